@@ -1,0 +1,239 @@
+"""What the commands share: how they start and end, and how they show progress."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from time import monotonic
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol, Self, TextIO, TypeVar
+
+from mirror_ppl.errors import MirrorError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Options = TypeVar("Options")
+
+EXIT_BAD_INPUT = 2
+# As shells report a process that a signal ended: 128 + the signal's number.
+EXIT_INTERRUPTED = 128 + 2
+EXIT_BROKEN_PIPE = 128 + 13
+
+
+def run(
+    options_class: type[Options],
+    main: Callable[[Options], int | None],
+    *,
+    prog: str,
+    description: str,
+    args: Sequence[str] | None = None,
+    threads: int = 1,
+) -> int:
+    """Parse the command line into options, call `main` with them, and return the exit status.
+
+    A command's file ends in `raise SystemExit(run(...))`.
+
+    Args:
+        options_class: a frozen dataclass; the docstrings of its fields become the help. A
+            `ValueError` from its `__post_init__` is reported as an argument error.
+        main: does the work; what it returns is the exit status, None counting as 0.
+        prog: the program's name in the help, such as "python -m mirror_ppl.fit".
+        description: what the command does, for the help.
+        args: the arguments; by default those of the process.
+        threads: how many threads torch gets, unless OMP_NUM_THREADS is set. The networks here are
+            too small to gain from more than one.
+
+    Returns:
+        What `main` returns; 2 after an argument error or a `MirrorError`, which is reported in one
+        line on stderr; 130 after an interruption; 141 when the reader of stdout went away. Other
+        exceptions are mistakes of the code and pass through.
+    """
+    import tyro
+
+    try:
+        try:
+            options = tyro.cli(options_class, prog=prog, description=description, args=args)
+        except SystemExit as end:  # after --help, or after tyro reported an argument error
+            status = int(end.code or 0)
+        else:
+            # After parsing, so that --help and argument errors do not wait for the import of torch.
+            _use_threads(threads)
+            status = main(options) or 0
+        sys.stdout.flush()
+        return status
+    except MirrorError as error:
+        message = " ".join(str(error).splitlines()) or type(error).__name__
+        print(f"error: {message}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # As in `... | head`. What is still buffered has to go somewhere, or the interpreter
+        # complains when it flushes stdout at its end.
+        with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        return EXIT_BROKEN_PIPE
+
+
+def _use_threads(threads: int) -> None:
+    if "OMP_NUM_THREADS" not in os.environ:
+        import torch
+
+        torch.set_num_threads(threads)
+
+
+class Progress:
+    """Shows on stderr how far long work has come; a context manager.
+
+    On a terminal it is a bar with the time elapsed and remaining. Elsewhere (a file, a pipe, a
+    notebook) it is plain lines such as `fit: 120/300 loss 12.3, 8 s`: at most one in `interval`
+    seconds, and one for the last state when the work ends or fails. Cheap enough to be told about
+    every step.
+
+    Args:
+        name: what is being done, such as "fit".
+        total: how many steps there are; None if that is not known.
+        done: how many of them were done before, by the run that is resumed.
+        interval: seconds between plain lines.
+        quiet: show nothing.
+        stream: where to, instead of stderr.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        total: int | None = None,
+        *,
+        done: int = 0,
+        interval: float = 5.0,
+        quiet: bool = False,
+        stream: TextIO | None = None,
+    ) -> None:
+        self.name = name
+        self.total = total
+        self.done = done
+        self.message = ""
+        self._interval = interval
+        self._quiet = quiet
+        self._stream = stream
+        self._display: _Display | None = None
+        self._shown = (self.done, self.message)
+        self._next = 0.0
+
+    def __enter__(self) -> Self:
+        if not self._quiet:
+            # Looked up now, not when the class was defined: stderr may have been redirected since.
+            stream = sys.stderr if self._stream is None else self._stream
+            display = _bar(self, stream) if stream.isatty() else None
+            self._display = display or _Lines(self, stream, self._interval)
+            self._next = monotonic() + self._display.interval
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._display is not None:
+            display, self._display = self._display, None
+            try:
+                if self._shown != (self.done, self.message):
+                    display.show(self)
+            finally:
+                display.close()
+
+    def update(self, done: int, message: str = "") -> None:
+        """Tell that `done` steps are done in all, with a message such as "loss 12.3"."""
+        self.done, self.message = done, message
+        if self._display is not None and (now := monotonic()) >= self._next:
+            self._next = now + self._display.interval
+            self._shown = (done, message)
+            self._display.show(self)
+
+    def advance(self, message: str = "") -> None:
+        """Tell that one more step is done."""
+        self.update(self.done + 1, message)
+
+
+class _Display(Protocol):
+    interval: float  # seconds from one `show` to the next, at least
+
+    def show(self, progress: Progress) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class _Lines:
+    """Plain lines, for files, pipes and notebooks."""
+
+    def __init__(self, progress: Progress, stream: TextIO, interval: float) -> None:
+        self.interval = interval
+        self._stream = stream
+        self._start = monotonic()
+
+    def show(self, progress: Progress) -> None:
+        total = "" if progress.total is None else f"/{progress.total}"
+        state = f"{progress.name}: {progress.done}{total} {progress.message}".rstrip()
+        print(f"{state}, {_duration(monotonic() - self._start)}", file=self._stream, flush=True)
+
+    def close(self) -> None:
+        pass
+
+
+class _Bar:
+    """A bar of rich, for terminals."""
+
+    interval = 0.1  # rich redraws ten times a second; telling it more often is wasted
+
+    def __init__(self, progress: Progress, console: "Console") -> None:
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+        from rich.progress import Progress as RichProgress
+
+        self._rich = RichProgress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[message]}", markup=False),
+            console=console,
+            # rich sends what is printed meanwhile above the bar, to the bar's stream: right on a
+            # terminal, but output that goes to a file must stay in that file.
+            redirect_stdout=sys.stdout.isatty(),
+        )
+        self._task = self._rich.add_task(
+            progress.name, total=progress.total, completed=progress.done, message=""
+        )
+        self._rich.start()
+
+    def show(self, progress: Progress) -> None:
+        self._rich.update(self._task, completed=progress.done, message=progress.message)
+
+    def close(self) -> None:
+        self._rich.stop()
+
+
+def _bar(progress: Progress, stream: TextIO) -> _Bar | None:
+    """A bar, or None on a terminal that cannot redraw a line."""
+    from rich.console import Console
+
+    console = Console(file=stream)
+    return None if console.is_dumb_terminal else _Bar(progress, console)
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

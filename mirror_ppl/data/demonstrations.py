@@ -1,0 +1,374 @@
+"""Recorded rounds of people: what there was to see, what they were told, and what they did."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.data import schema
+from mirror_ppl.data.schema import NO_INDEX, TOLD, TRUTH
+from mirror_ppl.domains import Observation, get_domain, require_known
+from mirror_ppl.errors import DemonstrationsError
+
+OPTIONAL = {"reward": "rewards", "scenario": "scenarios", "action_entropy": "action_entropy"}
+"""Variables that may be absent, and the fields that hold them."""
+DESCRIPTION = ("title", "Conventions", "format", "format_version", "domain", "setting")
+"""Attributes of a file that describe it; all others tell where the recordings come from."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Demonstrations:
+    """Rounds of P people, valid by construction and not to be modified.
+
+    People may have different numbers of rounds (or none), rounds different lengths. Arrays are as
+    large as the largest needs; the rest of them is padding. Rounds, steps and times count from 0.
+    Arrays are copied and brought into one form on creation, whatever numeric dtype they have and
+    whatever stands in their padding.
+
+    Args:
+        domain: name of the domain.
+        setting: name of the domain's setting that the rounds took place in.
+        people: P ids, unique.
+        ego: the ego's features ``[P, B, T+1, E]``, in the domain's units; NaN in padding.
+        observations: for each modality all that could have been observed, ``[P, B, T+1, K, F]``, in
+            the domain's units; NaN in padding. What of it the person saw is not recorded.
+        actions: indices of actions ``[P, B, T]``; -1 in padding.
+        round_counts: number of rounds of each person ``[P]``.
+        lengths: number of actions of each round ``[P, B]``, at least 1; 0 for padding.
+        told: for each modality which items were communicated just before the action,
+            ``[P, B, T, K]``, bool; nothing unless given.
+        rewards: task rewards ``[P, B, T]`` in units of reward; NaN in padding.
+        scenarios: indices of scenarios ``[P, B]``; -1 in padding and where unknown.
+        truth: values ``[P]`` of implants by name, known of simulated people only; NaN where
+            unknown.
+        action_entropy: entropy in nats of the choice that a simulated person made, ``[P, B, T]``;
+            NaN in padding and where unknown.
+        provenance: where the recordings come from: command, seed, population, version.
+
+    Raises:
+        UnknownNameError: the domain or its setting is unknown.
+        DemonstrationsError: shapes or values that cannot be; the message names person, round and
+            variable, what was expected and what was given.
+    """
+
+    domain: str
+    setting: str
+    people: tuple[str, ...]
+    ego: Tensor
+    observations: Mapping[str, Tensor]
+    actions: Tensor
+    round_counts: Tensor
+    lengths: Tensor
+    told: Mapping[str, Tensor] = field(default_factory=dict)
+    rewards: Tensor | None = None
+    scenarios: Tensor | None = None
+    truth: Mapping[str, Tensor] = field(default_factory=dict)
+    action_entropy: Tensor | None = None
+    provenance: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        domain = get_domain(self.domain)
+        require_known(self.setting, "setting", domain.settings)
+        modalities = {modality.name: modality for modality in domain.modalities}
+        _check_names("observations", self.observations, modalities, all_of_them=True)
+        _check_names("told", self.told, modalities, all_of_them=False)
+        for name in self.truth:
+            if not name.isprintable() or "/" in name:
+                raise DemonstrationsError(f"truth has {name!r}, expected printable text without /")
+        _check_provenance(self.provenance)
+        variables = self.variables()
+        for name, modality in modalities.items():
+            nothing = torch.zeros(*self.actions.shape, len(modality.items), dtype=torch.bool)
+            variables.setdefault(TOLD + name, nothing)
+        variables = schema.checked(domain, self.people, variables)
+        fields = {
+            "people": tuple(self.people),
+            "ego": variables["ego"],
+            "observations": {name: variables[name] for name in modalities},
+            "actions": variables["action"],
+            "round_counts": variables["round_count"],
+            "lengths": variables["length"],
+            "told": {name: variables[TOLD + name] for name in modalities},
+            "truth": {name: variables[TRUTH + name] for name in self.truth},
+            "provenance": dict(self.provenance),
+        }
+        fields |= {OPTIONAL[name]: variables[name] for name in OPTIONAL.keys() & variables.keys()}
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_variables(
+        cls,
+        domain: str,
+        setting: str,
+        people: Sequence[str],
+        variables: Mapping[str, Tensor],
+        provenance: Mapping[str, str | int | float] | None = None,
+    ) -> Demonstrations:
+        """Demonstrations of arrays that are called as in files, the inverse of `variables`.
+
+        Without ``round_count`` everybody has all rounds, without ``length`` each round all steps.
+
+        Raises:
+            UnknownNameError: as for the class.
+            DemonstrationsError: as for the class; or a required variable is missing.
+        """
+        modalities = [modality.name for modality in get_domain(domain).modalities]
+        for name in schema.required_variables(get_domain(domain)):
+            if name not in variables:
+                raise DemonstrationsError(f"the variable {name} is missing")
+        actions = variables["action"]
+        # Wrong shapes are left to the check of the class, which knows what to say about them.
+        people_, rounds, steps = actions.shape if actions.dim() == 3 else (0, 0, 0)
+        counts = variables.get("round_count", torch.full((people_,), rounds))
+        every = steps * (torch.arange(rounds) < counts.reshape(-1, 1).cpu())
+        return cls(
+            domain=domain,
+            setting=setting,
+            people=tuple(people),
+            ego=variables["ego"],
+            observations={name: variables[name] for name in modalities},
+            actions=actions,
+            round_counts=counts,
+            lengths=variables.get("length", every),
+            told=_without_prefix(TOLD, variables),
+            truth=_without_prefix(TRUTH, variables),
+            provenance=provenance or {},
+            **{key: variables.get(name) for name, key in OPTIONAL.items()},
+        )
+
+    def variables(self) -> dict[str, Tensor]:
+        """The arrays, called as in files; those that are absent are left out."""
+        optional = {name: getattr(self, field) for name, field in OPTIONAL.items()}
+        return {
+            "round_count": self.round_counts,
+            "length": self.lengths,
+            "ego": self.ego,
+            **self.observations,
+            **{TOLD + name: value for name, value in self.told.items()},
+            "action": self.actions,
+            **{name: value for name, value in optional.items() if value is not None},
+            **{TRUTH + name: value for name, value in self.truth.items()},
+        }
+
+    @property
+    def num_people(self) -> int:
+        """P."""
+        return len(self.people)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(P, B, T): people, and the rounds and steps that there is room for."""
+        people, rounds, steps = self.actions.shape
+        return people, rounds, steps
+
+    @property
+    def mask(self) -> Tensor:
+        """Which steps are real and not padding, ``[P, B, T]``, bool."""
+        return self.actions != NO_INDEX
+
+    def __repr__(self) -> str:
+        rounds, steps = int(self.round_counts.sum()), int(self.lengths.sum())
+        return (
+            f"Demonstrations({self.domain}, {self.setting}: "
+            f"people {self.num_people}, rounds {rounds}, steps {steps})"
+        )
+
+    def equals(self, other: Demonstrations) -> bool:
+        """Whether everything is the same, padding and provenance included."""
+        if self.variables().keys() != other.variables().keys():
+            return False
+        theirs = other.variables()
+        return (
+            (self.domain, self.setting, self.people) == (other.domain, other.setting, other.people)
+            and self.provenance == other.provenance
+            and all(_identical(value, theirs[name]) for name, value in self.variables().items())
+        )
+
+    def observation(self) -> Observation:
+        """What there was to observe, in the domain's layout and finite everywhere.
+
+        Returns:
+            ``"ego"`` ``[P, B, T+1, E]`` and each modality ``[P, B, T+1, K, F]``. Past a round's end
+            its last observation is repeated; padding rounds are 0.
+        """
+        times = torch.arange(self.ego.shape[2], device=self.ego.device)
+        # [P, B, T+1]: the time itself, or the round's last one.
+        time = torch.minimum(times, self.lengths[..., None])
+        person = torch.arange(self.shape[0], device=time.device)[:, None, None]
+        round_ = torch.arange(self.shape[1], device=time.device)[:, None]
+        return {
+            name: value[person, round_, time].nan_to_num(0.0)
+            for name, value in (("ego", self.ego), *self.observations.items())
+        }
+
+    def select_people(self, people: Sequence[str] | Sequence[int]) -> Demonstrations:
+        """Only these people, in this order, with no more padding than they need.
+
+        Args:
+            people: ids, or indices from 0.
+
+        Raises:
+            UnknownNameError: there is nobody of that id.
+            DemonstrationsError: an index is out of range, somebody is named twice, or the list is
+                empty.
+        """
+        chosen = []
+        for person in people:
+            if isinstance(person, str):
+                chosen.append(self.people.index(require_known(person, "person", self.people)))
+            else:
+                chosen.append(_in_range("person", person, self.num_people))
+        index = torch.tensor(chosen, dtype=torch.long, device=self.actions.device)
+        variables = {name: value[index] for name, value in self.variables().items()}
+        return self._like(variables, [self.people[number] for number in chosen])
+
+    def select_rounds(self, rounds: slice | Sequence[int]) -> Demonstrations:
+        """Only these rounds of each person, with no more padding than they need.
+
+        Args:
+            rounds: a slice, applied to each person's own rounds (``slice(-5, None)`` keeps the last
+                five of each); or numbers from 0, in the order wanted, of which each person keeps
+                those that they have. People who have none of them stay, with no rounds.
+
+        Raises:
+            DemonstrationsError: a number is negative, or beyond everybody's rounds.
+        """
+        counts = self.round_counts.tolist()
+        if isinstance(rounds, slice):
+            kept = [list(range(count)[rounds]) for count in counts]
+        else:
+            numbers = [_in_range("round", number, max(counts)) for number in rounds]
+            kept = [[number for number in numbers if number < count] for count in counts]
+        most = max(1, *map(len, kept))
+        index = torch.tensor([row + [0] * (most - len(row)) for row in kept])
+        index = index.to(self.actions.device)
+        new_counts = torch.tensor([len(row) for row in kept], device=index.device)
+        person = torch.arange(len(kept), device=index.device)[:, None]
+        variables = {
+            name: value[person, index] if "round" in self._dimensions(name) else value
+            for name, value in self.variables().items()
+        }
+        begun = torch.arange(most, device=index.device) < new_counts[:, None]
+        variables |= {"round_count": new_counts, "length": variables["length"] * begun}
+        return self._like(variables, self.people)
+
+    def to(self, device: torch.device | str) -> Demonstrations:
+        """The same on another device."""
+        variables = {name: value.to(device) for name, value in self.variables().items()}
+        return self.from_variables(
+            self.domain, self.setting, self.people, variables, self.provenance
+        )
+
+    def _dimensions(self, name: str) -> tuple[str, ...]:
+        return schema.variable_dimensions(get_domain(self.domain)).get(name, ("person",))
+
+    def _like(self, variables: Mapping[str, Tensor], people: Sequence[str]) -> Demonstrations:
+        """The same but for these arrays and people, without padding that nobody needs."""
+        most = {
+            "round": max(1, int(variables["round_count"].max())) if people else 1,
+            "step": max(1, int(variables["length"].max())) if people else 1,
+        }
+        most["time"] = most["step"] + 1
+        fitted = {
+            name: _fit(value, self._dimensions(name), most) for name, value in variables.items()
+        }
+        return self.from_variables(self.domain, self.setting, people, fitted, self.provenance)
+
+
+def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
+    """The people of all parts, in order, on the first part's device.
+
+    Scenarios, truths and entropies that a part lacks become unknown. Rewards are kept if every part
+    has them. Of the provenance, what all parts agree on is kept.
+
+    Raises:
+        DemonstrationsError: there is no part, the parts are of different domains or settings, or an
+            id occurs twice.
+    """
+    if not parts:
+        raise DemonstrationsError("there are no demonstrations to put together")
+    first = parts[0]
+    for part in parts:
+        if (part.domain, part.setting) != (first.domain, first.setting):
+            raise DemonstrationsError(
+                f"demonstrations of {part.domain}, {part.setting} cannot be put together with "
+                f"those of {first.domain}, {first.setting}"
+            )
+    rounds, steps = (max(part.shape[axis] for part in parts) for axis in (1, 2))
+    sizes = {"round": rounds, "step": steps, "time": steps + 1}
+    arrays = [part.variables() for part in parts]
+    names = dict.fromkeys(name for part in arrays for name in part)
+    if any(part.rewards is None for part in parts):
+        names.pop("reward", None)
+    dimensions = schema.variable_dimensions(get_domain(first.domain))
+    variables = {}
+    for name in names:
+        dims = dimensions.get(name, ("person",))
+        unknown = NO_INDEX if name == "scenario" else torch.nan
+        pieces = []
+        for part, own in zip(parts, arrays, strict=True):
+            if name in own:
+                piece = own[name]
+            else:
+                piece = part.ego.new_full(part.actions.shape[: len(dims)], unknown)
+            pieces.append(_fit(piece, dims, sizes).to(first.actions.device))
+        variables[name] = torch.cat(pieces)
+    provenance = {
+        key: value
+        for key, value in first.provenance.items()
+        if all(part.provenance.get(key) == value for part in parts)
+    }
+    people = [person for part in parts for person in part.people]
+    return Demonstrations.from_variables(first.domain, first.setting, people, variables, provenance)
+
+
+def _fit(value: Tensor, dimensions: Sequence[str], sizes: Mapping[str, int]) -> Tensor:
+    """Cut or extend some dimensions to these sizes; what is added counts as padding."""
+    shape = [sizes.get(name, size) for name, size in zip(dimensions, value.shape, strict=True)]
+    fitted = value.new_zeros(shape)
+    common = tuple(slice(min(old, new)) for old, new in zip(value.shape, shape, strict=True))
+    fitted[common] = value[common]
+    return fitted
+
+
+def _without_prefix(prefix: str, variables: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {
+        name.removeprefix(prefix): value
+        for name, value in variables.items()
+        if name.startswith(prefix)
+    }
+
+
+def _identical(one: Tensor, other: Tensor) -> bool:
+    if one.shape != other.shape or one.dtype != other.dtype:
+        return False
+    return bool(((one == other) | (one.isnan() & other.isnan())).all())
+
+
+def _in_range(kind: str, number: int, end: int) -> int:
+    if not 0 <= number < end:
+        raise DemonstrationsError(
+            f"there is no {kind} {number}, expected one of {end}, counted from 0"
+        )
+    return int(number)
+
+
+def _check_names(
+    field_name: str, given: Mapping[str, Tensor], known: Collection[str], *, all_of_them: bool
+) -> None:
+    if set(given) - set(known) or (all_of_them and set(known) - set(given)):
+        raise DemonstrationsError(
+            f"{field_name} has {', '.join(given) or 'nothing'}, expected {', '.join(known)}"
+        )
+
+
+def _check_provenance(provenance: Mapping[str, str | int | float]) -> None:
+    for name, value in provenance.items():
+        if name in DESCRIPTION:
+            raise DemonstrationsError(f"provenance has {name}, which is not a matter of origin")
+        if not isinstance(value, str | int | float) or isinstance(value, bool):
+            raise DemonstrationsError(f"provenance {name} is {value!r}, expected text or a number")

@@ -1,0 +1,287 @@
+"""Demonstrations as netCDF files that explain themselves; ``docs/demonstrations.md`` tells how."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mirror_ppl.data import schema
+from mirror_ppl.data.demonstrations import DESCRIPTION, Demonstrations
+from mirror_ppl.data.schema import TOLD, TRUTH
+from mirror_ppl.domains import Domain, get_domain, require_known
+from mirror_ppl.errors import DemonstrationsError, UnknownNameError
+from mirror_ppl.files import write_whole
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FORMAT = "mirror_ppl demonstrations"
+FORMAT_VERSION = "1"
+
+# The first bytes of a file, and the xarray engine that reads it: netCDF-4 is HDF5, netCDF-3 is what
+# xarray writes where it finds nothing but scipy.
+ENGINES = {b"\x89HDF\r\n\x1a\n": "h5netcdf", b"CDF": "scipy"}
+
+_LONG_NAMES = {
+    "round_count": ("number of rounds; those from it on are padding", "rounds"),
+    "length": ("number of actions of the round, 0 for padding", "steps"),
+    "ego": ("the ego's features, always known", "as in the domain's description"),
+    "action": ("action taken, -1 for padding", "index"),
+    "reward": ("task reward of the action, nan for padding", "units of reward"),
+    "scenario": ("scenario of the round, -1 for padding or if unknown", "index"),
+    "action_entropy": (
+        "entropy of the choice that the simulated person made, nan for padding or if unknown",
+        "nats",
+    ),
+}
+
+
+def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrations) -> Path:
+    """Write a netCDF-4 file, compressed, with checksums, whole or not at all.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    dataset = to_dataset(demonstrations)
+    packed = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
+    encoding = {str(name): packed for name in dataset.data_vars}
+
+    def write(temporary: Path) -> None:
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+
+    return write_whole(path, write)
+
+
+def load_demonstrations(
+    path: str | os.PathLike[str], domain: str | None = None, setting: str | None = None
+) -> Demonstrations:
+    """Read a netCDF file (netCDF-4, or the older netCDF-3).
+
+    Args:
+        path: the file.
+        domain: which domain the file must be of; it may then leave that open.
+        setting: the same for the setting.
+
+    Raises:
+        UnknownNameError: ``domain``, or ``setting`` as one of ``domain``, is unknown.
+        DemonstrationsError: the file is missing, damaged or not netCDF, or what is in it is not
+            valid; one line that names the file and the fault.
+    """
+    if domain is not None and setting is not None:
+        require_known(setting, "setting", get_domain(domain).settings)
+    elif domain is not None:
+        get_domain(domain)
+    dataset = _read(Path(path))
+    try:
+        return from_dataset(dataset, domain, setting)
+    except (DemonstrationsError, UnknownNameError) as error:
+        raise DemonstrationsError(f"{path}: {error}") from error
+
+
+def to_dataset(demonstrations: Demonstrations) -> xr.Dataset:
+    """Named dimensions, coordinates and units, in the smallest dtypes that lose nothing."""
+    import xarray as xr
+
+    domain = get_domain(demonstrations.domain)
+    dimensions = schema.variable_dimensions(domain)
+    variables = {}
+    for name, value in demonstrations.variables().items():
+        dims = dimensions.get(name, ("person",))
+        variables[name] = (dims, _smallest(value.cpu().numpy()), _attributes(domain, name))
+    labels = {"person": demonstrations.people, **schema.dimension_labels(domain)}
+    return xr.Dataset(
+        variables,
+        coords={name: (name, np.array(entries, dtype=object)) for name, entries in labels.items()},
+        attrs={
+            "title": f"Demonstrations: {domain.name}, {demonstrations.setting}",
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "domain": domain.name,
+            "setting": demonstrations.setting,
+            **demonstrations.provenance,
+        },
+    )
+
+
+def from_dataset(
+    dataset: xr.Dataset, domain: str | None = None, setting: str | None = None
+) -> Demonstrations:
+    """Demonstrations of a dataset, whatever software made it.
+
+    Dimensions may be in any order, and so may items and features if they are named; dtypes may be
+    any numeric ones. Variables that the format does not know are ignored.
+
+    Args:
+        dataset: in the documented format.
+        domain: which domain it must be of; it may then leave that open.
+        setting: the same for the setting.
+
+    Raises:
+        UnknownNameError: the domain or setting is unknown.
+        DemonstrationsError: the dataset is not in the format, or its values are not valid.
+    """
+    for name, expected in (("format", FORMAT), ("format_version", FORMAT_VERSION)):
+        given = str(dataset.attrs.get(name, "missing"))
+        if given != expected:
+            raise DemonstrationsError(f"attribute {name} is {given!r}, expected {expected!r}")
+    domain_name = _agreed(dataset, "domain", domain)
+    world = get_domain(domain_name)
+    setting = require_known(_agreed(dataset, "setting", setting), "setting", world.settings)
+    dataset = _in_order(dataset, schema.dimension_labels(world))
+    dimensions = schema.variable_dimensions(world)
+    for name in map(str, dataset.data_vars):
+        if name.startswith(TRUTH):
+            dimensions[name] = ("person",)
+        elif name.startswith(TOLD) and name not in dimensions:
+            known = ", ".join(other for other in dimensions if other.startswith(TOLD))
+            raise DemonstrationsError(f"unknown variable {name}, expected {known}")
+    for name in ("action", "scenario"):
+        expected = _attributes(world, name)["flag_meanings"]
+        given = dataset[name].attrs.get("flag_meanings") if name in dataset else None
+        if given is not None and str(given) != expected:
+            raise DemonstrationsError(
+                f"flag_meanings of {name} are {str(given)!r}, expected {expected!r}"
+            )
+    variables = {
+        name: _tensor(dataset[name], dims)
+        for name, dims in dimensions.items()
+        if name in dataset.variables
+    }
+    if "length" in variables:
+        # Where rounds of different lengths are put together, absent ones easily become nan.
+        variables["length"] = variables["length"].nan_to_num(0)
+    if "person" in dataset.coords:
+        people = _texts(dataset["person"])
+    else:
+        people = map(str, range(dataset.sizes.get("person", 0)))
+    return Demonstrations.from_variables(
+        domain_name, setting, tuple(people), variables, _provenance(dataset.attrs)
+    )
+
+
+def _read(path: Path) -> xr.Dataset:
+    import xarray as xr
+
+    try:
+        with path.open("rb") as file:
+            start = file.read(8)
+    except OSError as error:
+        raise DemonstrationsError(f"{path}: cannot be read ({error.strerror})") from error
+    engine = next((name for magic, name in ENGINES.items() if start.startswith(magic)), None)
+    if engine is None:
+        raise DemonstrationsError(f"{path}: is not a netCDF file")
+    try:
+        # Units such as "seconds" would turn numbers into dates.
+        with xr.open_dataset(path, engine=engine, decode_times=False) as dataset:
+            return dataset.load()
+    # What the libraries below raise for a damaged file depends on where the damage is.
+    except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise DemonstrationsError(f"{path}: is truncated or damaged ({reason})") from error
+
+
+def _agreed(dataset: xr.Dataset, name: str, wanted: str | None) -> str:
+    given = dataset.attrs.get(name)
+    if given is None and wanted is None:
+        raise DemonstrationsError(f"attribute {name} is missing")
+    if given is not None and wanted is not None and str(given) != wanted:
+        raise DemonstrationsError(f"attribute {name} is {str(given)!r}, expected {wanted!r}")
+    return str(given) if wanted is None else wanted
+
+
+def _in_order(dataset: xr.Dataset, labels: Mapping[str, tuple[str, ...]]) -> xr.Dataset:
+    """The dataset with items and features in the domain's order, where it names its own."""
+    for dimension, expected in labels.items():
+        if dimension in dataset.coords:
+            given = _texts(dataset[dimension])
+            if sorted(given) != sorted(expected):
+                raise DemonstrationsError(
+                    f"{dimension} has {', '.join(given)}, expected {', '.join(expected)}"
+                )
+            dataset = dataset.isel({dimension: [given.index(name) for name in expected]})
+    return dataset
+
+
+def _texts(array: xr.DataArray) -> list[str]:
+    entries = np.atleast_1d(array.values).tolist()
+    return [entry.decode() if isinstance(entry, bytes) else str(entry) for entry in entries]
+
+
+def _tensor(array: xr.DataArray, dimensions: tuple[str, ...]) -> Tensor:
+    if set(array.dims) != set(dimensions):
+        raise DemonstrationsError(
+            f"{array.name} has the dimensions {', '.join(map(str, array.dims)) or 'none'}, "
+            f"expected {', '.join(dimensions)}"
+        )
+    values = array.transpose(*dimensions).values
+    if values.dtype.kind not in "biuf":
+        raise DemonstrationsError(f"{array.name} has the dtype {values.dtype}, expected numbers")
+    return torch.from_numpy(values.astype(np.float64 if values.dtype.kind == "f" else np.int64))
+
+
+def _provenance(attributes: Mapping[str, object]) -> dict[str, str | int | float]:
+    """Attributes that are one text or number and do not describe the format."""
+    provenance = {}
+    for name, value in attributes.items():
+        plain = value.item() if isinstance(value, np.generic) else value
+        if name not in DESCRIPTION and type(plain) in (str, int, float):
+            provenance[str(name)] = plain
+    return provenance
+
+
+def _smallest(values: np.ndarray) -> np.ndarray:
+    """The same values in the smallest dtype that holds them."""
+    if values.dtype.kind in "iu":
+        kinds = (np.int8, np.int16, np.int32, np.int64)
+        return values.astype(
+            next(
+                kind
+                for kind in kinds
+                if np.iinfo(kind).min <= values.min() and values.max() <= np.iinfo(kind).max
+            )
+        )
+    if values.dtype == bool:
+        return values.astype(np.int8)
+    single = values.astype(np.float32)
+    return single if np.array_equal(single, values, equal_nan=True) else values
+
+
+def _attributes(domain: Domain, name: str) -> dict[str, object]:
+    if name.startswith(TRUTH):
+        implant = name.removeprefix(TRUTH)
+        long_name = f"true value of the implant {implant}, nan if unknown"
+        return {"long_name": long_name, "units": "those of the implant"}
+    if name.startswith(TOLD):
+        modality = name.removeprefix(TOLD)
+        long_name = f"whether the {modality} item was communicated just before the action"
+        return {"long_name": long_name, "units": "1", **_flags(("not_told", "told"))}
+    for modality in domain.modalities:
+        if name == modality.name:
+            return {
+                "long_name": f"all that could be observed of the {name} items, nan for padding",
+                "units": ", ".join(modality.units),
+                "comment": f"units in the order of {name}_feature; "
+                "what of it the person saw is not recorded",
+            }
+    long_name, units = _LONG_NAMES[name]
+    flags = {"action": domain.actions, "scenario": domain.scenarios}.get(name)
+    return {"long_name": long_name, "units": units, **(_flags(flags) if flags else {})}
+
+
+def _flags(names: tuple[str, ...]) -> dict[str, object]:
+    """Names of whole numbers in the manner of the CF conventions: words, separated by blanks."""
+    words = [re.sub(r"[^\w.+@-]+", "_", name) for name in names]
+    return {
+        "flag_values": np.arange(len(names), dtype=np.int8),
+        "flag_meanings": " ".join(words),
+    }

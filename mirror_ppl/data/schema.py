@@ -1,0 +1,210 @@
+"""What a recording consists of: its variables, their dimensions, and what makes them valid.
+
+A recording is a set of arrays, called by the same names in memory and in files (see
+``docs/demonstrations.md``). Every array begins with the dimension ``person``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains import Domain
+from mirror_ppl.errors import DemonstrationsError
+
+TOLD = "told_"
+"""Prefix of what was communicated through a modality."""
+TRUTH = "truth_"
+"""Prefix of the true value of an implant."""
+NO_INDEX = -1
+"""Stands for the actions and scenarios of padding, and for scenarios that are unknown."""
+
+
+def variable_dimensions(domain: Domain) -> dict[str, tuple[str, ...]]:
+    """Names of the dimensions of each variable; those of any ``truth_...`` are ``person`` alone."""
+    rounds = ("person", "round")
+    steps, times = (*rounds, "step"), (*rounds, "time")
+    dimensions = {
+        "round_count": ("person",),
+        "length": rounds,
+        "ego": (*times, "ego_feature"),
+        "action": steps,
+        "reward": steps,
+        "scenario": rounds,
+        "action_entropy": steps,
+    }
+    for modality in domain.modalities:
+        item, feature = f"{modality.name}_item", f"{modality.name}_feature"
+        dimensions[modality.name] = (*times, item, feature)
+        dimensions[TOLD + modality.name] = (*steps, item)
+    return dimensions
+
+
+def required_variables(domain: Domain) -> tuple[str, ...]:
+    """Names of the variables that no file lacks."""
+    return ("ego", *(modality.name for modality in domain.modalities), "action")
+
+
+def dimension_labels(domain: Domain) -> dict[str, tuple[str, ...]]:
+    """Names along each dimension whose entries the domain names."""
+    labels = {"ego_feature": domain.ego_features}
+    for modality in domain.modalities:
+        labels[f"{modality.name}_item"] = modality.items
+        labels[f"{modality.name}_feature"] = modality.features
+    return labels
+
+
+def checked(
+    domain: Domain, people: Sequence[str], variables: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Check a recording and bring it into its one form.
+
+    Args:
+        domain: where it was made.
+        people: ids of the P people.
+        variables: arrays by name, of any numeric dtype: ``round_count``, ``length``, what
+            `required_variables` lists, and any of the others.
+
+    Returns:
+        Copies on the device of ``action``. Numbers are in torch's default dtype and NaN in padding;
+        indices are int64 and -1 in padding; what was told is bool and False in padding.
+
+    Raises:
+        DemonstrationsError: one line with variable, person, round and step where they apply, what
+            was expected and what was given.
+    """
+    _check_people(people)
+    dimensions = variable_dimensions(domain)
+    dimensions |= {name: ("person",) for name in variables if name.startswith(TRUTH)}
+    places = _Places(tuple(people), dimensions, dimension_labels(domain))
+    sizes = places.sizes(variables["action"])
+    device = variables["action"].device
+    given: dict[str, Tensor] = {}
+    for name, value in variables.items():
+        places.check_shape(name, value, sizes)
+        given[name] = value.detach().to(device)
+
+    counts = places.whole("round_count", given, None, 0, sizes["round"])
+    lengths = places.whole("length", given, None, 0, sizes["step"])
+    begun = torch.arange(sizes["round"], device=device) < counts[:, None]
+    places.refuse("length", begun & (lengths == 0), lengths, "at least 1 (padding begins at round_count)")
+    places.refuse("length", ~begun & (lengths > 0), lengths, "0 (padding begins at round_count)")
+    times = torch.arange(sizes["time"], device=device)
+    real = {
+        "round": begun,
+        "step": times[:-1] < lengths[..., None],
+        "time": begun[..., None] & (times <= lengths[..., None]),
+    }
+
+    result = {"round_count": counts, "length": lengths}
+    dtype = torch.get_default_dtype()
+    for name in given.keys() - result.keys():
+        if name.startswith(TRUTH):
+            result[name] = given[name].to(dtype, copy=True)
+            continue
+        inside = real[next(key for key in reversed(dimensions[name]) if key in real)]
+        if name == "action":
+            highest = len(domain.actions) - 1
+            names = ", ".join(domain.actions)
+            actions = places.whole(name, given, inside, 0, highest, f" ({names})")
+            result[name] = actions.masked_fill(~inside, NO_INDEX)
+        elif name == "scenario":
+            highest = len(domain.scenarios) - 1
+            scenarios = places.whole(name, given, inside, NO_INDEX, highest, " (-1 if unknown)")
+            result[name] = scenarios.masked_fill(~inside, NO_INDEX)
+        elif name.startswith(TOLD):
+            result[name] = places.whole(name, given, inside, 0, 1).bool()
+        else:
+            result[name] = places.numbers(name, given[name].to(dtype), inside)
+    return result
+
+
+def _check_people(people: Sequence[str]) -> None:
+    if not people:
+        raise DemonstrationsError("there is nobody in it, expected at least one person")
+    seen = set()
+    for person in people:
+        if not isinstance(person, str) or not person or not person.isprintable():
+            raise DemonstrationsError(f"person's id is {person!r}, expected printable text")
+        if person in seen:
+            raise DemonstrationsError(f"two people have the id {person!r}, expected unique ids")
+        seen.add(person)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Checks values and says in words where a wrong one is."""
+
+    people: tuple[str, ...]
+    dimensions: Mapping[str, tuple[str, ...]]
+    labels: Mapping[str, tuple[str, ...]]
+
+    def sizes(self, action: Tensor) -> dict[str, int]:
+        """Sizes that all variables must agree on: the actions' and the domain's."""
+        if action.dim() != 3 or 0 in action.shape:
+            raise DemonstrationsError(
+                f"action has shape {tuple(action.shape)}, expected people, rounds and steps, "
+                "at least one of each"
+            )
+        _, rounds, steps = action.shape
+        sizes = {"person": len(self.people), "round": rounds, "step": steps, "time": steps + 1}
+        return sizes | {name: len(labels) for name, labels in self.labels.items()}
+
+    def check_shape(self, name: str, value: Tensor, sizes: Mapping[str, int]) -> None:
+        expected = {key: sizes[key] for key in self.dimensions[name]}
+        if tuple(value.shape) != tuple(expected.values()):
+            wanted = ", ".join(f"{key} {size}" for key, size in expected.items())
+            raise DemonstrationsError(
+                f"{name} has shape {tuple(value.shape)}, "
+                f"expected {tuple(expected.values())} ({wanted})"
+            )
+
+    def refuse(self, name: str, bad: Tensor, value: Tensor, expected: str) -> None:
+        """Raise for the first entry of ``value`` that is bad."""
+        if not bad.any():
+            return
+        index = tuple(bad.nonzero()[0].tolist())
+        where, of = [f"person {self.people[index[0]]!r}"], []
+        for dimension, place in zip(self.dimensions[name][1:], index[1:], strict=True):
+            if dimension in self.labels:
+                of.append(self.labels[dimension][place])
+            else:
+                where.append(f"{dimension} {place}")
+        what = f"{name} of {', '.join(of)}" if of else name
+        raise DemonstrationsError(
+            f"{', '.join(where)}: {what} is {value[index].item():g}, expected {expected}"
+        )
+
+    def whole(
+        self,
+        name: str,
+        given: Mapping[str, Tensor],
+        inside: Tensor | None,
+        lowest: int,
+        highest: int,
+        meaning: str = "",
+    ) -> Tensor:
+        """Whole numbers as int64; outside of ``inside`` anything goes and becomes 0."""
+        value = given[name].double()
+        good = (value >= lowest) & (value <= highest) & (value == value.round())
+        inside = torch.ones_like(good) if inside is None else _over_items(inside, good)
+        expected = f"a whole number from {lowest} to {highest}{meaning}"
+        self.refuse(name, inside & ~good, value, expected)
+        return value.masked_fill(~inside, 0).long()
+
+    def numbers(self, name: str, value: Tensor, inside: Tensor) -> Tensor:
+        """Finite numbers; outside of ``inside`` anything goes and becomes NaN."""
+        inside = _over_items(inside, value)
+        if name == "action_entropy":
+            self.refuse(name, inside & value.isinf(), value, "a finite number, or nan if unknown")
+        else:
+            self.refuse(name, inside & ~value.isfinite(), value, "a finite number")
+        return value.masked_fill(~inside, torch.nan)
+
+
+def _over_items(inside: Tensor, like: Tensor) -> Tensor:
+    """The mask for every item and feature that ``like`` has beyond the mask's dimensions."""
+    return inside.reshape(inside.shape + (1,) * (like.dim() - inside.dim())).expand_as(like)

@@ -1,0 +1,157 @@
+"""The contract of a domain: what can be seen, said and done, and how the world moves.
+
+A domain is a set of pure, batched functions over tensors. Nothing in it holds state between calls
+and randomness enters only through the generator that is passed in, so one seed gives one rollout.
+
+Shape letters, used in every docstring of the package:
+
+===  ==========================================================================================
+P    people
+B    rounds (episodes) of a person, or a batch of rounds
+T    steps of a round; a round holds T + 1 observations, T actions and T rewards
+K    items of a modality (cars that can be shown, utterances that can be said)
+F    features of an item
+E    features of the ego, which are always known
+Z    latent dimensions
+A    actions
+S    posterior draws
+V    views of a round: the distinct ways to have seen it
+===  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.errors import UnknownNameError
+
+Observation = dict[str, Tensor]
+"""Values by name: ``"ego"`` ``[..., E]`` and one entry ``[..., K, F]`` for each modality."""
+
+Visibility = dict[str, Tensor]
+"""Masks by modality, boolean ``[..., K]``: which items are seen (or were communicated)."""
+
+
+@dataclass(frozen=True)
+class Modality:
+    """A channel through which items can be observed and communicated.
+
+    Args:
+        name: name of the channel, a key of observations and visibilities.
+        items: names of its K items.
+        features: names of the F features of an item.
+        units: unit of each feature.
+        scales: typical size of each feature, by which decoders normalize.
+        cost_coefficient: communicating n items in one step costs ``cost_coefficient * n**2``
+            units of reward (supplement, Table I).
+    """
+
+    name: str
+    items: tuple[str, ...]
+    features: tuple[str, ...]
+    units: tuple[str, ...]
+    scales: tuple[float, ...]
+    cost_coefficient: float
+
+    def __post_init__(self) -> None:
+        if not len(self.features) == len(self.units) == len(self.scales):
+            raise ValueError(f"modality {self.name!r}: each feature needs a unit and a scale")
+
+    def cost(self, number: Tensor) -> Tensor:
+        """Cost in units of reward of communicating ``number`` items in one step."""
+        return self.cost_coefficient * number.to(torch.get_default_dtype()) ** 2
+
+
+class Domain(Protocol):
+    """What a world offers to models, people, inference and communication.
+
+    ``state`` is the domain's own frozen dataclass of tensors; only the domain looks inside.
+    """
+
+    name: str
+    version: str
+    modalities: tuple[Modality, ...]
+    ego_features: tuple[str, ...]
+    symbol_sizes: Mapping[str, int]
+    actions: tuple[str, ...]
+    horizon: int
+    settings: tuple[str, ...]
+    scenarios: tuple[str, ...]
+    reward_terms: tuple[str, ...]
+    directions: tuple[str, ...]
+    reach_bins: tuple[float, ...]
+
+    def initial(
+        self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
+    ) -> Any:
+        """States ``[batch]`` at the start of a round, scenarios drawn uniformly unless given."""
+        ...
+
+    def transition(self, state: Any, action: Tensor) -> Any:
+        """State at t + 1 from the state at t and the action at t, both batched alike."""
+        ...
+
+    def rewards(self, state: Any, action: Tensor, following: Any) -> dict[str, Tensor]:
+        """Reward terms by name, each ``[...]``; the task reward is their sum."""
+        ...
+
+    def observe(self, state: Any) -> Observation:
+        """Everything that could be observed of a state, whoever looks."""
+        ...
+
+    def visibility(self, setting: str, observation: Observation) -> Visibility:
+        """What an unaided person sees in a setting, limited by the setting alone."""
+        ...
+
+    def communicable(self, observation: Observation) -> Visibility:
+        """Which items may be communicated now."""
+        ...
+
+    def unknown_so_far(self, visibility: Visibility) -> Visibility:
+        """Items ``[..., T, K]`` of which nothing was seen or told up to each step."""
+        ...
+
+    def symbols(self, observation: Observation) -> dict[str, Tensor]:
+        """Observations in the form in which networks read them, ``[..., symbol_sizes[name]]``."""
+        ...
+
+    def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
+        """What perceptual implants act on: direction index and distance of each visual item."""
+        ...
+
+    def absent(self, observation: Observation) -> Observation:
+        """The observation in which every item is taken to be absent."""
+        ...
+
+    def remove(self, state: Any, gone: Tensor) -> Any:
+        """The state without the things behind the visual items marked in ``gone`` ``[..., K]``."""
+        ...
+
+    def reference_values(self, state: Any, discount: float) -> Tensor:
+        """Exact discounted action values ``[..., A]`` of a fully known state."""
+        ...
+
+    def render(self, state: Any) -> Any:
+        """A picture of one state, ``uint8 [height, width, 3]``."""
+        ...
+
+
+def total_reward(terms: Mapping[str, Tensor]) -> Tensor:
+    """Sum of reward terms ``[...]``."""
+    return torch.stack(list(terms.values())).sum(0)
+
+
+def require_known(name: str, kind: str, known: Sequence[str]) -> str:
+    """Return ``name`` if it is one of ``known``.
+
+    Raises:
+        UnknownNameError: listing the known names.
+    """
+    if name not in known:
+        raise UnknownNameError.of(kind, name, known)
+    return name

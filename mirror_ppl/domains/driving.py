@@ -1,0 +1,326 @@
+"""Gridworld driving: two lanes, four cars that never yield (supplement, sections A and E, Table I).
+
+Description
+    The person drives at constant speed; everything is measured in cells relative to their car.
+    Two cars start ahead (one in each lane) and two behind, at random distances. A scenario says
+    which of them speed up and which slow down; nobody makes room for the person.
+
+Actions
+    ===  ========  ==============================================
+    0    stay      keep the lane
+    1    switch    be in the other lane at the next step
+    ===  ========  ==============================================
+
+Observations
+    ========  ==================  ==========  ====================================================
+    ego       lane                index       0 left, 1 right; always known
+    visual    distance_ahead      cells       of each car, negative behind, saturating at +-12
+    visual    lane_offset         lanes       lane of the car minus lane of the ego
+    verbal    distance_ahead      cells       as above, as an utterance about each car
+    verbal    lane_offset         lanes       as above
+    verbal    relative_speed      cells/step  +1 faster than the ego, -1 slower; 0 off the road
+    ========  ==================  ==========  ====================================================
+
+    A distance of +-12 means that the car is off the visible road. In clear weather all cars are
+    visible; in fog those up to two cells ahead (abreast included), in both lanes, and none behind.
+    Nothing is said unless somebody says it.
+
+Rewards, of the action and the state that it leads to
+    ===========  ======  ============================================================
+    proximity    -2      for each car of the ego's lane at most two cells away
+    collision    -5      for each car in the ego's cell
+    off_road     -5      lane index outside the road (the two actions cannot cause it)
+    lane_change  -1      for switching lanes
+    ===========  ======  ============================================================
+
+Start and end
+    A round begins with a random lane and random distances of 1 to 11 cells and lasts 15 steps,
+    after which every car has left the neighbourhood of the ego. Collisions do not end it.
+
+Version history
+    1: first version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.lane_values import action_values
+
+STAY, SWITCH = 0, 1
+ROAD_END = 12
+"""Distance in cells at which the visible road ends, ahead and behind."""
+NEAR = 2
+"""Cars of the ego's lane at most this many cells away are too near."""
+FOG_REACH = 2
+"""How many cells ahead a person sees in dense fog."""
+PROXIMITY, COLLISION, OFF_ROAD, LANE_CHANGE = -2.0, -5.0, -5.0, -1.0
+
+CARS = ("front-left", "front-right", "rear-left", "rear-right")
+"""The four cars, named by where they start."""
+CAR_LANES = (0, 1, 0, 1)
+CAR_SIDES = (1, 1, -1, -1)
+
+# Relative speed of each car in cells per step, one row a scenario: a front car approaches when it
+# slows down (-1), a rear car when it speeds up (+1).
+SCENARIO_SPEEDS = {
+    "front-left slows": (-1, +1, -1, -1),
+    "front-right slows": (+1, -1, -1, -1),
+    "both front cars slow": (-1, -1, -1, -1),
+    "left lane squeezes": (-1, +1, +1, -1),
+    "right lane squeezes": (+1, -1, -1, +1),
+    "front-left slows, rear-right speeds up": (-1, +1, -1, +1),
+    "front-right slows, rear-left speeds up": (+1, -1, +1, -1),
+    "all four close in": (-1, -1, +1, +1),
+}
+
+
+@dataclass(frozen=True)
+class DrivingState:
+    """State of a batch of rounds.
+
+    Attributes:
+        lane: ego's lane ``[...]``, 0 left, 1 right.
+        position: cells ahead of the ego ``[..., 4]``, negative behind, not saturated.
+        speed: relative speed ``[..., 4]`` in cells per step.
+    """
+
+    lane: Tensor
+    position: Tensor
+    speed: Tensor
+
+
+class Driving:
+    """The driving domain; see the module's description."""
+
+    name = "driving"
+    version = "1"
+    modalities: tuple[Modality, ...] = (
+        Modality(
+            "visual",
+            CARS,
+            ("distance_ahead", "lane_offset"),
+            ("cells", "lanes"),
+            (12.0, 1.0),
+            0.01,
+        ),
+        Modality(
+            "verbal",
+            CARS,
+            ("distance_ahead", "lane_offset", "relative_speed"),
+            ("cells", "lanes", "cells/step"),
+            (12.0, 1.0, 1.0),
+            0.03,
+        ),
+    )
+    ego_features: tuple[str, ...] = ("lane",)
+    symbol_sizes: Mapping[str, int] = {"ego": 2, "visual": 50, "verbal": 53}
+    actions: tuple[str, ...] = ("stay", "switch")
+    horizon = 15
+    settings: tuple[str, ...] = ("clear", "fog")
+    scenarios: tuple[str, ...] = tuple(SCENARIO_SPEEDS)
+    reward_terms: tuple[str, ...] = ("proximity", "collision", "off_road", "lane_change")
+    directions: tuple[str, ...] = ("front_own", "front_other", "back_own", "back_other")
+    reach_bins: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, float(ROAD_END))
+    """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
+    cells away and none at the next edge. The last bin is the whole road."""
+
+    def initial(
+        self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
+    ) -> DrivingState:
+        """States ``[batch]`` at the start of a round.
+
+        Args:
+            batch: number of rounds.
+            generator: source of randomness; its device is where the states live.
+            scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
+        """
+        device = generator.device
+        if scenario is None:
+            scenario = torch.randint(
+                len(self.scenarios), (batch,), generator=generator, device=device
+            )
+        speeds = torch.tensor(list(SCENARIO_SPEEDS.values()), device=device)
+        distance = torch.randint(
+            1, ROAD_END, (batch, len(CARS)), generator=generator, device=device
+        )
+        return DrivingState(
+            lane=torch.randint(2, (batch,), generator=generator, device=device),
+            position=distance * torch.tensor(CAR_SIDES, device=device),
+            speed=speeds[scenario],
+        )
+
+    def transition(self, state: DrivingState, action: Tensor) -> DrivingState:
+        """State at t + 1; ``action`` ``[...]`` is 0 (stay) or 1 (switch)."""
+        lane = torch.where(action == SWITCH, 1 - state.lane, state.lane)
+        return replace(state, lane=lane, position=state.position + state.speed)
+
+    def rewards(
+        self, state: DrivingState, action: Tensor, following: DrivingState
+    ) -> dict[str, Tensor]:
+        """Reward terms ``[...]`` by name, in units of reward."""
+        lanes = torch.tensor(CAR_LANES, device=state.lane.device)
+        own = lanes == following.lane[..., None]
+        gap = following.position.abs()
+        off_road = (following.lane < 0) | (following.lane > 1)
+        dtype = torch.get_default_dtype()
+        return {
+            "proximity": PROXIMITY * (own & (gap <= NEAR)).sum(-1).to(dtype),
+            "collision": COLLISION * (own & (gap == 0)).sum(-1).to(dtype),
+            "off_road": OFF_ROAD * off_road.to(dtype),
+            "lane_change": LANE_CHANGE * (action == SWITCH).to(dtype),
+        }
+
+    def observe(self, state: DrivingState) -> Observation:
+        """Everything there is to observe: ego ``[..., 1]``, visual and verbal ``[..., 4, F]``."""
+        dtype = torch.get_default_dtype()
+        lanes = torch.tensor(CAR_LANES, device=state.lane.device)
+        position = state.position.clamp(-ROAD_END, ROAD_END).to(dtype)
+        offset = (lanes - state.lane[..., None]).to(dtype)
+        speed = torch.where(position.abs() < ROAD_END, state.speed.to(dtype), 0.0)
+        return {
+            "ego": state.lane[..., None].to(dtype),
+            "visual": torch.stack([position, offset], -1),
+            "verbal": torch.stack([position, offset, speed], -1),
+        }
+
+    def visibility(self, setting: str, observation: Observation) -> Visibility:
+        """What the setting lets an unaided person see.
+
+        Raises:
+            UnknownNameError: if the setting is neither ``clear`` nor ``fog``.
+        """
+        require_known(setting, "setting", self.settings)
+        ahead = observation["visual"][..., 0]
+        if setting == "clear":
+            seen = torch.ones_like(ahead, dtype=torch.bool)
+        else:
+            seen = (ahead >= 0) & (ahead <= FOG_REACH)
+        return {"visual": seen, "verbal": torch.zeros_like(seen)}
+
+    def communicable(self, observation: Observation) -> Visibility:
+        """Only cars in front on the visible road may be shown; any car on it may be spoken of."""
+        ahead = observation["visual"][..., 0]
+        on_road = ahead.abs() < ROAD_END
+        return {"visual": on_road & (ahead >= 0), "verbal": on_road}
+
+    def unknown_so_far(self, visibility: Visibility) -> Visibility:
+        """Visual items ``[..., T, 4]`` of cars neither seen nor told of at this step or before."""
+        known = (visibility["visual"] | visibility["verbal"]).long().cummax(-2).values.bool()
+        return {"visual": ~known, "verbal": torch.zeros_like(known)}
+
+    def symbols(self, observation: Observation) -> dict[str, Tensor]:
+        """Observations as discrete symbols, the form in which networks read them.
+
+        Returns:
+            ego ``[..., 2]``, one-hot lane; visual ``[..., 4, 50]``, one-hot over distance and
+            own/other lane; verbal ``[..., 4, 53]``, the same and one-hot speed.
+        """
+        dtype = observation["ego"].dtype
+
+        def place(item: Tensor) -> Tensor:
+            own = (item[..., 1] == 0).long()
+            index = (item[..., 0].long() + ROAD_END) * 2 + own
+            return one_hot(index, 2 * (2 * ROAD_END + 1)).to(dtype)
+
+        verbal = observation["verbal"]
+        speed = one_hot(verbal[..., 2].long() + 1, 3).to(dtype)
+        return {
+            "ego": one_hot(observation["ego"][..., 0].long(), 2).to(dtype),
+            "visual": place(observation["visual"]),
+            "verbal": torch.cat([place(verbal), speed], -1),
+        }
+
+    def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
+        """Direction (index into ``directions``) and distance in cells of each car, ``[..., 4]``."""
+        ahead, offset = observation["visual"].unbind(-1)
+        return 2 * (ahead < 0).long() + (offset != 0).long(), ahead.abs()
+
+    def absent(self, observation: Observation) -> Observation:
+        """The same lane and an empty road: every car beyond the visible end."""
+        empty = {name: value.clone() for name, value in observation.items()}
+        for name in ("visual", "verbal"):
+            empty[name][..., 0] = ROAD_END
+        empty["verbal"][..., 2] = 0.0
+        return empty
+
+    def remove(self, state: DrivingState, gone: Tensor) -> DrivingState:
+        """The state without the cars marked in ``gone`` ``[..., 4]``: they are far off the road."""
+        return replace(state, position=torch.where(gone, 10 * ROAD_END, state.position))
+
+    def reference_values(self, state: DrivingState, discount: float) -> Tensor:
+        """Exact action values ``[..., 2]`` with everything known, to the end of the encounter."""
+        known = torch.ones_like(state.position, dtype=torch.bool)
+        return known_car_values(state, known, self.horizon, discount)
+
+    def render(self, state: DrivingState) -> np.ndarray:
+        """Picture ``uint8 [height, width, 3]`` of one state, the road running to the right."""
+        cell, lanes, length = 16, 2, 2 * ROAD_END + 1
+        picture = np.full((lanes * cell, length * cell, 3), 235, dtype=np.uint8)
+        picture[cell - 1 : cell + 1, :: cell // 2] = 255
+
+        def block(lane: int, position: int, colour: tuple[int, int, int]) -> None:
+            left = (position + ROAD_END) * cell
+            picture[lane * cell + 3 : (lane + 1) * cell - 3, left + 1 : left + cell - 1] = colour
+
+        for lane, position in zip(CAR_LANES, state.position.reshape(-1).tolist(), strict=True):
+            if abs(position) < ROAD_END:
+                block(lane, position, (200, 60, 50))
+        block(int(state.lane), 0, (40, 90, 200))
+        return picture
+
+
+def lane_rewards(
+    position: Tensor, speed: Tensor, known: Tensor, horizon: int, weights: Tensor
+) -> Tensor:
+    """Reward of being in each lane at each of the next steps, given the cars that are known.
+
+    Args:
+        position: cells ahead ``[..., 4]``.
+        speed: relative speed ``[..., 4]`` in cells per step.
+        known: which cars are known ``[..., 4]``; the others are taken to be absent.
+        horizon: number of steps H.
+        weights: reward of a car of the same lane by its distance in cells, ``[D]`` or
+            ``[..., D]``; cars at D cells and beyond do not matter.
+
+    Returns:
+        ``[..., H, 2]``: entry (h, lane) is the reward at step h + 1.
+    """
+    steps = torch.arange(1, horizon + 1, device=position.device)
+    gap = (position[..., None, :] + speed[..., None, :] * steps[:, None]).abs().long()
+    number = weights.shape[-1]
+    near = known[..., None, :] & (gap < number)
+    shape = gap.shape[:-1]
+    table = weights.expand(*shape, number)
+    value = torch.where(near, table.gather(-1, gap.clamp(max=number - 1)), 0.0)
+    lanes = torch.tensor(CAR_LANES, device=position.device)
+    return torch.stack([(value * (lanes == lane)).sum(-1) for lane in range(2)], -1)
+
+
+def task_weights(device: torch.device | None = None) -> Tensor:
+    """Reward of a car of the ego's lane at 0, 1, ..., ``NEAR`` cells, ``[NEAR + 1]``."""
+    weights = torch.full((NEAR + 1,), PROXIMITY, device=device)
+    weights[0] += COLLISION
+    return weights
+
+
+def known_car_values(state: DrivingState, known: Tensor, horizon: int, discount: float) -> Tensor:
+    """Action values ``[..., 2]`` of the task for a planner that knows only some of the cars.
+
+    Args:
+        state: where those cars are and how fast they move; what it says of others is not used.
+        known: ``[..., 4]``; unknown cars are taken to be absent.
+        horizon: number of steps looked ahead.
+        discount: discount per step.
+    """
+    rewards = lane_rewards(
+        state.position, state.speed, known, horizon, task_weights(state.position.device)
+    )
+    return action_values(rewards, state.lane, LANE_CHANGE, discount)

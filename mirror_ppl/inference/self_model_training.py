@@ -1,0 +1,253 @@
+"""Training of the self-model: SVI for the world, Q-learning for the policy (supplement, section D).
+
+Training alternates between phases of driving and of learning. Before a phase each round is given to
+the expert with probability beta, else to the model's own epsilon-greedy policy. Every gradient step
+draws rounds from all experience so far, sees each through a view of its own, and follows
+
+    - ELBO / (B (T + 1)) * world_weight  +  mean squared Bellman error of both actions.
+
+The Bellman error uses the outcomes of *every* action: the robot's simulator is at hand, so no
+action's value has to wait until somebody takes it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Domain
+from mirror_ppl.errors import CheckpointError
+from mirror_ppl.files import write_whole
+from mirror_ppl.inference.experience import Experience, drive, experience, map_state
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.views import draw_views
+
+
+@dataclass(frozen=True)
+class SelfModelOptions:
+    """Settings of self-model training.
+
+    Attributes:
+        phases: number of phases of driving and learning.
+        rounds: rounds driven in a phase.
+        steps: gradient steps of a phase.
+        batch: rounds in a gradient step.
+        learning_rate: of Adam at the start; it falls to a hundredth on a cosine. The supplement's
+            constant 3e-4 learns as well but needs about three times as many steps.
+        beta: probability that the expert drives a round, in the first phase (supplement: 0.5).
+        beta_decay: factor on beta after each phase (supplement: 0.8).
+        epsilon: probability of a random action, in the first phase (supplement: 0.5).
+        epsilon_decay: factor on epsilon after each phase (supplement: 0.75).
+        epsilon_floor: least epsilon; people err more often than a finished policy, and the
+            robot has to know the states that errors lead to.
+        discount: discount of rewards per step.
+        target_rate: rate at which the target network follows the Q-network, per step.
+        world_weight: weight of the negative ELBO per observation.
+    """
+
+    phases: int = 40
+    rounds: int = 2048
+    steps: int = 300
+    batch: int = 64
+    learning_rate: float = 1e-3
+    beta: float = 0.5
+    beta_decay: float = 0.8
+    epsilon: float = 0.5
+    epsilon_decay: float = 0.75
+    epsilon_floor: float = 0.15
+    discount: float = 0.9
+    target_rate: float = 0.01
+    world_weight: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("phases", "rounds", "steps", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name in ("beta", "beta_decay", "epsilon", "epsilon_decay", "epsilon_floor", "discount"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Parts of the loss of one gradient step."""
+
+    total: Tensor
+    negative_elbo: Tensor
+    bellman: Tensor
+
+
+def self_model_loss(
+    self_model: SelfModel, target: torch.nn.Module, lived: Experience, options: SelfModelOptions
+) -> Loss:
+    """Loss of a batch of rounds; ``target`` is the slow copy of the Q-network."""
+    bound, z = self_model.elbo(lived.rounds)
+    batch, steps = lived.rounds.actions.shape
+    negative_elbo = -bound / (batch * (steps + 1))
+    belief = z[:, :-1]
+    goals = []
+    with torch.no_grad():
+        for action, outcome in enumerate(lived.outcomes):
+            embedded = self_model.encoder.embed(self_model.domain.symbols(outcome.observation))
+            evidence = self_model.encoder.combine(embedded, outcome.visible)
+            evidence = evidence + self_model.encoder.action.weight[action]
+            value = target(self_model.encoder(belief, evidence).mean).amax(-1)
+            # The encounter is over after the last step: every car has left or is leaving.
+            value[:, -1] = 0.0
+            goals.append(outcome.reward + options.discount * value)
+    error = self_model.action_values(belief) - torch.stack(goals, -1)
+    bellman = error.pow(2).mean()
+    return Loss(options.world_weight * negative_elbo + bellman, negative_elbo.detach(),
+                bellman.detach())
+
+
+def train_self_model(
+    domain: Domain,
+    options: SelfModelOptions,
+    generator: torch.Generator,
+    report: Callable[[int, str], None] = lambda done, message: None,
+    checkpoint: Path | None = None,
+) -> SelfModel:
+    """Train a self-model from nothing.
+
+    Args:
+        domain: the world to learn.
+        options: settings.
+        generator: source of randomness; torch's global generator is forked and seeded from it
+            because Pyro draws from the global one.
+        report: called after each phase with the number of phases done and a message.
+        checkpoint: file that is written after each phase and continued from if it exists.
+
+    Raises:
+        CheckpointError: if the checkpoint belongs to other options or cannot be read.
+    """
+    device = generator.device
+    seed = int(torch.randint(2**31, (1,), generator=generator, device=device))
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        trainer = _Trainer(domain, options, generator)
+        trainer.run(report, checkpoint)
+    return trainer.self_model.eval()
+
+
+class _Trainer:
+    """State of a training run; everything that a checkpoint has to hold."""
+
+    def __init__(
+        self, domain: Domain, options: SelfModelOptions, generator: torch.Generator
+    ) -> None:
+        self.domain = domain
+        self.options = options
+        self.generator = generator
+        self.self_model = SelfModel(domain).to(generator.device)
+        self.target = copy.deepcopy(self.self_model.q_network)
+        self.optimizer = torch.optim.Adam(
+            self.self_model.parameters(), options.learning_rate, fused=True
+        )
+        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+            self.optimizer, options.phases * options.steps, options.learning_rate / 100
+        )
+        self.starts: list[Any] = []
+        self.actions: list[Tensor] = []
+        self.phase = 0
+
+    def run(self, report: Callable[[int, str], None], checkpoint: Path | None) -> None:
+        if checkpoint is not None and checkpoint.exists():
+            self._restore(checkpoint)
+        while self.phase < self.options.phases:
+            self._drive()
+            message = self._learn()
+            self.phase += 1
+            if checkpoint is not None:
+                self._save(checkpoint)
+            report(self.phase, message)
+
+    def _save(self, path: Path) -> None:
+        starts = [map_state(lambda part: part.to(torch.int16), start) for start in self.starts]
+        content = {
+            "options": asdict(self.options),
+            "phase": self.phase,
+            "self_model": self.self_model.state_dict(),
+            "target": self.target.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
+            "starts": [vars(start) for start in starts],
+            "actions": [actions.to(torch.int8) for actions in self.actions],
+            "generator": self.generator.get_state(),
+            "torch": torch.random.get_rng_state(),
+        }
+        write_whole(path, lambda temporary: torch.save(content, temporary))
+
+    def _restore(self, path: Path) -> None:
+        try:
+            content = torch.load(path, weights_only=True)
+        except Exception as error:
+            raise CheckpointError(f"{path}: not a checkpoint of this program") from error
+        if content.get("options") != asdict(self.options):
+            raise CheckpointError(f"{path}: made with other options; remove it to start anew")
+        self.self_model.load_state_dict(content["self_model"])
+        self.target.load_state_dict(content["target"])
+        self.optimizer.load_state_dict(content["optimizer"])
+        self.schedule.load_state_dict(content["schedule"])
+        kind = type(self.domain.initial(1, torch.Generator(self.generator.device)))
+        self.starts = [
+            kind(**{name: part.long() for name, part in start.items()})
+            for start in content["starts"]
+        ]
+        self.actions = [actions.long() for actions in content["actions"]]
+        self.phase = content["phase"]
+        self.generator.set_state(content["generator"])
+        torch.random.set_rng_state(content["torch"])
+
+    def _drive(self) -> None:
+        options, domain = self.options, self.domain
+        start = domain.initial(options.rounds, self.generator)
+        plan = draw_views(domain, options.rounds, domain.horizon, self.generator)
+        epsilon = options.epsilon * options.epsilon_decay**self.phase
+        self.starts.append(start)
+        self.actions.append(
+            drive(
+                self.self_model, start, plan, domain.horizon, self.generator,
+                epsilon=max(epsilon, options.epsilon_floor),
+                expert=options.beta * options.beta_decay**self.phase,
+                discount=options.discount,
+            )
+        )
+
+    def _learn(self) -> str:
+        options = self.options
+        starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
+        actions = torch.cat(self.actions)
+        elbo = bellman = 0.0
+        for _ in range(options.steps):
+            chosen = torch.randint(
+                len(actions), (options.batch,), generator=self.generator,
+                device=self.generator.device,
+            )
+            plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
+            start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
+            lived = experience(self.domain, start, actions[chosen], plan)
+            loss = self_model_loss(self.self_model, self.target, lived, options)
+            self.optimizer.zero_grad()
+            loss.total.backward()
+            torch.nn.utils.clip_grad_norm_(self.self_model.parameters(), 5.0)
+            self.optimizer.step()
+            self.schedule.step()
+            self._follow()
+            elbo -= float(loss.negative_elbo) / options.steps
+            bellman += float(loss.bellman) / options.steps
+        return f"elbo {elbo:.2f} per observation, bellman error {bellman:.3f}"
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        pairs = zip(
+            self.target.parameters(), self.self_model.q_network.parameters(), strict=True
+        )
+        for slow, fast in pairs:
+            slow.lerp_(fast, self.options.target_rate)

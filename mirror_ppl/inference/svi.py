@@ -1,0 +1,232 @@
+"""Stochastic variational inference of implants, with the discrete ones marginalized exactly.
+
+The evidence lower bound enumerates every discrete site of the human model in parallel, so a guide
+is needed for the continuous sites alone. Mean-field guides on relaxed sight thresholds get stuck
+between plateaus of the likelihood; enumeration has no such trap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import pyro
+import torch
+from pyro import poutine
+from pyro.infer import TraceEnum_ELBO, config_enumerate, infer_discrete
+from pyro.infer.autoguide import AutoGuide, AutoNormal, init_to_median
+from torch import Tensor
+
+from mirror_ppl.errors import CheckpointError
+from mirror_ppl.files import write_whole
+from mirror_ppl.inference.views import discrete_sites
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.view_table import ViewTable
+
+Draws = dict[str, Tensor]
+"""Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
+
+PLATES = 2
+"""People and their rounds; whatever is drawn or enumerated goes to the left of them."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Settings of fitting implants.
+
+    Attributes:
+        steps: gradient steps of variational inference.
+        learning_rate: of Adam at the start; it falls to a twentieth on a cosine.
+        draws: posterior draws S.
+        checkpoint_every: steps between checkpoints.
+    """
+
+    steps: int = 150
+    learning_rate: float = 0.05
+    draws: int = 200
+    checkpoint_every: int = 25
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "draws", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
+
+
+@dataclass(frozen=True)
+class ImplantPosterior:
+    """What was inferred of P people.
+
+    Attributes:
+        guide: over the continuous sites.
+        draws: joint posterior draws of all sites, ``[S, P, 1, ...]``.
+        losses: negative ELBO at each step, in nats.
+    """
+
+    guide: AutoGuide
+    draws: Draws
+    losses: tuple[float, ...]
+
+
+def continuous_guide(human: HumanModel, table: ViewTable) -> AutoGuide:
+    """A mean-field guide over the continuous sites of a human model, one factor a person."""
+    hidden = list(discrete_sites(human))
+    model = poutine.block(human.model, hide=hidden)
+    guide = AutoNormal(model, init_loc_fn=init_to_median, init_scale=0.1)
+    guide(table)
+    return guide
+
+
+def fit_implants(
+    human: HumanModel,
+    table: ViewTable,
+    options: FitOptions,
+    seed: int,
+    report: Callable[[int, str], None] = lambda done, message: None,
+    checkpoint: tuple[Path, str] | None = None,
+) -> ImplantPosterior:
+    """Posterior of the implants of P people.
+
+    Args:
+        human: the model of people.
+        table: views of the rounds to learn from.
+        options: settings.
+        seed: seed of everything random here.
+        report: called after each step with the number of steps done and a message.
+        checkpoint: a file that is written now and then and continued from if it exists, and what
+            identifies this run (a checkpoint of another run is refused).
+
+    Raises:
+        CheckpointError: the checkpoint is damaged or of another run.
+    """
+    with torch.random.fork_rng(devices=[]), pyro.settings.context(module_local_params=True):
+        torch.manual_seed(seed)
+        guide = continuous_guide(human, table)
+        losses = _optimize(human, table, guide, options, report, checkpoint)
+        draws = draw_implants(human, table, guide, options.draws)
+    return ImplantPosterior(guide, draws, tuple(losses))
+
+
+def _optimize(
+    human: HumanModel,
+    table: ViewTable,
+    guide: AutoGuide,
+    options: FitOptions,
+    report: Callable[[int, str], None],
+    checkpoint: tuple[Path, str] | None,
+) -> list[float]:
+    elbo = TraceEnum_ELBO(max_plate_nesting=PLATES)(
+        config_enumerate(human.model, "parallel"), guide
+    )
+    optimizer = torch.optim.Adam(guide.parameters(), options.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimizer, options.steps, options.learning_rate / 20
+    )
+    losses: list[float] = []
+    if checkpoint is not None and checkpoint[0].exists():
+        losses = _restore(*checkpoint, guide, optimizer, schedule)
+    while len(losses) < options.steps:
+        optimizer.zero_grad()
+        loss = elbo(table)
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        losses.append(loss.item())
+        report(len(losses), f"negative ELBO {losses[-1]:.1f}")
+        if checkpoint is not None and len(losses) % options.checkpoint_every == 0:
+            _save(*checkpoint, guide, optimizer, schedule, losses)
+    return losses
+
+
+def _save(path: Path, run: str, guide, optimizer, schedule, losses: list[float]) -> None:
+    content = {
+        "run": run,
+        "guide": guide.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "schedule": schedule.state_dict(),
+        "losses": losses,
+        "torch": torch.random.get_rng_state(),
+    }
+    write_whole(path, lambda temporary: torch.save(content, temporary))
+
+
+def _restore(path: Path, run: str, guide, optimizer, schedule) -> list[float]:
+    try:
+        content = torch.load(path, weights_only=True)
+        own = content["run"]
+    except Exception as error:
+        raise CheckpointError(f"{path} is not a checkpoint of this program; remove it") from error
+    if own != run:
+        raise CheckpointError(
+            f"{path} belongs to a fit with other recordings or options; remove it to start anew"
+        )
+    guide.load_state_dict(content["guide"])
+    optimizer.load_state_dict(content["optimizer"])
+    schedule.load_state_dict(content["schedule"])
+    torch.random.set_rng_state(content["torch"])
+    return content["losses"]
+
+
+@torch.no_grad()
+def draw_implants(human: HumanModel, table: ViewTable, guide: AutoGuide, number: int) -> Draws:
+    """Joint draws ``[S, P, 1, ...]`` of all sites from the guide and the enumerated posterior."""
+    model = config_enumerate(human.model, "parallel")
+    chunks = []
+    for _ in range(number):
+        continuous = guide(table)
+        sampled = infer_discrete(
+            poutine.condition(model, data=continuous), first_available_dim=-1 - PLATES
+        )
+        trace = poutine.trace(sampled).get_trace(table)
+        chunks.append(
+            {
+                name: site["value"]
+                for name, site in trace.nodes.items()
+                if site["type"] == "sample" and (name in continuous or not site["is_observed"])
+                and not name.startswith("_") and name not in ("person", "round")
+            }
+        )
+    return {name: torch.stack([chunk[name] for chunk in chunks]) for name in chunks[0]}
+
+
+@torch.no_grad()
+def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
+    """Draws ``[S, P, 1, ...]`` of the prior's sites, ``act``'s own sites left out."""
+    with (
+        torch.random.fork_rng(devices=[]),
+        pyro.plate("draw", number, dim=-1 - PLATES),
+        pyro.plate("person", people, dim=-PLATES),
+    ):
+        torch.manual_seed(seed)
+        trace = poutine.trace(human.prior).get_trace()
+    return {
+        name: site["value"].expand(site["fn"].batch_shape + site["fn"].event_shape)
+        for name, site in trace.nodes.items()
+        if site["type"] == "sample" and not site["is_observed"]
+    }
+
+
+@torch.no_grad()
+def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
+    """Log-probabilities ``[S, P, B, T, A]`` of actions, for each draw of the implants.
+
+    Runs the same program as fitting, with the implants conditioned on the draws and each person
+    seeing what the draw says they see.
+    """
+    number = next(iter(draws.values())).shape[0]
+    person = torch.arange(table.people)[:, None]
+    results = []
+    for draw in range(number):
+        own = {name: value[draw] for name, value in draws.items()}
+        with (
+            poutine.block(),
+            poutine.condition(data=own),
+            pyro.plate("person", table.people, dim=-PLATES),
+        ):
+            implants = human.prior()
+            view = table.view_of(implants).expand(table.people, table.rounds)
+            belief, values = table.belief[person, view], table.values[person, view]
+            results.append(human.act(implants, belief, values))
+    return torch.stack(results)

@@ -1,0 +1,65 @@
+"""A Gaussian Markov chain as one Pyro distribution.
+
+Latent trajectories are one sample site, ``z`` ``[T + 1, Z]``. Drawing from the chain walks through
+time; its log density, given the whole trajectory, needs no walk and is computed for all steps at
+once, which is what makes the evidence lower bound cheap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from pyro.distributions import TorchDistribution
+from torch import Tensor
+from torch.distributions import Normal, constraints
+
+from mirror_ppl.models.networks import Gaussian
+
+Step = Callable[[Tensor, Tensor], Gaussian]
+
+
+class GaussianChain(TorchDistribution):
+    """``p(z_0) prod_t p(z_t | z_{t-1}, u_t)`` with diagonal Gaussian steps.
+
+    Args:
+        initial: parameters ``[..., Z]`` of ``p(z_0)``.
+        step: ``(z_{t-1} [..., Z], u_t [..., U]) -> Gaussian [..., Z]``.
+        inputs: ``u_1 .. u_T``, ``[..., T, U]`` or ``[..., T]``.
+        input_dims: 1 if each ``u_t`` is a vector, 0 if it is a number (an action's index).
+    """
+
+    arg_constraints = {}  # noqa: RUF012 - the base class declares it so
+    support = constraints.real_vector
+    has_rsample = True
+
+    def __init__(self, initial: Gaussian, step: Step, inputs: Tensor, input_dims: int) -> None:
+        self.initial = initial
+        self.step = step
+        self.inputs = inputs
+        self.time = inputs.dim() - 1 - input_dims
+        steps = inputs.shape[self.time]
+        batch = initial.mean.shape[:-1]
+        event = torch.Size((steps + 1, initial.mean.shape[-1]))
+        super().__init__(batch, event, validate_args=False)
+
+    def expand(self, batch_shape: torch.Size, _instance: object = None) -> GaussianChain:
+        if torch.Size(batch_shape) != self.batch_shape:
+            raise ValueError("a GaussianChain has one trajectory for each of its inputs")
+        return self
+
+    def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+        mean, scale = self.initial
+        shape = torch.Size(sample_shape) + mean.shape
+        latent = mean + scale * torch.randn(shape, dtype=mean.dtype, device=mean.device)
+        trajectory = [latent]
+        for inputs in self.inputs.unbind(self.time):
+            mean, scale = self.step(latent, inputs)
+            latent = mean + scale * torch.randn_like(mean)
+            trajectory.append(latent)
+        return torch.stack(trajectory, -2)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        first = Normal(*self.initial, validate_args=False).log_prob(value[..., 0, :])
+        rest = Normal(*self.step(value[..., :-1, :], self.inputs), validate_args=False)
+        return first.sum(-1) + rest.log_prob(value[..., 1:, :]).sum((-1, -2))

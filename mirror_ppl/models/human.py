@@ -1,0 +1,152 @@
+"""The human model: the robot's self-model with implants, as one Pyro program.
+
+Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a person ``p``::
+
+    psi_p      ~ prior                                     inside pyro.plate("person", P)
+    n_t        = natural visibility of each item           perceptual implants
+    v_t        = n_t or told_t                             what was communicated is overlaid
+    zH_t       = mean of q(. | zH_{t-1}, v_t * x_t, v_t, a_{t-1})         social projection
+    a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
+    z_t, x_t, r_t ~ the self-model's transition, observation and reward likelihoods
+
+To change the model, derive from :class:`HumanModel` and override one of ``prior``, ``perceive``,
+``believe`` and ``act``, in Pyro's syntax; fitting, predicting and simulating call those methods.
+
+Departures from the supplement: thresholds are inferred by the bin between distances that can occur;
+a person may take the unseen to be absent (``assumes_clear``); actions may be lapses. Reasons and
+measurements stand in ``docs/decisions.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pyro
+import torch
+from torch import Tensor, nn
+
+from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.self_model import Rounds, SelfModel
+from mirror_ppl.models.view_table import ViewedActions, ViewTable
+
+Implants = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class View:
+    """What of a round enters a person's belief; masks ``[..., T, K]`` for each modality.
+
+    Attributes:
+        visible: seen or told.
+        absent: not seen or told, and taken to be absent.
+    """
+
+    visible: Visibility
+    absent: Visibility
+
+
+class HumanModel(nn.Module):
+    """The probabilistic model of people.
+
+    Args:
+        self_model: the robot's networks; they are frozen here.
+
+    Batch dimensions of implants are ``[..., P, 1]``: people at -2, and -1 left for their rounds or
+    views. Weights and the like follow as event dimensions.
+    """
+
+    def __init__(self, self_model: SelfModel) -> None:
+        super().__init__()
+        self.self_model = self_model.eval().requires_grad_(False)
+
+    @property
+    def domain(self) -> Domain:
+        """The domain that people act in."""
+        return self.self_model.domain
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample the implants of every person; runs inside ``pyro.plate("person", P, dim=-2)``.
+
+        Discrete sites with finite support are marginalized exactly, all others get an automatic
+        guide. Returns values by name, for :meth:`perceive` and :meth:`act`.
+        """
+        like = next(self.self_model.parameters())
+        return implant_priors.perceptual_implants(
+            self.domain, like
+        ) | implant_priors.policy_implants(self.domain, self.self_model.latent, like)
+
+    def perceive(self, implants: Implants, observation: Observation, told: Visibility) -> View:
+        """What a person sees, and takes to be absent.
+
+        Args:
+            implants: the discrete sites of :meth:`prior`, ``[...]``.
+            observation: everything that could be seen, ``[..., T, K, F]``.
+            told: what is communicated, ``[..., T, K]``.
+        """
+        direction, distance = self.domain.distance(observation)
+        thresholds = implant_priors.reach(self.domain, implants)[..., None, None, :]
+        selected = torch.zeros_like(distance)
+        for index in range(thresholds.shape[-1]):
+            selected = torch.where(direction == index, thresholds[..., index], selected)
+        visible = {name: mask.expand(selected.shape) for name, mask in told.items()}
+        visible["visual"] = (distance <= selected) | told["visual"]
+        unknown = self.domain.unknown_so_far(visible)
+        clear = implants[implant_priors.ASSUMES_CLEAR][..., None, None] == 1
+        return View(visible, {name: mask & clear for name, mask in unknown.items()})
+
+    def believe(self, view: View, observation: Observation, actions: Tensor) -> Tensor:
+        """Beliefs ``zH`` ``[..., T, Z]`` of views of rounds: the means of the robot's own encoder.
+
+        Args:
+            view: masks ``[..., T, K]``.
+            observation: everything that could be seen, ``[..., T, K, F]``.
+            actions: what was done, ``[..., T]``; the last one is not used.
+        """
+        encoder, domain = self.self_model.encoder, self.domain
+        real = encoder.embed(domain.symbols(observation))
+        empty = encoder.embed(domain.symbols(domain.absent(observation)))
+        evidence = encoder.combine(real, view.visible)
+        evidence = encoder.combine({**empty, "ego": evidence}, view.absent)
+        evidence = evidence + encoder.previous_actions(actions[..., :-1])
+        return self.self_model.believe(evidence)
+
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """Log-probabilities of actions ``[..., T, A]``.
+
+        Runs inside the person plate, so new sample sites have one value a person, ``[..., P, 1]``.
+
+        Args:
+            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
+            belief: ``[..., P, V, T, Z]``, of each view of each person's rounds, in time order.
+            values: the self-model's action values at the belief, ``[..., P, V, T, A]``.
+        """
+        logits = implants["consistency"][..., None, None] * values
+        logits = logits + implant_priors.residual(implants, belief)
+        lapse = implants["lapse"][..., None, None]
+        aware = torch.log1p(-lapse) + torch.log_softmax(logits, -1)
+        return torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
+
+    def model(self, table: ViewTable, world: Rounds | None = None) -> None:
+        """The program, conditioned on the recorded actions of a table of views.
+
+        Args:
+            table: the rounds of P people and the distinct views of them.
+            world: the same rounds, flattened, to condition the self-model's states, observations
+                and rewards too. They do not depend on implants once the actions are known, so
+                fitting implants leaves them out; see :meth:`SelfModel.elbo` for their bound.
+        """
+        with pyro.plate("person", table.people, dim=-2):
+            implants = self.prior()
+            log_probabilities = self.act(implants, table.belief, table.values)
+            view = table.view_of(implants)
+            with pyro.plate("round", table.rounds, dim=-1):
+                pyro.sample(
+                    "actions",
+                    ViewedActions(table.log_likelihoods(log_probabilities), view, table.real),
+                    obs=table.recorded,
+                )
+        if world is not None:
+            with pyro.plate("worlds", 1, dim=-2):
+                self.self_model.model(world)

@@ -1,0 +1,101 @@
+"""Implants: what distinguishes a person from the robot, as priors (supplement, section C).
+
+Perceptual implants say what a person sees, and what they make of the rest; policy implants say how
+they decide. Each is a sample site of the human model, with one value a person.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Domain
+
+SIGHT = "sight_"
+"""Prefix of the sites of directional sight thresholds, one for each direction of the domain."""
+ASSUMES_CLEAR = "assumes_clear"
+"""Site of what the person makes of things they have not seen or been told of."""
+RESIDUAL_HIDDEN = 8
+
+
+def sight_sites(domain: Domain) -> tuple[str, ...]:
+    """Names of the sites of sight thresholds, in the order of the domain's directions."""
+    return tuple(SIGHT + direction for direction in domain.directions)
+
+
+def perceptual_implants(domain: Domain, like: Tensor) -> dict[str, Tensor]:
+    """Sample what a person sees, as indices that can be enumerated.
+
+    ``sight_<direction>`` is an index into the domain's ``reach_bins``, uniform: a threshold matters
+    only where it crosses a distance that can occur, so those crossings are all there is to infer.
+    ``assumes_clear`` is 1 for a person to whom what they never saw is not there, and 0 for one to
+    whom it is unknown, as it is to the robot.
+    """
+    bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
+    implants = {
+        site: pyro.sample(site, dist.Categorical(bins / bins.sum())) for site in sight_sites(domain)
+    }
+    half = torch.full((2,), 0.5, dtype=like.dtype, device=like.device)
+    implants[ASSUMES_CLEAR] = pyro.sample(ASSUMES_CLEAR, dist.Categorical(half))
+    return implants
+
+
+def policy_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tensor]:
+    """Sample how a person decides.
+
+    - ``consistency``: inverse temperature of the choice between action values, per unit of reward;
+    - ``lapse``: probability that an action has nothing to do with the belief;
+    - ``residual_in`` ``[..., Z + 1, R]`` and ``residual_out`` ``[..., R + 1, A]``: weights (the
+      last row is the bias) of the network of the residual ``delta(zH_t)``. The prior keeps its
+      output small (about 0.3 on logits), because a large residual can imitate blindness.
+    """
+
+    def number(value: float) -> Tensor:
+        return torch.tensor(value, dtype=like.dtype, device=like.device)
+
+    def weights(rows: int, columns: int, scale: float) -> Tensor:
+        zero = torch.zeros(rows, columns, dtype=like.dtype, device=like.device)
+        return dist.Normal(zero, scale).to_event(2)
+
+    return {
+        "consistency": pyro.sample(
+            "consistency", dist.LogNormal(number(math.log(3.0)), number(0.5))
+        ),
+        "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(30.0))),
+        "residual_in": pyro.sample(
+            "residual_in", weights(latent + 1, RESIDUAL_HIDDEN, latent**-0.5)
+        ),
+        "residual_out": pyro.sample(
+            "residual_out", weights(RESIDUAL_HIDDEN + 1, len(domain.actions), 0.1)
+        ),
+    }
+
+
+def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
+    """Sight thresholds ``[..., D]`` in the domain's unit of distance."""
+    bins = torch.tensor(domain.reach_bins, device=implants[sight_sites(domain)[0]].device)
+    return torch.stack(
+        torch.broadcast_tensors(*(bins[implants[site]] for site in sight_sites(domain))), -1
+    )
+
+
+def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
+    """``delta(zH_t)`` ``[..., T, A]`` of beliefs ``[..., T, Z]``: one hidden layer."""
+    hidden = torch.tanh(_layer(implants["residual_in"], belief))
+    return _layer(implants["residual_out"], hidden)
+
+
+def _layer(weights: Tensor, inputs: Tensor) -> Tensor:
+    """Per-person linear layer: weights ``[..., I + 1, O]`` on inputs ``[..., T, I]``."""
+    if weights.dim() > 2 and weights.shape[-3] == 1 and inputs.dim() > 3:
+        # Views of a person share the weights: one product for all of them, not one for each.
+        weights = weights.squeeze(-3)
+        product = inputs.flatten(-3, -2) @ weights[..., :-1, :]
+        product = product.unflatten(-2, inputs.shape[-3:-1])
+        return product + weights[..., None, -1:, :]
+    return inputs @ weights[..., :-1, :] + weights[..., -1:, :]

@@ -1,0 +1,156 @@
+"""The robot's self-model: a latent state-space model over modalities, and values on its states.
+
+Implements section D of the supplement ("Gridworld Driving"):
+
+    p(z_0) prod_t p(z_t | z_{t-1}, a_{t-1}) prod_m p(x^m_t | z_t) p(r_t | z_t, a_t)
+
+with the amortized guide ``q(z_t | z_{t-1}, v_t * x_t, v_t, a_{t-1})``, whose targets are unmasked
+observations, and a Q-network on ``z_t``.
+
+Departures, each with its reason in ``docs/decisions.md``:
+
+- observations enter as discrete symbols (the supplement calls them discrete) and leave as Gaussians;
+- transition and encoder predict the change of the state instead of the state;
+- the ego's own state is decoded like a modality that is always visible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pyro
+import pyro.distributions as dist
+import torch
+from pyro import poutine
+from torch import Tensor, nn
+
+from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.models.distributions import GaussianChain
+from mirror_ppl.models.networks import (
+    Decoder,
+    Encoder,
+    Gaussian,
+    QNetwork,
+    Reward,
+    Transition,
+)
+
+LATENT = 48
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """A batch of rounds as a self-model sees it.
+
+    Attributes:
+        observation: what is true, ``[B, T + 1, ...]``: the target of the decoders.
+        visible: what is seen of it, ``[B, T + 1, K]`` for each modality.
+        actions: ``[B, T]``.
+        rewards: ``[B, T]``, of the action and the state that it leads to.
+    """
+
+    observation: Observation
+    visible: Visibility
+    actions: Tensor
+    rewards: Tensor
+
+
+class SelfModel(nn.Module):
+    """Networks and probabilistic program of the robot.
+
+    Args:
+        domain: the domain that the networks are sized for.
+        latent: number of latent dimensions Z.
+    """
+
+    def __init__(self, domain: Domain, latent: int = LATENT) -> None:
+        super().__init__()
+        self.domain = domain
+        self.latent = latent
+        actions = len(domain.actions)
+        items = {modality.name: len(modality.items) for modality in domain.modalities}
+        self.encoder = Encoder(latent, actions, domain.symbol_sizes, items)
+        self.transition = Transition(latent, actions)
+        self.decoders = nn.ModuleDict(
+            {"ego": Decoder(latent, 1, len(domain.ego_features))}
+            | {m.name: Decoder(latent, len(m.items), len(m.features)) for m in domain.modalities}
+        )
+        self.reward = Reward(latent, actions)
+        self.q_network = QNetwork(latent, actions)
+        self.scales: dict[str, tuple[float, ...]] = {
+            "ego": (1.0,) * len(domain.ego_features)
+        } | {modality.name: modality.scales for modality in domain.modalities}
+
+    def model(self, rounds: Rounds) -> Tensor:
+        """The generative program, conditioned on what is true; returns ``z`` ``[B, T + 1, Z]``."""
+        actions = rounds.actions
+        with pyro.plate("round", actions.shape[0]):
+            z = pyro.sample(
+                "z", GaussianChain(self.prior(actions.shape[:1]), self.transition, actions, 0)
+            )
+            for name, target in self.targets(rounds.observation).items():
+                mean, scale = self.decoders[name](z)
+                pyro.sample(f"x_{name}", dist.Normal(mean, scale).to_event(3), obs=target)
+            mean, scale = self.reward(z[..., :-1, :], actions)
+            pyro.sample("reward", dist.Normal(mean, scale).to_event(1), obs=rounds.rewards)
+        return z
+
+    def guide(self, rounds: Rounds) -> Tensor:
+        """The amortized guide: the encoder on what is visible; returns ``z`` ``[B, T + 1, Z]``."""
+        evidence = self.evidence(rounds.observation, rounds.visible, rounds.actions)
+        nothing = evidence.new_zeros(*evidence.shape[:-2], self.latent)
+        with pyro.plate("round", evidence.shape[0]):
+            return pyro.sample(
+                "z",
+                GaussianChain(
+                    self.encoder(nothing, evidence[..., 0, :]),
+                    self.encoder,
+                    evidence[..., 1:, :],
+                    1,
+                ),
+            )
+
+    def elbo(self, rounds: Rounds) -> tuple[Tensor, Tensor]:
+        """One-particle evidence lower bound, summed over rounds, and the ``z`` it was taken at."""
+        guide_trace = poutine.trace(self.guide).get_trace(rounds)
+        replayed = poutine.replay(self.model, trace=guide_trace)
+        model_trace = poutine.trace(replayed).get_trace(rounds)
+        bound = model_trace.log_prob_sum() - guide_trace.log_prob_sum()
+        return bound, guide_trace.nodes["_RETURN"]["value"]
+
+    def prior(self, batch: torch.Size) -> Gaussian:
+        """``p(z_0)``: a standard Gaussian, ``[*batch, Z]``."""
+        zero = next(self.parameters()).new_zeros(*batch, self.latent)
+        return Gaussian(zero, torch.ones_like(zero))
+
+    def targets(self, observation: Observation) -> Observation:
+        """Observations in units of the scales; ego as one item ``[..., 1, E]``."""
+        values = {name: value for name, value in observation.items() if name != "ego"}
+        values["ego"] = observation["ego"][..., None, :]
+        return {
+            name: value / torch.tensor(self.scales[name], dtype=value.dtype, device=value.device)
+            for name, value in values.items()
+        }
+
+    def evidence(self, observation: Observation, visible: Visibility, actions: Tensor) -> Tensor:
+        """What each step tells the encoder: ``x_t, v_t, a_{t-1}`` as ``[..., T + 1, H]``."""
+        embedded = self.encoder.embed(self.domain.symbols(observation))
+        steps = self.encoder.previous_actions(actions)
+        return self.encoder.combine(embedded, visible) + steps[..., : embedded["ego"].shape[-2], :]
+
+    def believe(self, evidence: Tensor) -> Tensor:
+        """Beliefs ``[..., T, Z]``: the encoder's means, each step starting from the last mean.
+
+        Args:
+            evidence: ``[..., T, H]`` from :meth:`evidence`.
+        """
+        belief = evidence.new_zeros(*evidence.shape[:-2], self.latent)
+        beliefs = []
+        for step in evidence.unbind(-2):
+            belief = self.encoder(belief, step).mean
+            beliefs.append(belief)
+        return torch.stack(beliefs, -2)
+
+    def action_values(self, belief: Tensor) -> Tensor:
+        """``Q(z_t, .)`` ``[..., A]`` of beliefs ``[..., Z]``, in units of reward."""
+        return self.q_network(belief)

@@ -1,0 +1,120 @@
+"""Tables of views: every distinct way in which a person may have seen their rounds.
+
+Perceptual implants reach the likelihood only through what is seen, and beliefs depend on nothing
+else. Many combinations of implants see the same, so beliefs are computed once for each distinct
+view of a round and kept; the program then looks up the view that its implants lead to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from pyro.distributions import TorchDistribution
+from torch import Tensor
+from torch.distributions import constraints
+
+if TYPE_CHECKING:
+    from mirror_ppl.models.human import Implants
+
+
+@dataclass(frozen=True)
+class ViewTable:
+    """Distinct views of the rounds of P people, V a person (padded), with the beliefs they lead to.
+
+    Attributes:
+        sites: names of the discrete sites that views depend on.
+        index: view of each person, round and combination of those sites' values,
+            ``[P, B, n_1, ..., n_k]``, an index into the person's V views.
+        belief: ``[P, V, T, Z]``.
+        values: the self-model's action values ``[P, V, T, A]``.
+        view_actions: recorded actions of the round that a view belongs to, ``[P, V, T]``.
+        view_steps: which of its steps are real, ``[P, V, T]``.
+        recorded: actions ``[P, B, T]``, 0 in padding.
+        steps: which steps are real ``[P, B, T]``.
+        view_counts: number of real views of each person ``[P]``.
+    """
+
+    sites: tuple[str, ...]
+    index: Tensor
+    belief: Tensor
+    values: Tensor
+    view_actions: Tensor
+    view_steps: Tensor
+    recorded: Tensor
+    steps: Tensor
+    view_counts: Tensor
+
+    @property
+    def people(self) -> int:
+        """Number of people P."""
+        return self.recorded.shape[0]
+
+    @property
+    def rounds(self) -> int:
+        """Largest number of rounds B of a person."""
+        return self.recorded.shape[1]
+
+    @property
+    def real(self) -> Tensor:
+        """Which rounds are real, ``[P, B]``."""
+        return self.steps.any(-1)
+
+    def view_of(self, implants: Implants) -> Tensor:
+        """The view that implants ``[..., P, 1]`` lead to in each round, ``[..., P, B]``."""
+        combination = torch.zeros((), dtype=torch.long, device=self.index.device)
+        for site, size in zip(self.sites, self.index.shape[2:], strict=True):
+            combination = combination * size + implants[site]
+        people = torch.arange(self.people, device=self.index.device)[:, None]
+        rounds = torch.arange(self.rounds, device=self.index.device)
+        table = self.index.flatten(2)
+        begin = (people * self.rounds + rounds) * table.shape[-1]
+        return table.reshape(-1)[begin + combination]
+
+    def log_likelihoods(self, log_probabilities: Tensor) -> Tensor:
+        """Log-likelihood of the recorded actions under each view.
+
+        Args:
+            log_probabilities: of actions ``[..., P, V, T, A]``.
+
+        Returns:
+            ``[..., P, V]``.
+        """
+        actions = self.view_actions.expand(log_probabilities.shape[:-1])
+        chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
+        return torch.where(self.view_steps, chosen, 0.0).sum(-1)
+
+
+class ViewedActions(TorchDistribution):
+    """Actions of whole rounds, given the log-likelihood of each view and which view was had.
+
+    Args:
+        log_likelihoods: of the recorded actions ``[..., P, V]``.
+        view: index ``[..., P, B]`` into V.
+        real: which rounds are real ``[P, B]``; the others have probability one.
+    """
+
+    arg_constraints = {}  # noqa: RUF012 - the base class declares it so
+    support = constraints.independent(constraints.nonnegative_integer, 1)
+
+    def __init__(self, log_likelihoods: Tensor, view: Tensor, real: Tensor) -> None:
+        self.log_likelihoods = log_likelihoods
+        self.view = view
+        self.real = real
+        batch = torch.broadcast_shapes(
+            (*log_likelihoods.shape[:-1], 1), view.shape, real.shape
+        )
+        super().__init__(batch, torch.Size((1,)), validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Looked up: ``value`` is what the likelihoods were computed for."""
+        del value
+        views = self.log_likelihoods.shape[-1]
+        # Where each leading index of the likelihoods begins in the flat table; gathering from a
+        # flat table keeps the gradient as small as the table.
+        begin = torch.arange(
+            self.log_likelihoods[..., 0].numel(), device=self.view.device
+        ).reshape(*self.log_likelihoods.shape[:-1], 1)
+        found = self.log_likelihoods.reshape(-1)[begin * views + self.view]
+        return torch.where(self.real, found, 0.0)

@@ -1,0 +1,97 @@
+"""Who the drivers of a population are: how far each sees and how consistent each is.
+
+Every draw comes from a generator derived from the seed, its purpose and the person's number. So
+person 3 of a seed is the same in every setting and however many other people there are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import require_known
+from mirror_ppl.domains.driving import FOG_REACH, ROAD_END, Driving
+
+CONSISTENCY_MEDIAN = 3.0
+"""Median over people of the consistency, in 1 / units of reward."""
+CONSISTENCY_SPREAD = 0.35
+"""Standard deviation over people of its logarithm."""
+
+SETTING_REACH = {
+    "clear": (ROAD_END, ROAD_END, ROAD_END, ROAD_END),
+    "fog": (FOG_REACH, FOG_REACH, 0, 0),
+}
+"""How far a setting lets see, in cells, for each of ``Driving.directions``."""
+REACHES_AHEAD = (1, 2, 3, 4, 6)
+"""What reaches ahead there are in the population ``diverse``, in cells."""
+REACHES_BEHIND = (0, 1, 2, 3, 4)
+"""The same behind; 0 sees nothing there."""
+
+
+def derived_generator(
+    seed: int, *purpose: str | int, device: torch.device | str = "cpu"
+) -> torch.Generator:
+    """A generator of its own for each seed and purpose.
+
+    Hashed rather than added up, so that neighbouring seeds share nothing.
+    """
+    text = "/".join(map(str, (seed, *purpose)))
+    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
+    # Torch's seeds are signed.
+    return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
+
+
+def consistencies(people: int, seed: int) -> Tensor:
+    """Each person's consistency ``[P]`` in 1 / units of reward, log-normal."""
+    noise = [
+        torch.randn((), generator=derived_generator(seed, "consistency", person))
+        for person in range(people)
+    ]
+    return (math.log(CONSISTENCY_MEDIAN) + CONSISTENCY_SPREAD * torch.stack(noise)).exp()
+
+
+def reaches(population: str, setting: str, people: int, seed: int) -> Tensor:
+    """How far each person sees, in cells, ``[P, 4]`` for each of ``Driving.directions``.
+
+    Args:
+        population: a name in ``POPULATIONS``: ``paper``, sight limited by the setting alone;
+            ``diverse``, each person's own reach ahead and behind, the same in both lanes and in
+            every setting.
+        setting: a setting of the driving domain.
+        people: number of people P.
+        seed: the same seed gives the same people.
+
+    Raises:
+        UnknownNameError: there is no such population or setting.
+    """
+    require_known(setting, "setting", Driving.settings)
+    require_known(population, "population", tuple(POPULATIONS))
+    return POPULATIONS[population](setting, people, seed)
+
+
+def _by_setting(setting: str, people: int, seed: int) -> Tensor:
+    reach = torch.tensor(SETTING_REACH[setting], dtype=torch.get_default_dtype())
+    return reach.repeat(people, 1)
+
+
+def _by_person(setting: str, people: int, seed: int) -> Tensor:
+    def choice(options: tuple[int, ...], generator: torch.Generator) -> int:
+        return options[int(torch.randint(len(options), (), generator=generator))]
+
+    rows = []
+    for person in range(people):
+        generator = derived_generator(seed, "reach", person)
+        ahead, behind = choice(REACHES_AHEAD, generator), choice(REACHES_BEHIND, generator)
+        rows.append((ahead, ahead, behind, behind))
+    return torch.tensor(rows, dtype=torch.get_default_dtype())
+
+
+POPULATIONS: dict[str, Callable[[str, int, int], Tensor]] = {
+    "paper": _by_setting,
+    "diverse": _by_person,
+}
+"""Populations of drivers: how far each person sees, given setting, number of people and seed."""

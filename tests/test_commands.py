@@ -1,0 +1,428 @@
+"""What the commands share: start and end, progress, files, errors; and `python -m mirror_ppl`."""
+
+import io
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+import mirror_ppl
+from mirror_ppl import console, errors
+from mirror_ppl.__main__ import COMMANDS
+from mirror_ppl.console import Progress, run
+from mirror_ppl.errors import MirrorError, OutputError, UnknownNameError
+from mirror_ppl.files import prepare_output_folder, write_whole
+
+
+def python(*args, **kwargs):
+    return subprocess.run(
+        [sys.executable, *args], capture_output=True, text=True, timeout=60, check=False, **kwargs
+    )
+
+
+# --- the package ------------------------------------------------------------------------------
+
+
+def test_import_prints_nothing_and_loads_no_library():
+    code = "import mirror_ppl, sys; assert not {'torch', 'pyro', 'rich', 'tyro'} & set(sys.modules)"
+    done = python("-W", "error", "-c", code)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("args", [(), ("--help",), ("-h",)])
+def test_overview_lists_every_command(args):
+    done = python("-m", "mirror_ppl", *args)
+    assert (done.returncode, done.stderr) == (0, "")
+    for name, purpose in COMMANDS.items():
+        assert re.search(rf"python -m mirror_ppl\.{name} +{re.escape(purpose)}", done.stdout)
+
+
+def test_version():
+    done = python("-m", "mirror_ppl", "--version")
+    assert (done.returncode, done.stdout) == (0, f"mirror_ppl {mirror_ppl.__version__}\n")
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        (("--nonsense",), "--nonsense"),
+        (("fit", "--out", "x"), "python -m mirror_ppl.fit"),
+        (("--version", "more"), "more"),
+    ],
+)
+def test_unknown_argument_is_one_line_and_status_2(args, told):
+    done = python("-m", "mirror_ppl", *args)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert told in done.stderr
+
+
+# --- errors -----------------------------------------------------------------------------------
+
+
+def test_unknown_name_tells_the_known_ones_and_the_closest():
+    error = UnknownNameError.of("domain", "Drivin", ["driving", "bomb"])
+    expected = 'unknown domain "Drivin"; known: bomb, driving; perhaps you meant "driving"'
+    assert str(error) == expected
+
+
+def test_unknown_name_without_a_close_one():
+    error = UnknownNameError.of("setting", "xyz", iter(["fog"]))
+    assert str(error) == 'unknown setting "xyz"; known: fog'
+    assert str(UnknownNameError.of("guide", "x", [])) == 'unknown guide "x"; known: none'
+
+
+def test_every_error_is_a_mirror_error_that_survives_a_process_boundary():
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    kinds = [kind for kind in kinds if issubclass(kind, Exception)]
+    assert len(kinds) >= 7
+    for kind in kinds:
+        assert issubclass(kind, MirrorError)
+        assert "aised" in kind.__doc__
+    error = UnknownNameError.of("domain", "a", ["b"])
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again)) == (UnknownNameError, str(error))
+
+
+# --- run --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a command that only exists here."""
+
+    steps: int = 3
+    """How many steps."""
+    domain: str = "driving"
+    """Which domain."""
+
+    def __post_init__(self):
+        if self.steps < 0:
+            raise ValueError(f"steps must be at least 0, not {self.steps}")
+        if self.domain != "driving":
+            raise UnknownNameError.of("domain", self.domain, ["driving"])
+
+
+def start(main, *args):
+    return run(Options, main, prog="toy", description="A toy.", args=args)
+
+
+def test_run_passes_the_options_and_returns_the_status(capsys):
+    seen = []
+    assert start(seen.append, "--steps", "5") == 0
+    assert seen == [Options(steps=5)]
+    assert start(lambda options: 7) == 7
+    assert capsys.readouterr().err == ""
+
+
+def test_run_help(capsys):
+    assert start(pytest.fail, "--help") == 0
+    out = capsys.readouterr().out
+    assert "A toy." in out
+    assert "How many steps." in out
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        (("--stepz", "5"), "--steps"),
+        (("--steps", "many"), "many"),
+        (("--steps", "-1"), "steps must be at least 0, not -1"),
+    ],
+)
+def test_run_argument_errors_end_with_status_2(args, told, capsys):
+    assert start(pytest.fail, *args) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert told in captured.err
+
+
+def test_run_mirror_error_is_one_line_and_status_2(capsys):
+    def main(options):
+        raise MirrorError("first [red]\nsecond")
+
+    assert start(main) == 2
+    assert capsys.readouterr().err == "error: first [red] second\n"
+
+
+def test_run_mirror_error_of_the_options_is_one_line_too(capsys):
+    assert start(pytest.fail, "--domain", "Driving") == 2
+    expected = 'unknown domain "Driving"; known: driving; perhaps you meant "driving"'
+    assert capsys.readouterr().err == f"error: {expected}\n"
+
+
+def test_run_interrupted_is_one_line_and_status_130(capsys):
+    def main(options):
+        raise KeyboardInterrupt
+
+    assert start(main) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_run_lets_mistakes_of_the_code_through():
+    with pytest.raises(ZeroDivisionError):
+        start(lambda options: 1 // 0)
+
+
+@pytest.mark.parametrize(("environment", "expected"), [(None, 1), ("2", 2)])
+def test_run_sets_the_threads_unless_the_environment_does(monkeypatch, environment, expected):
+    if environment is None:
+        monkeypatch.delenv("OMP_NUM_THREADS")
+    else:
+        monkeypatch.setenv("OMP_NUM_THREADS", environment)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        start(lambda options: None)
+        assert torch.get_num_threads() == expected
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("lines", [1, 100_000], ids=["at the final flush", "while printing"])
+def test_run_is_quiet_when_the_reader_goes_away(lines):
+    code = f"""
+        from dataclasses import dataclass
+        from mirror_ppl.console import run
+
+        @dataclass(frozen=True)
+        class Options: pass
+
+        def main(options):
+            input()
+            for _ in range({lines}): print("line")
+
+        raise SystemExit(run(Options, main, prog="toy", description=""))
+        """
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    process.stdout = None
+    _, stderr = process.communicate("\n", timeout=60)
+    assert (process.returncode, stderr) == (128 + signal.SIGPIPE, "")
+
+
+# --- progress ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time that passes only when it is told to: `clock[0] += 1`."""
+    now = [1000.0]
+    monkeypatch.setattr(console, "monotonic", lambda: now[0])
+    return now
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_lines_are_plain_and_rare(clock):
+    stream = io.StringIO()
+    with Progress("fit", 300, interval=4, stream=stream) as progress:
+        for step in range(1, 121):
+            clock[0] += 8 / 120
+            progress.update(step, f"loss {step / 10:.1f}")
+    assert stream.getvalue().splitlines() == [
+        "fit: 60/300 loss 6.0, 4 s",
+        "fit: 120/300 loss 12.0, 8 s",
+    ]
+
+
+def test_progress_ends_with_the_last_state_once(clock):
+    stream = io.StringIO()
+    with Progress("fit", 2, stream=stream) as progress:
+        progress.advance()
+        progress.advance("loss 1.5")
+        clock[0] += 125
+    assert stream.getvalue() == "fit: 2/2 loss 1.5, 2 min 5 s\n"
+
+
+def test_progress_tells_how_far_failed_work_came(clock):
+    stream = io.StringIO()
+    with pytest.raises(ZeroDivisionError), Progress("fit", stream=stream, done=10) as progress:
+        progress.advance("loss 3")
+        raise ZeroDivisionError
+    assert stream.getvalue() == "fit: 11 loss 3, 0 s\n"
+
+
+def test_progress_without_a_step_or_when_quiet_shows_nothing():
+    stream = io.StringIO()
+    with Progress("fit", 3, stream=stream):
+        pass
+    with Progress("fit", 3, stream=stream, quiet=True) as progress:
+        progress.update(3)
+    assert stream.getvalue() == ""
+    assert progress.done == 3
+
+
+def test_progress_goes_to_stderr(capsys):
+    with Progress("fit", 1) as progress:
+        progress.advance()
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == "fit: 1/1, 0 s\n"
+
+
+def test_progress_on_a_terminal_is_a_bar(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    stream = Terminal()
+    with Progress("fit", 3, stream=stream) as progress:
+        progress.update(3, "loss [1]")
+        print("a result")
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
+    assert "━" in shown
+    assert "3/3" in shown
+    assert "loss [1]" in shown
+    # stdout is no terminal here: what is printed must not be mixed into the bar's stream.
+    assert capsys.readouterr().out == "a result\n"
+
+
+def test_progress_on_a_terminal_that_cannot_redraw_is_plain(monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    stream = Terminal()
+    with Progress("fit", 3, stream=stream) as progress:
+        progress.update(3)
+    assert stream.getvalue() == "fit: 3/3, 0 s\n"
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def content(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_write_whole_writes_and_replaces(tmp_path):
+    path = tmp_path / "new" / "deep" / "a.txt"
+    assert write_whole(path, lambda to: to.write_text("one")) == path
+    assert path.read_text() == "one"
+    write_whole(str(path), lambda to: to.write_text("two"))
+    assert path.read_text() == "two"
+    assert content(path.parent) == ["a.txt"]
+
+
+def test_write_whole_gives_the_permissions_of_any_new_file(tmp_path):
+    (tmp_path / "plain").touch()
+    write_whole(tmp_path / "whole", lambda to: to.write_text("x"))
+    assert (tmp_path / "whole").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_write_whole_suits_writers_that_go_by_the_suffix(tmp_path):
+    write_whole(tmp_path / "a.npz", lambda to: np.savez(to, x=np.arange(3)))
+    assert content(tmp_path) == ["a.npz"]
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["x"].tolist() == [0, 1, 2]
+
+
+def test_write_whole_takes_the_longest_names(tmp_path):
+    name = "n" * 251 + ".txt"
+    write_whole(tmp_path / name, lambda to: to.write_text("x"))
+    assert content(tmp_path) == [name]
+
+
+def test_write_whole_shows_readers_the_old_content_until_the_end(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def writer(to):
+        to.write_text("new, first half")
+        assert path.read_text() == "old"
+        to.write_text("new")
+
+    write_whole(path, writer)
+    assert path.read_text() == "new"
+
+
+@pytest.mark.parametrize("failure", [ZeroDivisionError, KeyboardInterrupt, OSError])
+def test_write_whole_leaves_nothing_of_a_failure(tmp_path, failure):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def writer(to):
+        to.write_text("half")
+        raise failure("no space")
+
+    raised = OutputError if failure is OSError else failure
+    with pytest.raises(raised, match="no space"):
+        write_whole(path, writer)
+    with pytest.raises(raised, match="no space"):
+        write_whole(tmp_path / "new" / "deep" / "a.txt", writer)
+    assert content(tmp_path) == ["a.txt"]
+    assert path.read_text() == "old"
+
+
+def test_write_whole_killed_half_way_keeps_the_old_content(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    code = """
+        import os, sys
+        from mirror_ppl.files import write_whole
+
+        def writer(to):
+            to.write_text("half")
+            os._exit(9)
+
+        write_whole(sys.argv[1], writer)
+        """
+    assert python("-c", textwrap.dedent(code), str(path)).returncode == 9
+    assert path.read_text() == "old"
+
+
+def test_write_whole_follows_a_link(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "a.txt").symlink_to("elsewhere/b.txt")
+    write_whole(tmp_path / "a.txt", lambda to: to.write_text("x"))
+    assert (tmp_path / "a.txt").is_symlink()
+    assert (tmp_path / "elsewhere" / "b.txt").read_text() == "x"
+
+
+def test_write_whole_refuses_what_is_no_regular_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe"):
+        with pytest.raises(OutputError, match="not a regular file"):
+            write_whole(path, pytest.fail)
+    assert content(tmp_path) == ["pipe"]
+
+
+@pytest.mark.parametrize("call", [prepare_output_folder, lambda to: write_whole(to, pytest.fail)])
+def test_a_file_in_the_way_is_an_output_error(tmp_path, call):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match=r"cannot create the folder .*file"):
+        call(tmp_path / "file" / "sub" / "deep")
+    assert content(tmp_path) == ["file"]
+
+
+def test_prepare_output_folder_creates_it_and_leaves_it_empty(tmp_path):
+    folder = tmp_path / "runs" / "demo"
+    assert prepare_output_folder(str(folder)) == folder
+    assert prepare_output_folder(folder) == folder
+    assert content(tmp_path) == ["runs", "runs/demo"]
+
+
+def test_prepare_output_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    # Root may write anywhere, so the refusal is staged.
+    def refuse(self, **kwargs):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr("pathlib.Path.touch", refuse)
+    with pytest.raises(OutputError, match=r"cannot write in the folder .*Permission denied"):
+        prepare_output_folder(tmp_path / "runs" / "demo")
+    with pytest.raises(OutputError, match=r"cannot write .*Permission denied"):
+        write_whole(tmp_path / "runs" / "a.txt", pytest.fail)
+    assert content(tmp_path) == []

@@ -1,0 +1,417 @@
+"""The type of recordings and its files: what is refused, what is kept, what the docs promise."""
+
+import dataclasses
+import pickle
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mirror_ppl.data.files
+from mirror_ppl.data import (
+    Demonstrations,
+    asset_path,
+    concatenate,
+    from_dataset,
+    load_demonstrations,
+    save_demonstrations,
+    to_dataset,
+)
+from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import AssetError, DemonstrationsError, OutputError, UnknownNameError
+
+DRIVING = get_domain("driving")
+NAN = float("nan")
+
+
+def fields(lengths, names="abcdefgh", seed=0):
+    """Arguments of Demonstrations: rounds of these lengths for each person, anything in padding."""
+    g = torch.Generator().manual_seed(seed)
+    P, B = len(lengths), max(1, *map(len, lengths))
+    T = max([1, *(length for rounds in lengths for length in rounds)])
+    padded = [list(rounds) + [0] * (B - len(rounds)) for rounds in lengths]
+
+    def numbers(*shape):
+        return torch.randn(P, B, *shape, generator=g)
+
+    def below(end, *shape):
+        return torch.randint(end, (P, B, *shape), generator=g)
+
+    return {
+        "domain": "driving",
+        "setting": "fog",
+        "people": tuple(names[:P]),
+        "ego": numbers(T + 1, 1),
+        "observations": {"visual": numbers(T + 1, 4, 2), "verbal": numbers(T + 1, 4, 3)},
+        "actions": below(2, T),
+        "round_counts": torch.tensor([len(rounds) for rounds in lengths]),
+        "lengths": torch.tensor(padded),
+        "told": {"visual": below(2, T, 4), "verbal": below(2, T, 4)},
+        "rewards": numbers(T),
+        "scenarios": below(8),
+        "truth": {"reach": torch.randn(P, generator=g), "bias": torch.full((P,), NAN)},
+        "action_entropy": numbers(T).abs(),
+        "provenance": {"command": "test", "seed": 3, "temperature": 0.1},
+    }
+
+
+RAGGED = [[3, 1], [], [2, 4, 1]]
+
+
+@pytest.fixture
+def given_fields():
+    return fields(RAGGED)
+
+
+@pytest.fixture
+def ragged(given_fields):
+    return Demonstrations(**given_fields)
+
+
+# --- creation ---------------------------------------------------------------------------------
+
+
+def test_padding_is_brought_into_one_form_and_the_rest_is_kept(given_fields, ragged):
+    assert (ragged.num_people, ragged.shape) == (3, (3, 3, 4))
+    assert repr(ragged) == "Demonstrations(driving, fog: people 3, rounds 5, steps 11)"
+    for p in range(3):
+        for b in range(3):
+            n = RAGGED[p][b] if b < len(RAGGED[p]) else 0
+            seen = n + 1 if n else 0
+            assert ragged.mask[p, b].tolist() == [True] * n + [False] * (4 - n)
+            for field, end, padding in (
+                ("actions", n, -1),
+                ("rewards", n, NAN),
+                ("action_entropy", n, NAN),
+                ("ego", seen, NAN),
+            ):
+                value, before = getattr(ragged, field)[p, b], given_fields[field][p, b]
+                torch.testing.assert_close(value[:end], before[:end], rtol=0, atol=0)
+                expected = torch.full_like(value[end:], padding)
+                torch.testing.assert_close(value[end:], expected, equal_nan=True)
+            for name in ("visual", "verbal"):
+                observed, before = ragged.observations[name], given_fields["observations"][name]
+                assert torch.equal(observed[p, b, :seen], before[p, b, :seen])
+                assert observed[p, b, seen:].isnan().all()
+                told, before = ragged.told[name], given_fields["told"][name]
+                assert told.dtype == torch.bool and not told[p, b, n:].any()
+                assert torch.equal(told[p, b, :n], before[p, b, :n].bool())
+            assert ragged.scenarios[p, b] == (given_fields["scenarios"][p, b] if n else -1)
+
+
+def test_arrays_are_copies_and_fields_are_frozen(given_fields):
+    full = fields([[2, 2]])
+    made = Demonstrations(**full)
+    before = made.select_people([0])
+    for name in ("ego", "actions", "lengths", "round_counts", "rewards"):
+        full[name].fill_(1)
+    full["truth"]["reach"].fill_(1)
+    full["observations"]["visual"].fill_(1)
+    full["told"].clear()
+    assert made.equals(before)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        made.setting = "clear"
+
+
+def test_optional_fields_may_be_absent_and_nothing_is_told_by_default(given_fields):
+    for name in ("told", "rewards", "scenarios", "truth", "action_entropy", "provenance"):
+        del given_fields[name]
+    made = Demonstrations(**given_fields)
+    assert made.rewards is None and made.scenarios is None and made.action_entropy is None
+    assert made.truth == {} and made.provenance == {}
+    assert {name: value.shape for name, value in made.told.items()} == {
+        "visual": (3, 3, 4, 4),
+        "verbal": (3, 3, 4, 4),
+    }
+    assert not any(value.any() for value in made.told.values())
+
+
+@pytest.mark.parametrize("dtype", [torch.int8, torch.int32, torch.float32, torch.float64])
+def test_any_numeric_dtype_will_do(given_fields, ragged, dtype):
+    for name in ("actions", "lengths", "round_counts", "scenarios"):
+        given_fields[name] = given_fields[name].to(dtype)
+    given_fields["told"] = {key: value.to(dtype) for key, value in given_fields["told"].items()}
+    given_fields["ego"] = given_fields["ego"].double()
+    assert Demonstrations(**given_fields).equals(ragged)
+
+
+def put(path, index, value):
+    """A change of one entry (index) or of a whole field (index None) of the arguments."""
+
+    def change(arguments):
+        place = arguments
+        for key in path[:-1]:
+            place = place[key]
+        if index is None:
+            place[path[-1]] = value
+        else:
+            place[path[-1]] = place[path[-1]].double()
+            place[path[-1]][index] = value
+
+    return change
+
+
+BAD = {
+    "nan inside a round": (
+        put(["observations", "visual"], (2, 1, 4, 3, 0), NAN),
+        "person 'c', round 1, time 4: visual of rear-right, distance_ahead is nan, "
+        "expected a finite number",
+    ),
+    "infinity inside a round": (
+        put(["ego"], (0, 0, 1, 0), float("inf")),
+        "person 'a', round 0, time 1: ego of lane is inf, expected a finite number",
+    ),
+    "reward nan": (
+        put(["rewards"], (2, 2, 0), NAN),
+        "person 'c', round 2, step 0: reward is nan, expected a finite number",
+    ),
+    "entropy infinite": (
+        put(["action_entropy"], (2, 2, 0), float("inf")),
+        "person 'c', round 2, step 0: action_entropy is inf, "
+        "expected a finite number, or nan if unknown",
+    ),
+    "action too large": (
+        put(["actions"], (2, 1, 3), 2),
+        "person 'c', round 1, step 3: action is 2, "
+        "expected a whole number from 0 to 1 (stay, switch)",
+    ),
+    "action missing": (
+        put(["actions"], (0, 1, 0), -1),
+        "person 'a', round 1, step 0: action is -1, "
+        "expected a whole number from 0 to 1 (stay, switch)",
+    ),
+    "half an action": (
+        put(["actions"], (0, 1, 0), 0.5),
+        "person 'a', round 1, step 0: action is 0.5, "
+        "expected a whole number from 0 to 1 (stay, switch)",
+    ),
+    "told twice": (
+        put(["told", "verbal"], (0, 0, 2, 1), 2),
+        "person 'a', round 0, step 2: told_verbal of front-right is 2, "
+        "expected a whole number from 0 to 1",
+    ),
+    "unknown scenario": (
+        put(["scenarios"], (2, 2), 8),
+        "person 'c', round 2: scenario is 8, expected a whole number from -1 to 7 (-1 if unknown)",
+    ),
+    "round of length zero": (
+        put(["lengths"], (2, 1), 0),
+        "person 'c', round 1: length is 0, expected at least 1 (padding begins at round_count)",
+    ),
+    "round beyond the count": (
+        put(["lengths"], (1, 0), 2),
+        "person 'b', round 0: length is 2, expected 0 (padding begins at round_count)",
+    ),
+    "round too long": (
+        put(["lengths"], (2, 1), 5),
+        "person 'c', round 1: length is 5, expected a whole number from 0 to 4",
+    ),
+    "too many rounds": (
+        put(["round_counts"], (1,), 4),
+        "person 'b': round_count is 4, expected a whole number from 0 to 3",
+    ),
+    "wrong number of items": (
+        put(["observations", "visual"], None, torch.zeros(3, 3, 5, 3, 2)),
+        "visual has shape (3, 3, 5, 3, 2), expected (3, 3, 5, 4, 2) "
+        "(person 3, round 3, time 5, visual_item 4, visual_feature 2)",
+    ),
+    "as many observations as actions": (
+        put(["ego"], None, torch.zeros(3, 3, 4, 1)),
+        "ego has shape (3, 3, 4, 1), expected (3, 3, 5, 1) "
+        "(person 3, round 3, time 5, ego_feature 1)",
+    ),
+    "lengths without people": (
+        put(["lengths"], None, torch.ones(3)),
+        "length has shape (3,), expected (3, 3) (person 3, round 3)",
+    ),
+    "truth of another number of people": (
+        put(["truth", "reach"], None, torch.ones(2)),
+        "truth_reach has shape (2,), expected (3,) (person 3)",
+    ),
+    "actions without rounds": (
+        put(["actions"], None, torch.zeros(3, 0, 4)),
+        "action has shape (3, 0, 4), expected people, rounds and steps, at least one of each",
+    ),
+    "modality missing": (
+        put(["observations"], None, {"visual": torch.zeros(3, 3, 5, 4, 2)}),
+        "observations has visual, expected visual, verbal",
+    ),
+    "modality unknown": (
+        put(["told"], None, {"smell": torch.zeros(3, 3, 4, 4)}),
+        "told has smell, expected visual, verbal",
+    ),
+    "same id twice": (
+        put(["people"], None, ("a", "b", "a")),
+        "two people have the id 'a', expected unique ids",
+    ),
+    "empty id": (put(["people"], None, ("a", "", "c")), "id is '', expected printable text"),
+    "nobody": (put(["people"], None, ()), "there is nobody in it, expected at least one person"),
+    "truth that files cannot name": (
+        put(["truth"], None, {"a/b": torch.ones(3)}),
+        "truth has 'a/b', expected printable text without /",
+    ),
+    "provenance that is a description": (
+        put(["provenance"], None, {"domain": "x"}),
+        "provenance has domain, which is not a matter of origin",
+    ),
+    "provenance that is a list": (
+        put(["provenance"], None, {"seed": [1]}),
+        "provenance seed is [1], expected text or a number",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), BAD.values(), ids=BAD.keys())
+def test_bad_demonstrations_are_refused_in_one_line(given_fields, change, message):
+    change(given_fields)
+    with pytest.raises(DemonstrationsError) as error:
+        Demonstrations(**given_fields)
+    assert str(error.value).endswith(message)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [("domain", "drivin", 'unknown domain "drivin"'), ("setting", "rain", 'unknown setting "rain"')],
+)
+def test_unknown_domain_and_setting(given_fields, field, value, message):
+    with pytest.raises(UnknownNameError, match=message):
+        Demonstrations(**(given_fields | {field: value}))
+
+
+# --- what is made of them ---------------------------------------------------------------------
+
+
+def test_observation_is_finite_and_repeats_the_rounds_last(ragged):
+    observation = ragged.observation()
+    assert list(observation) == ["ego", "visual", "verbal"]
+    raw = {"ego": ragged.ego, **ragged.observations}
+    for name, value in observation.items():
+        assert value.shape == raw[name].shape and value.isfinite().all()
+        assert torch.equal(value[2, 1], raw[name][2, 1])  # as long as there is room
+        assert torch.equal(value[0, 1, :2], raw[name][0, 1, :2])
+        assert torch.equal(value[0, 1, 2:], raw[name][0, 1, 1].expand_as(value[0, 1, 2:]))
+        assert not value[1].any() and not value[0, 2].any()
+
+
+def test_select_people_by_id_and_by_index(ragged):
+    chosen = ragged.select_people(["b", "a"])
+    assert chosen.people == ("b", "a") and chosen.shape == (2, 2, 3)
+    assert chosen.round_counts.tolist() == [0, 2] and chosen.lengths.tolist() == [[0, 0], [3, 1]]
+    assert torch.equal(chosen.actions[1], ragged.actions[0, :2, :3])
+    assert torch.equal(chosen.told["visual"][1], ragged.told["visual"][0, :2, :3])
+    assert torch.equal(chosen.ego[1, 0], ragged.ego[0, 0, :4])
+    assert torch.equal(chosen.truth["reach"], ragged.truth["reach"][[1, 0]])
+    assert chosen.provenance == ragged.provenance
+    assert chosen.equals(ragged.select_people([1, 0]))
+    assert ragged.select_people([0, 1, 2]).equals(ragged)
+    nothing = ragged.select_people(["b"])
+    assert nothing.shape == (1, 1, 1) and not nothing.mask.any()
+
+
+def test_select_people_refuses_what_is_not_there(ragged):
+    with pytest.raises(UnknownNameError, match='unknown person "z"'):
+        ragged.select_people(["z"])
+    with pytest.raises(DemonstrationsError, match="there is no person 3, expected one of 3"):
+        ragged.select_people([3])
+    with pytest.raises(DemonstrationsError, match="two people have the id 'a'"):
+        ragged.select_people([0, 0])
+    with pytest.raises(DemonstrationsError, match="there is nobody"):
+        ragged.select_people([])
+
+
+@pytest.mark.parametrize(
+    ("rounds", "kept"),
+    [
+        (slice(0, 1), [[0], [], [0]]),
+        (slice(-2, None), [[0, 1], [], [1, 2]]),
+        (slice(1, 3), [[1], [], [1, 2]]),
+        ([2, 0], [[0], [], [2, 0]]),
+        ([2], [[], [], [2]]),
+        ([], [[], [], []]),
+    ],
+)
+def test_select_rounds_keeps_people_and_each_their_own_rounds(ragged, rounds, kept):
+    chosen = ragged.select_rounds(rounds)
+    assert chosen.people == ragged.people
+    assert chosen.round_counts.tolist() == [len(row) for row in kept]
+    lengths = [[RAGGED[p][b] for b in row] for p, row in enumerate(kept)]
+    T = max([1, *(n for row in lengths for n in row)])
+    assert chosen.shape == (3, max(1, *map(len, kept)), T)
+    for p, row in enumerate(kept):
+        for new, old in enumerate(row):
+            n = RAGGED[p][old]
+            assert chosen.lengths[p, new] == n and chosen.mask[p, new].sum() == n
+            assert torch.equal(chosen.actions[p, new, :n], ragged.actions[p, old, :n])
+            assert torch.equal(chosen.rewards[p, new, :n], ragged.rewards[p, old, :n])
+            seen = chosen.observations["verbal"][p, new, : n + 1]
+            assert torch.equal(seen, ragged.observations["verbal"][p, old, : n + 1])
+            assert chosen.scenarios[p, new] == ragged.scenarios[p, old]
+    assert torch.equal(chosen.truth["reach"], ragged.truth["reach"])
+
+
+def test_select_rounds_refuses_what_nobody_has(ragged):
+    for number in (3, -1):
+        with pytest.raises(DemonstrationsError, match=f"no round {number}, expected one of 3"):
+            ragged.select_rounds([0, number])
+
+
+def test_concatenate_undoes_select_people(ragged):
+    parts = [ragged.select_people([name]) for name in "abc"]
+    assert concatenate(parts).equals(ragged)
+
+
+def test_concatenate_fills_in_what_a_part_does_not_know(ragged, given_fields):
+    for name in ("told", "rewards", "scenarios", "truth", "action_entropy"):
+        del given_fields[name]
+    given_fields |= {"people": ("d", "e", "f"), "provenance": {"seed": 3, "command": "other"}}
+    both = concatenate([ragged, Demonstrations(**given_fields)])
+    assert both.people == tuple("abcdef") and both.provenance == {"seed": 3}
+    assert torch.equal(both.truth["reach"][:3], ragged.truth["reach"])
+    assert both.truth["reach"][3:].isnan().all()
+    assert torch.equal(both.scenarios[:3], ragged.scenarios) and (both.scenarios[3:] == -1).all()
+    assert both.action_entropy[3:].isnan().all() and both.rewards is None
+
+
+def test_concatenate_refuses_what_does_not_belong_together(ragged, given_fields):
+    clear = Demonstrations(**(given_fields | {"setting": "clear"}))
+    with pytest.raises(DemonstrationsError, match="driving, clear .* driving, fog"):
+        concatenate([ragged, clear])
+    with pytest.raises(DemonstrationsError, match="two people have the id 'a'"):
+        concatenate([ragged, ragged])
+    with pytest.raises(DemonstrationsError, match="there are no demonstrations"):
+        concatenate([])
+
+
+def test_to_device_and_pickle_keep_everything(ragged):
+    assert ragged.to("cpu").equals(ragged)
+    assert pickle.loads(pickle.dumps(ragged)).equals(ragged)
+    assert ragged.to("meta" if False else torch.device("cpu")).ego.device.type == "cpu"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        put(["actions"], (0, 0, 0), NAN),
+        put(["truth", "reach"], (0,), 7),
+        put(["truth", "bias"], (0,), 7),
+        put(["setting"], None, "clear"),
+        put(["provenance"], None, {}),
+        put(["rewards"], None, None),
+    ],
+)
+def test_equals_sees_each_difference(given_fields, ragged, change):
+    given_fields["actions"][0, 0, 0] = 1 - given_fields["actions"][0, 0, 0]
+    other = fields(RAGGED)
+    change(other)
+    if other["actions"].isnan().any():
+        other = given_fields
+    assert not Demonstrations(**other).equals(ragged)
+    assert Demonstrations(**fields(RAGGED)).equals(ragged)
