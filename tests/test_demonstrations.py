@@ -1,68 +1,14 @@
-"""The type of recordings and its files: what is refused, what is kept, what the docs promise."""
+"""Recordings: what is refused, what is kept, and what is made of them."""
 
 import dataclasses
 import pickle
-import re
-import subprocess
-import sys
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-import xarray as xr
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from example_recordings import NAN, RAGGED, fields
 
-import mirror_ppl.data.files
-from mirror_ppl.data import (
-    Demonstrations,
-    asset_path,
-    concatenate,
-    from_dataset,
-    load_demonstrations,
-    save_demonstrations,
-    to_dataset,
-)
-from mirror_ppl.domains import get_domain
-from mirror_ppl.errors import AssetError, DemonstrationsError, OutputError, UnknownNameError
-
-DRIVING = get_domain("driving")
-NAN = float("nan")
-
-
-def fields(lengths, names="abcdefgh", seed=0):
-    """Arguments of Demonstrations: rounds of these lengths for each person, anything in padding."""
-    g = torch.Generator().manual_seed(seed)
-    P, B = len(lengths), max(1, *map(len, lengths))
-    T = max([1, *(length for rounds in lengths for length in rounds)])
-    padded = [list(rounds) + [0] * (B - len(rounds)) for rounds in lengths]
-
-    def numbers(*shape):
-        return torch.randn(P, B, *shape, generator=g)
-
-    def below(end, *shape):
-        return torch.randint(end, (P, B, *shape), generator=g)
-
-    return {
-        "domain": "driving",
-        "setting": "fog",
-        "people": tuple(names[:P]),
-        "ego": numbers(T + 1, 1),
-        "observations": {"visual": numbers(T + 1, 4, 2), "verbal": numbers(T + 1, 4, 3)},
-        "actions": below(2, T),
-        "round_counts": torch.tensor([len(rounds) for rounds in lengths]),
-        "lengths": torch.tensor(padded),
-        "told": {"visual": below(2, T, 4), "verbal": below(2, T, 4)},
-        "rewards": numbers(T),
-        "scenarios": below(8),
-        "truth": {"reach": torch.randn(P, generator=g), "bias": torch.full((P,), NAN)},
-        "action_entropy": numbers(T).abs(),
-        "provenance": {"command": "test", "seed": 3, "temperature": 0.1},
-    }
-
-
-RAGGED = [[3, 1], [], [2, 4, 1]]
+from mirror_ppl.data import Demonstrations, concatenate
+from mirror_ppl.errors import DemonstrationsError, UnknownNameError
 
 
 @pytest.fixture
@@ -279,7 +225,10 @@ def test_bad_demonstrations_are_refused_in_one_line(given_fields, change, messag
 
 @pytest.mark.parametrize(
     ("field", "value", "message"),
-    [("domain", "drivin", 'unknown domain "drivin"'), ("setting", "rain", 'unknown setting "rain"')],
+    [
+        ("domain", "drivin", 'unknown domain "drivin"'),
+        ("setting", "rain", 'unknown setting "rain"'),
+    ],
 )
 def test_unknown_domain_and_setting(given_fields, field, value, message):
     with pytest.raises(UnknownNameError, match=message):
@@ -393,13 +342,12 @@ def test_concatenate_refuses_what_does_not_belong_together(ragged, given_fields)
 def test_to_device_and_pickle_keep_everything(ragged):
     assert ragged.to("cpu").equals(ragged)
     assert pickle.loads(pickle.dumps(ragged)).equals(ragged)
-    assert ragged.to("meta" if False else torch.device("cpu")).ego.device.type == "cpu"
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        put(["actions"], (0, 0, 0), NAN),
+        lambda arguments: arguments["actions"][0, 0, 0].neg_().add_(1),  # the other action
         put(["truth", "reach"], (0,), 7),
         put(["truth", "bias"], (0,), 7),
         put(["setting"], None, "clear"),
@@ -408,10 +356,6 @@ def test_to_device_and_pickle_keep_everything(ragged):
     ],
 )
 def test_equals_sees_each_difference(given_fields, ragged, change):
-    given_fields["actions"][0, 0, 0] = 1 - given_fields["actions"][0, 0, 0]
-    other = fields(RAGGED)
-    change(other)
-    if other["actions"].isnan().any():
-        other = given_fields
-    assert not Demonstrations(**other).equals(ragged)
-    assert Demonstrations(**fields(RAGGED)).equals(ragged)
+    assert Demonstrations(**given_fields).equals(ragged)
+    change(given_fields)
+    assert not Demonstrations(**given_fields).equals(ragged)

@@ -1,6 +1,6 @@
 """Recordings of people: the type, its files, and what ships with the package."""
 
-from importlib.resources import files
+from importlib import resources
 from pathlib import Path
 
 from mirror_ppl.data.demonstrations import Demonstrations, concatenate
@@ -19,7 +19,7 @@ def asset_path(name: str) -> Path:
     Raises:
         AssetError: there is none of that name; lists those that ship.
     """
-    folder = Path(str(files(__name__))) / "assets"
+    folder = Path(str(resources.files(__name__))) / "assets"
     path = folder / name
     if not path.is_file():
         shipped = sorted(

@@ -111,6 +111,7 @@ class Demonstrations:
         """Demonstrations of arrays that are called as in files, the inverse of `variables`.
 
         Without ``round_count`` everybody has all rounds, without ``length`` each round all steps.
+        Variables of other names are ignored.
 
         Raises:
             UnknownNameError: as for the class.
@@ -122,8 +123,8 @@ class Demonstrations:
                 raise DemonstrationsError(f"the variable {name} is missing")
         actions = variables["action"]
         # Wrong shapes are left to the check of the class, which knows what to say about them.
-        people_, rounds, steps = actions.shape if actions.dim() == 3 else (0, 0, 0)
-        counts = variables.get("round_count", torch.full((people_,), rounds))
+        number, rounds, steps = actions.shape if actions.dim() == 3 else (0, 0, 0)
+        counts = variables.get("round_count", torch.full((number,), rounds))
         every = steps * (torch.arange(rounds) < counts.reshape(-1, 1).cpu())
         return cls(
             domain=domain,

@@ -90,7 +90,9 @@ def checked(
     counts = places.whole("round_count", given, None, 0, sizes["round"])
     lengths = places.whole("length", given, None, 0, sizes["step"])
     begun = torch.arange(sizes["round"], device=device) < counts[:, None]
-    places.refuse("length", begun & (lengths == 0), lengths, "at least 1 (padding begins at round_count)")
+    places.refuse(
+        "length", begun & (lengths == 0), lengths, "at least 1 (padding begins at round_count)"
+    )
     places.refuse("length", ~begun & (lengths > 0), lengths, "0 (padding begins at round_count)")
     times = torch.arange(sizes["time"], device=device)
     real = {
@@ -101,9 +103,11 @@ def checked(
 
     result = {"round_count": counts, "length": lengths}
     dtype = torch.get_default_dtype()
-    for name in given.keys() - result.keys():
+    for name, value in given.items():
+        if name in result:
+            continue
         if name.startswith(TRUTH):
-            result[name] = given[name].to(dtype, copy=True)
+            result[name] = value.to(dtype, copy=True)
             continue
         inside = real[next(key for key in reversed(dimensions[name]) if key in real)]
         if name == "action":
@@ -118,7 +122,7 @@ def checked(
         elif name.startswith(TOLD):
             result[name] = places.whole(name, given, inside, 0, 1).bool()
         else:
-            result[name] = places.numbers(name, given[name].to(dtype), inside)
+            result[name] = places.numbers(name, value.to(dtype), inside)
     return result
 
 

@@ -298,7 +298,7 @@ def lane_rewards(
     number = weights.shape[-1]
     near = known[..., None, :] & (gap < number)
     shape = gap.shape[:-1]
-    table = weights.expand(*shape, number)
+    table = weights[..., None, :].expand(*shape, number)
     value = torch.where(near, table.gather(-1, gap.clamp(max=number - 1)), 0.0)
     lanes = torch.tensor(CAR_LANES, device=position.device)
     return torch.stack([(value * (lanes == lane)).sum(-1) for lane in range(2)], -1)

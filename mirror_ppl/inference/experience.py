@@ -142,9 +142,7 @@ def drive(
     unknown = torch.ones(batch, 1, len(domain.modalities[0].items), device=device).bool()
     state, actions = start, []
     for step in range(steps):
-        observation = {
-            name: value[:, None] for name, value in domain.observe(state).items()
-        }
+        observation = {name: value[:, None] for name, value in domain.observe(state).items()}
         seen = plan.visibility(domain, observation, first=step)
         unknown = unknown & domain.unknown_so_far(seen)["visual"]
         imagined = unknown & plan.credulous[:, None, None]

@@ -38,8 +38,8 @@ class SelfModelOptions:
         rounds: rounds driven in a phase.
         steps: gradient steps of a phase.
         batch: rounds in a gradient step.
-        learning_rate: of Adam at the start; it falls to a hundredth on a cosine. The supplement's
-            constant 3e-4 learns as well but needs about three times as many steps.
+        learning_rate: of Adam at the start; it falls to a hundredth on a cosine. The supplement
+            has 3e-4; ``docs/decisions.md`` has the measurement of both.
         beta: probability that the expert drives a round, in the first phase (supplement: 0.5).
         beta_decay: factor on beta after each phase (supplement: 0.8).
         epsilon: probability of a random action, in the first phase (supplement: 0.5).
@@ -103,8 +103,9 @@ def self_model_loss(
             goals.append(outcome.reward + options.discount * value)
     error = self_model.action_values(belief) - torch.stack(goals, -1)
     bellman = error.pow(2).mean()
-    return Loss(options.world_weight * negative_elbo + bellman, negative_elbo.detach(),
-                bellman.detach())
+    return Loss(
+        options.world_weight * negative_elbo + bellman, negative_elbo.detach(), bellman.detach()
+    )
 
 
 def train_self_model(
@@ -213,7 +214,11 @@ class _Trainer:
         self.starts.append(start)
         self.actions.append(
             drive(
-                self.self_model, start, plan, domain.horizon, self.generator,
+                self.self_model,
+                start,
+                plan,
+                domain.horizon,
+                self.generator,
                 epsilon=max(epsilon, options.epsilon_floor),
                 expert=options.beta * options.beta_decay**self.phase,
                 discount=options.discount,
@@ -227,7 +232,9 @@ class _Trainer:
         elbo = bellman = 0.0
         for _ in range(options.steps):
             chosen = torch.randint(
-                len(actions), (options.batch,), generator=self.generator,
+                len(actions),
+                (options.batch,),
+                generator=self.generator,
                 device=self.generator.device,
             )
             plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
@@ -246,8 +253,6 @@ class _Trainer:
 
     @torch.no_grad()
     def _follow(self) -> None:
-        pairs = zip(
-            self.target.parameters(), self.self_model.q_network.parameters(), strict=True
-        )
+        pairs = zip(self.target.parameters(), self.self_model.q_network.parameters(), strict=True)
         for slow, fast in pairs:
             slow.lerp_(fast, self.options.target_rate)

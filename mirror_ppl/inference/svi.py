@@ -8,7 +8,7 @@ between plateaus of the likelihood; enumeration has no such trap.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import pyro
@@ -20,13 +20,14 @@ from torch import Tensor
 
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.views import discrete_sites
+from mirror_ppl.inference.views import combination_scores, discrete_sites, restricted
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import ViewTable
+from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 Draws = dict[str, Tensor]
 """Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
 
+PRUNING_DRAWS = 4
 PLATES = 2
 """People and their rounds; whatever is drawn or enumerated goes to the left of them."""
 
@@ -40,15 +41,20 @@ class FitOptions:
         learning_rate: of Adam at the start; it falls to a twentieth on a cosine.
         draws: posterior draws S.
         checkpoint_every: steps between checkpoints.
+        prune_every: steps after which combinations of discrete implants are given up that have
+            become hopeless under the guide.
+        prune_margin: nats by which the log-likelihood of such a combination has fallen behind.
     """
 
     steps: int = 150
     learning_rate: float = 0.05
     draws: int = 200
     checkpoint_every: int = 25
+    prune_every: int = 25
+    prune_margin: float = 12.0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "draws", "checkpoint_every"):
+        for name in ("steps", "draws", "checkpoint_every", "prune_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not self.learning_rate > 0:
@@ -104,7 +110,7 @@ def fit_implants(
     with torch.random.fork_rng(devices=[]), pyro.settings.context(module_local_params=True):
         torch.manual_seed(seed)
         guide = continuous_guide(human, table)
-        losses = _optimize(human, table, guide, options, report, checkpoint)
+        table, losses = _optimize(human, table, guide, options, report, checkpoint)
         draws = draw_implants(human, table, guide, options.draws)
     return ImplantPosterior(guide, draws, tuple(losses))
 
@@ -116,7 +122,8 @@ def _optimize(
     options: FitOptions,
     report: Callable[[int, str], None],
     checkpoint: tuple[Path, str] | None,
-) -> list[float]:
+) -> tuple[ViewTable, list[float]]:
+    """Optimize the guide; returns the table without what was given up, and the losses."""
     elbo = TraceEnum_ELBO(max_plate_nesting=PLATES)(
         config_enumerate(human.model, "parallel"), guide
     )
@@ -126,7 +133,8 @@ def _optimize(
     )
     losses: list[float] = []
     if checkpoint is not None and checkpoint[0].exists():
-        losses = _restore(*checkpoint, guide, optimizer, schedule)
+        losses, alive = _restore(*checkpoint, guide, optimizer, schedule)
+        table = restricted(table, alive)
     while len(losses) < options.steps:
         optimizer.zero_grad()
         loss = elbo(table)
@@ -135,24 +143,50 @@ def _optimize(
         schedule.step()
         losses.append(loss.item())
         report(len(losses), f"negative ELBO {losses[-1]:.1f}")
+        if len(losses) % options.prune_every == 0 or len(losses) == options.steps:
+            table = _prune(human, table, guide, options.prune_margin)
         if checkpoint is not None and len(losses) % options.checkpoint_every == 0:
-            _save(*checkpoint, guide, optimizer, schedule, losses)
-    return losses
+            alive = (table.index != NO_VIEW).any(1)
+            _save(*checkpoint, guide, optimizer, schedule, losses, alive)
+    return table, losses
 
 
-def _save(path: Path, run: str, guide, optimizer, schedule, losses: list[float]) -> None:
+@torch.no_grad()
+def _prune(human: HumanModel, table: ViewTable, guide: AutoGuide, margin: float) -> ViewTable:
+    """Give up combinations that are behind the best one by more than the margin.
+
+    Each is scored under the guide's draw that suits it best.
+    """
+    best = None
+    for _ in range(PRUNING_DRAWS):
+        with (
+            poutine.block(),
+            poutine.condition(data=guide(table)),
+            pyro.plate("person", table.people, dim=-PLATES),
+        ):
+            log_probabilities = human.act(human.prior(), table.belief, table.values)
+        score = combination_scores(table, log_probabilities)
+        best = score if best is None else torch.maximum(best, score)
+    assert best is not None
+    return restricted(table, best >= best.amax(-1, keepdim=True) - margin)
+
+
+def _save(
+    path: Path, run: str, guide, optimizer, schedule, losses: list[float], alive: Tensor
+) -> None:
     content = {
         "run": run,
         "guide": guide.state_dict(),
         "optimizer": optimizer.state_dict(),
         "schedule": schedule.state_dict(),
         "losses": losses,
+        "alive": alive,
         "torch": torch.random.get_rng_state(),
     }
     write_whole(path, lambda temporary: torch.save(content, temporary))
 
 
-def _restore(path: Path, run: str, guide, optimizer, schedule) -> list[float]:
+def _restore(path: Path, run: str, guide, optimizer, schedule) -> tuple[list[float], Tensor]:
     try:
         content = torch.load(path, weights_only=True)
         own = content["run"]
@@ -166,7 +200,7 @@ def _restore(path: Path, run: str, guide, optimizer, schedule) -> list[float]:
     optimizer.load_state_dict(content["optimizer"])
     schedule.load_state_dict(content["schedule"])
     torch.random.set_rng_state(content["torch"])
-    return content["losses"]
+    return content["losses"], content["alive"]
 
 
 @torch.no_grad()
@@ -184,8 +218,10 @@ def draw_implants(human: HumanModel, table: ViewTable, guide: AutoGuide, number:
             {
                 name: site["value"]
                 for name, site in trace.nodes.items()
-                if site["type"] == "sample" and (name in continuous or not site["is_observed"])
-                and not name.startswith("_") and name not in ("person", "round")
+                if site["type"] == "sample"
+                and (name in continuous or not site["is_observed"])
+                and not name.startswith("_")
+                and name not in ("person", "round")
             }
         )
     return {name: torch.stack([chunk[name] for chunk in chunks]) for name in chunks[0]}

@@ -1,9 +1,15 @@
-"""Building tables of views: which distinct ways there are to have seen the recorded rounds."""
+"""Building tables of views: which distinct ways there are to have seen the recorded rounds.
+
+Every combination of the discrete implants is a candidate. Round by round, candidates are dropped
+that explain the person's actions hopelessly worse than the best one, however the person decides:
+the later rounds need not be seen through their eyes, and exact marginalization stays cheap.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from itertools import pairwise
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import prod
 
 import pyro
 import torch
@@ -11,62 +17,127 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains import Observation
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, View
-from mirror_ppl.models.view_table import ViewTable
+from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
 
 MAX_COMBINATIONS = 100_000
-CHUNK = 20_000
+CHUNK = 4096
 """Views whose beliefs are computed at once; bounds memory."""
+
+
+@dataclass(frozen=True)
+class Screening:
+    """When a combination of discrete implants is given up.
+
+    Attributes:
+        margin: nats by which its log-likelihood may fall behind the best one's, each under the way
+            to decide that suits it best.
+        ways: number of ways to decide, drawn from the prior.
+        seed: seed of those draws.
+        resolution: views of a round count as one when the action values along them, in units of
+            reward, fall on the same points of a grid of this width at every step. The grid widens
+            where one action is far better, because there nothing hangs on how much.
+    """
+
+    margin: float = 15.0
+    ways: int = 16
+    seed: int = 0
+    resolution: float = 0.1
 
 
 def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of the discrete sites of a human model's prior, by name."""
-    with pyro.plate("person", 1, dim=-2):
+    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
         trace = poutine.trace(human.prior).get_trace()
     return {
         name: site["fn"].enumerate_support(expand=False).flatten()
         for name, site in trace.nodes.items()
-        if site["type"] == "sample"
-        and not site["is_observed"]
-        and site["fn"].has_enumerate_support
+        if site["type"] == "sample" and not site["is_observed"] and site["fn"].has_enumerate_support
     }
 
 
 class _Reading(Mapping[str, Tensor]):
     """Implants that note which of them are read, and refuse those that cannot be enumerated."""
 
-    def __init__(self, values: Mapping[str, Tensor]) -> None:
-        self.values_ = values
+    def __init__(self, known: Mapping[str, Tensor]) -> None:
+        self.known = known
         self.read: set[str] = set()
 
     def __getitem__(self, name: str) -> Tensor:
-        if name not in self.values_:
+        if name not in self.known:
             raise HumanModelError(
                 f'perceive() reads "{name}", which is not a discrete site of prior(); '
-                f"it can read: {', '.join(self.values_) or 'none'}"
+                f"it can read: {', '.join(self.known) or 'none'}"
             )
         self.read.add(name)
-        return self.values_[name]
+        return self.known[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.values_)
+        return iter(self.known)
 
     def __len__(self) -> int:
-        return len(self.values_)
+        return len(self.known)
+
+
+def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
+    """The table with only the combinations ``[P, M]`` that are alive, and the views they had."""
+    index = torch.where(alive[:, None], table.index, NO_VIEW)
+    kept = []
+    for person in index:
+        needed, renumbered = torch.unique(person[person != NO_VIEW], return_inverse=True)
+        person[person != NO_VIEW] = renumbered
+        kept.append(needed)
+    most = max(len(needed) for needed in kept)
+
+    def part(value: Tensor) -> Tensor:
+        pairs = zip(value, kept, strict=True)
+        return torch.stack([_pad(own[needed], most) for own, needed in pairs])
+
+    return replace(
+        table,
+        index=index,
+        belief=part(table.belief),
+        values=part(table.values),
+        view_actions=part(table.view_actions),
+        view_steps=part(table.view_steps),
+        view_counts=torch.tensor([len(needed) for needed in kept]),
+    )
+
+
+def combination_scores(table: ViewTable, log_probabilities: Tensor) -> Tensor:
+    """Log-likelihood ``[..., P, M]`` of each combination, given log-probabilities of actions.
+
+    Args:
+        table: the recorded rounds.
+        log_probabilities: ``[..., P, V, T, A]`` of actions in each view.
+    """
+    likelihood = table.log_likelihoods(log_probabilities)
+    scores = []
+    for person, index in enumerate(table.index):
+        found = likelihood[..., person, :][..., index.clamp(min=0)]
+        found = torch.where(index == NO_VIEW, IMPOSSIBLE, found)
+        scores.append(torch.where(table.real[person, :, None], found, 0.0).sum(-2))
+    return torch.stack(scores, -2)
 
 
 @torch.no_grad()
 def build_view_table(
     human: HumanModel,
     demonstrations: Demonstrations,
+    candidates: Sequence[Tensor] | None = None,
+    screening: Screening | None = None,
     report: Callable[[int], None] = lambda people: None,
 ) -> ViewTable:
     """Every distinct view of the recorded rounds, with the beliefs that they lead to.
 
     Args:
-        human: whose ``perceive`` and ``believe`` are called.
+        human: whose ``perceive`` and ``believe`` are called (and ``act`` for screening).
         demonstrations: rounds of P people.
+        candidates: for each person, the combinations that are considered at all (see
+            :meth:`ViewTable.combination`); all of them unless given.
+        screening: when to give up combinations on the way; never unless given.
         report: called with the number of people done.
 
     Raises:
@@ -77,40 +148,34 @@ def build_view_table(
     used = _sites_read(human, demonstrations, supports)
     supports = {name: support for name, support in supports.items() if name in used}
     sizes = tuple(len(support) for support in supports.values())
-    combinations = 1
-    for size in sizes:
-        combinations *= size
-    if combinations > MAX_COMBINATIONS:
+    if prod(sizes) > MAX_COMBINATIONS:
         raise HumanModelError(
-            f"perceive() depends on {combinations} combinations of discrete values; "
+            f"perceive() depends on {prod(sizes)} combinations of discrete values; "
             f"at most {MAX_COMBINATIONS} can be marginalized"
         )
-    grid = dict(
-        zip(
-            supports,
-            (axis.flatten() for axis in torch.meshgrid(*supports.values(), indexing="ij")),
-            strict=True,
-        )
-    )
-    people = [
-        _person(human, demonstrations, person, grid, report)
-        for person in range(demonstrations.num_people)
-    ]
+    axes = torch.meshgrid(*supports.values(), indexing="ij") if supports else ()
+    grid = {name: axis.flatten() for name, axis in zip(supports, axes, strict=True)}
+    observation = demonstrations.observation()
+    people = []
+    for person in range(demonstrations.num_people):
+        alive = torch.arange(prod(sizes)) if candidates is None else candidates[person]
+        people.append(_person(human, demonstrations, observation, person, grid, alive, screening))
+        report(person + 1)
     most = max(len(part["actions"]) for part in people)
 
     def padded(name: str) -> Tensor:
         return torch.stack([_pad(part[name], most) for part in people])
 
-    steps = demonstrations.mask
     return ViewTable(
         sites=tuple(supports),
-        index=torch.stack([part["index"] for part in people]).unflatten(-1, sizes),
+        sizes=sizes,
+        index=torch.stack([part["index"] for part in people]),
         belief=padded("belief"),
         values=padded("values"),
         view_actions=padded("actions"),
         view_steps=padded("steps"),
         recorded=demonstrations.actions.clamp(min=0),
-        steps=steps,
+        steps=demonstrations.mask,
         view_counts=torch.tensor([len(part["actions"]) for part in people]),
     )
 
@@ -118,77 +183,170 @@ def build_view_table(
 def _sites_read(
     human: HumanModel, demonstrations: Demonstrations, supports: Mapping[str, Tensor]
 ) -> set[str]:
-    observation, told, _ = _round(demonstrations, 0, 0)
+    observation, told, _ = _round(demonstrations, demonstrations.observation(), 0, 0)
     implants = _Reading({name: support[:1] for name, support in supports.items()})
     human.perceive(implants, observation, told)
     return implants.read
 
 
 def _round(
-    demonstrations: Demonstrations, person: int, number: int
+    demonstrations: Demonstrations, observation: Observation, person: int, number: int
 ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
     """Observation ``[1, T, ...]``, told ``[1, T, K]`` and actions ``[1, T]`` of one round."""
     steps = demonstrations.shape[2]
-    observation = {
-        name: value[person, number, :steps][None]
-        for name, value in demonstrations.observation().items()
-    }
+    seen = {name: value[person, number, :steps][None] for name, value in observation.items()}
     told = {name: value[person, number][None] for name, value in demonstrations.told.items()}
-    return observation, told, demonstrations.actions[person, number].clamp(min=0)[None]
+    return seen, told, demonstrations.actions[person, number].clamp(min=0)[None]
 
 
 def _person(
     human: HumanModel,
     demonstrations: Demonstrations,
+    observation: Observation,
     person: int,
     grid: Mapping[str, Tensor],
-    report: Callable[[int], None],
+    alive: Tensor,
+    screening: Screening | None,
 ) -> dict[str, Tensor]:
-    count = int(demonstrations.round_counts[person])
+    """Views of one person's rounds, and index ``[B, M]`` of each combination's view."""
     combinations = max([len(values) for values in grid.values()], default=1)
-    index = torch.zeros(demonstrations.shape[1], combinations, dtype=torch.long)
-    parts: dict[str, list[Tensor]] = {"belief": [], "values": [], "actions": [], "steps": []}
+    index = torch.full((demonstrations.shape[1], combinations), NO_VIEW)
+    rounds: list[dict[str, Tensor]] = []
+    resolution = 0.0 if screening is None else screening.resolution
+    screen = None if screening is None else _Screen(human, screening, combinations)
     total = 0
     # Somebody without rounds still needs one view, of padding, to be looked up.
-    for number in range(max(count, 1)):
-        observation, told, actions = _round(demonstrations, person, number)
+    for number in range(max(int(demonstrations.round_counts[person]), 1)):
+        seen, told, actions = _round(demonstrations, observation, person, number)
         real = demonstrations.mask[person, number]
-        view = human.perceive(grid, observation, told)
-        first, inverse = _distinct(view, real)
-        index[number] = total + inverse
-        total += len(first)
-        for begin, end in pairwise([*range(0, len(first), CHUNK), len(first)]):
-            chosen = first[begin:end]
-            some = View(_take(view.visible, chosen), _take(view.absent, chosen))
-            belief = human.believe(some, observation, actions)
-            parts["belief"].append(belief)
-            parts["values"].append(human.self_model.action_values(belief))
-        parts["actions"].append(actions.expand(len(first), -1))
-        parts["steps"].append(real.expand(len(first), -1))
-    report(person + 1)
-    return {"index": index} | {name: torch.cat(values) for name, values in parts.items()}
+        candidates = {name: axis[alive] for name, axis in grid.items()}
+        view = human.perceive(candidates, seen, told)
+        part, inverse = _views(human, view, seen, actions, real, len(alive), resolution)
+        index[number, alive] = total + inverse
+        total += len(part["actions"])
+        rounds.append(part)
+        if screen is not None:
+            alive = screen.keep(alive, inverse, part)
+    # Only what somebody who was never given up has seen is worth keeping.
+    kept = torch.full_like(index, NO_VIEW)
+    kept[:, alive] = index[:, alive]
+    values = {name: torch.cat([part[name] for part in rounds]) for name in rounds[0]}
+    needed, renumbered = torch.unique(kept[kept != NO_VIEW], return_inverse=True)
+    kept[kept != NO_VIEW] = renumbered
+    return {"index": kept} | {name: value[needed] for name, value in values.items()}
 
 
-def _take(masks: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    return {name: mask.expand(max(len(mask), int(rows.max()) + 1), *mask.shape[1:])[rows]
-            for name, mask in masks.items()}
+def _views(
+    human: HumanModel,
+    view: View,
+    observation: Observation,
+    actions: Tensor,
+    real: Tensor,
+    combinations: int,
+    resolution: float,
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Distinct views of one round, and which of them each combination has."""
+    view = View(*(_expanded(masks, combinations) for masks in (view.visible, view.absent)))
+    bits = _bits(view, real)
+    first, inverse = _first_rows(bits.flatten(1))
+    beliefs = []
+    for rows in first.split(CHUNK):
+        some = View(
+            {name: mask[rows] for name, mask in view.visible.items()},
+            {name: mask[rows] for name, mask in view.absent.items()},
+        )
+        beliefs.append(human.believe(some, observation, actions))
+    belief = torch.cat(beliefs)
+    # Views that agree up to a step agree in the belief at that step.
+    node, same = _first_rows(_prefixes(bits[first]).flatten()[:, None])
+    values = torch.cat(
+        [human.self_model.action_values(part) for part in belief.flatten(0, 1)[node].split(CHUNK)]
+    )
+    values = values[same].unflatten(0, belief.shape[:2])
+    if resolution > 0:
+        merged, cluster = _alike(values, real, resolution)
+        belief, values, inverse = belief[merged], values[merged], cluster[inverse]
+    return {
+        "belief": belief,
+        "values": values,
+        "actions": actions.expand(len(belief), -1),
+        "steps": real.expand(len(belief), -1),
+    }, inverse
 
 
-def _distinct(view: View, real: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows ``[U]`` of distinct views and the distinct view ``[M]`` of each combination."""
+def _alike(values: Tensor, real: Tensor, resolution: float) -> tuple[Tensor, Tensor]:
+    """Rows ``[U']`` that stand for clusters of like action values, and each row's cluster."""
+    advantage = values - values.mean(-1, keepdim=True)
+    # asinh is the identity near 0 and logarithmic far from it.
+    grid = torch.round(torch.asinh(advantage) / resolution) * real[:, None]
+    return _first_rows(grid.flatten(1).long())
+
+
+class _Screen:
+    """Running log-likelihoods ``[ways, M]`` of combinations, and who is still worth following."""
+
+    def __init__(self, human: HumanModel, screening: Screening, combinations: int) -> None:
+        self.human = human
+        self.screening = screening
+        self.score = torch.zeros(screening.ways, combinations)
+        self.sites: dict[str, Tensor] | None = None
+
+    def keep(self, alive: Tensor, inverse: Tensor, part: Mapping[str, Tensor]) -> Tensor:
+        log_probabilities = self._act(part["belief"][None], part["values"][None])[:, 0]
+        actions = part["actions"].expand(log_probabilities.shape[:-1])
+        chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
+        log_likelihood = torch.where(part["steps"], chosen, 0.0).sum(-1)
+        self.score[:, alive] += log_likelihood[:, inverse]
+        score = self.score[:, alive].amax(0)
+        return alive[score >= score.max() - self.screening.margin]
+
+    def _act(self, belief: Tensor, values: Tensor) -> Tensor:
+        """Log-probabilities ``[ways, 1, V, T, A]`` under the same drawn ways every time."""
+        with (
+            torch.random.fork_rng(devices=[]),
+            pyro.plate("way", self.screening.ways, dim=-3),
+            pyro.plate("person", 1, dim=-2),
+            poutine.condition(data=self.sites or {}),
+            poutine.trace() as trace,
+        ):
+            torch.manual_seed(self.screening.seed)
+            log_probabilities = self.human.act(self.human.prior(), belief, values)
+        self.sites = {
+            name: site["value"]
+            for name, site in trace.trace.nodes.items()
+            if site["type"] == "sample" and name not in ("way", "person")
+        }
+        return log_probabilities
+
+
+def _expanded(masks: Mapping[str, Tensor], rows: int) -> dict[str, Tensor]:
+    return {name: mask.expand(rows, *mask.shape[1:]) for name, mask in masks.items()}
+
+
+def _bits(view: View, real: Tensor) -> Tensor:
+    """What distinguishes views, ``[M, T, N]``; padding steps do not."""
     masks = [*view.visible.values(), *view.absent.values()]
-    rows = max(len(mask) for mask in masks)
-    bits = torch.cat(
-        [(mask & real[:, None]).expand(rows, -1, -1).flatten(1) for mask in masks], -1
-    )
-    # A random 63-bit key for each bit: sums of keys differ for different rows but for one chance
-    # in 2**63, and sorting numbers is a hundred times quicker than sorting rows of bits.
-    keys = torch.randint(
-        2**62, (bits.shape[1],), generator=torch.Generator().manual_seed(0), dtype=torch.long
-    )
-    values, inverse = torch.unique((bits * keys).sum(-1), return_inverse=True)
-    first = torch.full((len(values),), rows, dtype=torch.long)
-    first.scatter_reduce_(0, inverse, torch.arange(rows), "amin")
+    return torch.cat(masks, -1).long() * real[:, None]
+
+
+def _prefixes(bits: Tensor) -> Tensor:
+    """A number ``[M, T]`` for each beginning of each view, the same for the same beginnings."""
+    keys = _keys(bits.shape[1] * bits.shape[2]).unflatten(0, bits.shape[1:])
+    steps = torch.arange(bits.shape[1]) * _keys(1)
+    return (bits * keys).sum(-1).cumsum(-1) + steps
+
+
+def _keys(number: int) -> Tensor:
+    """Random 62-bit keys ``[number]``: sums of different sets of them differ, but for a chance of
+    about one in 2**62. Sorting numbers is a hundred times quicker than sorting rows."""
+    return torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(0))
+
+
+def _first_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """First of each set of equal rows of ``[M, N]``, and the number of each row's set."""
+    values, inverse = torch.unique(rows @ _keys(rows.shape[1]), return_inverse=True)
+    first = torch.full((len(values),), len(rows))
+    first.scatter_reduce_(0, inverse, torch.arange(len(rows)), "amin")
     return first, inverse
 
 

@@ -77,9 +77,9 @@ class SelfModel(nn.Module):
         )
         self.reward = Reward(latent, actions)
         self.q_network = QNetwork(latent, actions)
-        self.scales: dict[str, tuple[float, ...]] = {
-            "ego": (1.0,) * len(domain.ego_features)
-        } | {modality.name: modality.scales for modality in domain.modalities}
+        self.scales: dict[str, tuple[float, ...]] = {"ego": (1.0,) * len(domain.ego_features)} | {
+            modality.name: modality.scales for modality in domain.modalities
+        }
 
     def model(self, rounds: Rounds) -> Tensor:
         """The generative program, conditioned on what is true; returns ``z`` ``[B, T + 1, Z]``."""

@@ -19,14 +19,21 @@ if TYPE_CHECKING:
     from mirror_ppl.models.human import Implants
 
 
+NO_VIEW = -1
+"""Index of a combination of implants that was given up."""
+IMPOSSIBLE = -1e6
+"""Log-likelihood in nats of such a combination; finite, so that gradients are numbers."""
+
+
 @dataclass(frozen=True)
 class ViewTable:
     """Distinct views of the rounds of P people, V a person (padded), with the beliefs they lead to.
 
     Attributes:
         sites: names of the discrete sites that views depend on.
-        index: view of each person, round and combination of those sites' values,
-            ``[P, B, n_1, ..., n_k]``, an index into the person's V views.
+        sizes: number of values of each of those sites.
+        index: view of each person, round and combination of those sites' values, ``[P, B, M]``, an
+            index into the person's V views or ``NO_VIEW``.
         belief: ``[P, V, T, Z]``.
         values: the self-model's action values ``[P, V, T, A]``.
         view_actions: recorded actions of the round that a view belongs to, ``[P, V, T]``.
@@ -37,6 +44,7 @@ class ViewTable:
     """
 
     sites: tuple[str, ...]
+    sizes: tuple[int, ...]
     index: Tensor
     belief: Tensor
     values: Tensor
@@ -63,14 +71,17 @@ class ViewTable:
 
     def view_of(self, implants: Implants) -> Tensor:
         """The view that implants ``[..., P, 1]`` lead to in each round, ``[..., P, B]``."""
-        combination = torch.zeros((), dtype=torch.long, device=self.index.device)
-        for site, size in zip(self.sites, self.index.shape[2:], strict=True):
-            combination = combination * size + implants[site]
         people = torch.arange(self.people, device=self.index.device)[:, None]
         rounds = torch.arange(self.rounds, device=self.index.device)
-        table = self.index.flatten(2)
-        begin = (people * self.rounds + rounds) * table.shape[-1]
-        return table.reshape(-1)[begin + combination]
+        begin = (people * self.rounds + rounds) * self.index.shape[-1]
+        return self.index.reshape(-1)[begin + self.combination(implants)]
+
+    def combination(self, implants: Implants) -> Tensor:
+        """Number of the combination that implants ``[...]`` are, row-major over ``sizes``."""
+        combination = torch.zeros((), dtype=torch.long, device=self.index.device)
+        for site, size in zip(self.sites, self.sizes, strict=True):
+            combination = combination * size + implants[site].long()
+        return combination
 
     def log_likelihoods(self, log_probabilities: Tensor) -> Tensor:
         """Log-likelihood of the recorded actions under each view.
@@ -102,9 +113,7 @@ class ViewedActions(TorchDistribution):
         self.log_likelihoods = log_likelihoods
         self.view = view
         self.real = real
-        batch = torch.broadcast_shapes(
-            (*log_likelihoods.shape[:-1], 1), view.shape, real.shape
-        )
+        batch = torch.broadcast_shapes((*log_likelihoods.shape[:-1], 1), view.shape, real.shape)
         super().__init__(batch, torch.Size((1,)), validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -113,8 +122,9 @@ class ViewedActions(TorchDistribution):
         views = self.log_likelihoods.shape[-1]
         # Where each leading index of the likelihoods begins in the flat table; gathering from a
         # flat table keeps the gradient as small as the table.
-        begin = torch.arange(
-            self.log_likelihoods[..., 0].numel(), device=self.view.device
-        ).reshape(*self.log_likelihoods.shape[:-1], 1)
-        found = self.log_likelihoods.reshape(-1)[begin * views + self.view]
+        begin = torch.arange(self.log_likelihoods[..., 0].numel(), device=self.view.device).reshape(
+            *self.log_likelihoods.shape[:-1], 1
+        )
+        found = self.log_likelihoods.reshape(-1)[begin * views + self.view.clamp(min=0)]
+        found = torch.where(self.view == NO_VIEW, IMPOSSIBLE, found)
         return torch.where(self.real, found, 0.0)

@@ -79,8 +79,9 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     full, dropout, sight = (kind == index for index in range(len(KINDS)))
     bins = torch.tensor(domain.reach_bins, device=device)
     reach = bins[
-        torch.randint(len(bins), (batch, len(domain.directions)), generator=generator,
-                      device=device)
+        torch.randint(
+            len(bins), (batch, len(domain.directions)), generator=generator, device=device
+        )
     ]
     keep, told, noise = {}, {}, {}
     spoken_to = uniform(batch) < TOLD_PROBABILITY

@@ -33,11 +33,11 @@ class CrossEntropyOptions:
         ValueError: a number is out of its range.
     """
 
-    samples: int = 64
-    elites: int = 8
+    samples: int = 256
+    elites: int = 32
     iterations: int = 4
-    smoothing: float = 0.8
-    start_probability: float = 0.25
+    smoothing: float = 0.5
+    start_probability: float = 0.3
 
     def __post_init__(self) -> None:
         if not 1 <= self.elites <= self.samples:

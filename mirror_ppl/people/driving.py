@@ -22,8 +22,9 @@ Choices that the supplement leaves open, with their reasons, are in ``docs/peopl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -164,7 +165,7 @@ def remember(
 
 
 @dataclass(frozen=True)
-class Drivers:
+class Drivers(ABC):
     """P people who drive, each with their own sight and consistency; step them with `step`.
 
     Nothing is kept between calls: the memory goes in and comes out, so that one person can be
@@ -175,15 +176,12 @@ class Drivers:
         consistency: ``[P]``, in 1 / units of reward.
     """
 
-    actions: ClassVar[int] = 2
     reach: Tensor
     consistency: Tensor
 
-    def select(self, index: list[int]) -> Drivers:
+    def select(self, index: list[int]) -> Self:
         """Some of these people, ``[len(index)]``."""
-        kept = {field.name: getattr(self, field.name) for field in fields(self)}
-        kept.update(reach=self.reach[index], consistency=self.consistency[index])
-        return type(self)(**kept)
+        return replace(self, reach=self.reach[index], consistency=self.consistency[index])
 
     def start(self, *batch: int) -> Memory:
         """Memory ``[P, *batch, K]`` before a round begins."""
@@ -220,6 +218,7 @@ class Drivers:
         consistency = self._each(self.consistency, values.dim() - 1)
         return (consistency * values).softmax(-1), memory
 
+    @abstractmethod
     def values(self, memory: Memory, lane: Tensor) -> Tensor:
         """Value ``[..., A]`` of each action, in units of reward.
 
@@ -227,7 +226,6 @@ class Drivers:
             memory: what is known, ``[..., K]``.
             lane: the driver's lane ``[...]``.
         """
-        raise NotImplementedError
 
     @staticmethod
     def _each(value: Tensor, dimensions: int) -> Tensor:
@@ -283,7 +281,7 @@ class PlanningDrivers(Drivers):
             away = switches.cumsum(-1) % 2
             return along + (away @ gain + switches @ switch).squeeze(-1)
 
-        batch = (*lane.shape, self.actions)
+        batch = (*lane.shape, len(Driving.actions))
         generator = torch.Generator(device).manual_seed(self.planning_seed)
-        begins = torch.arange(self.actions, device=device).bool().expand(batch)
+        begins = torch.arange(batch[-1], device=device).bool().expand(batch)
         return best_sequences(value, batch, HORIZON, generator, self.options, begins)[1]

@@ -9,9 +9,6 @@ maximum causal entropy. With features ``f`` of what a step leads to and weights 
 - ``p(a_t | m_t) = softmax(Q(., m_t))``
 - ``p(w) = Normal(0, prior_scale)``, weak
 
-The world that a driver plans in is deterministic (cars do not yield), so here maximum causal entropy
-and the maximum entropy of trajectories (Ziebart et al., 2008) are the same thing.
-
 Features (supplement): distance to the centre of the road, distance to the cars (indicators of a car
 of the ego's lane at 0 to 4 cells, one weight for all cars), and the action (1 for switching lanes).
 Both lanes are equally far from the centre and no action leaves them, so the first feature is
@@ -90,9 +87,7 @@ class LearnedReward:
         return torch.tensor([self.weights[name] for name in FEATURES[1:-1]], device=device)
 
 
-def log_policy(
-    weights: Tensor, decisions: Decisions, horizon: int = 10, discount: float = 0.9
-) -> Tensor:
+def log_policy(weights: Tensor, decisions: Decisions, horizon: int, discount: float) -> Tensor:
     """Log-probability ``[N, A]`` of each action under the policy of maximum causal entropy.
 
     Args:
@@ -110,8 +105,8 @@ def log_policy(
 
 def learn_reward(
     decisions: Decisions,
-    horizon: int = 10,
-    discount: float = 0.9,
+    horizon: int,
+    discount: float,
     prior_scale: float = 30.0,
     iterations: int = 100,
 ) -> LearnedReward:

@@ -193,7 +193,8 @@ def simulated_drivers(
     """
     reach = reaches(population, setting, people, seed).to(device)
     consistency = consistencies(people, seed).to(device)
-    return PlanningDrivers(reach, consistency, learned_reward(seed))
+    planning_seed = derived_generator(seed, "planning").initial_seed()
+    return PlanningDrivers(reach, consistency, learned_reward(seed), planning_seed=planning_seed)
 
 
 def simulate_driving(
@@ -209,28 +210,23 @@ def simulate_driving(
     drivers = simulated_drivers(setting, population, people, seed, device)
     start = draw_starts(people, rounds, seed, "rounds", setting, device=device)
     recording = record(drivers, start, progress)
-    observation, steps = recording.observation, Driving.horizon
-    truth = dict(zip((f"sight_{name}" for name in _TRUTH_ORDER), drivers.reach.T, strict=True))
+    sight = zip(Driving.directions, drivers.reach.unbind(-1), strict=True)
     return Demonstrations(
         domain=Driving.name,
         setting=setting,
         people=tuple(f"person-{number:02d}" for number in range(1, people + 1)),
-        ego=observation["ego"],
-        observations={modality.name: observation[modality.name] for modality in Driving.modalities},
+        ego=recording.observation["ego"],
+        observations={part.name: recording.observation[part.name] for part in Driving.modalities},
         actions=recording.actions,
         round_counts=torch.full((people,), rounds),
-        lengths=torch.full((people, rounds), steps),
+        lengths=torch.full((people, rounds), Driving.horizon),
         rewards=recording.rewards,
         scenarios=start.scenario,
-        truth=truth
-        | {"assumes_clear": torch.ones(people), "consistency": drivers.consistency},
-        action_entropy=recording.action_entropy,
-        provenance={
-            "software": f"mirror_ppl {__version__}",
-            "population": population,
-            "seed": seed,
+        truth={
+            **{f"sight_{direction}": reach for direction, reach in sight},
+            "assumes_clear": torch.ones(people),
+            "consistency": drivers.consistency,
         },
+        action_entropy=recording.action_entropy,
+        provenance={"population": population, "seed": seed, "version": __version__},
     )
-
-
-_TRUTH_ORDER = Driving.directions

@@ -1,0 +1,144 @@
+"""How good a self-model is: its returns, and its agreement with exact planners in any view.
+
+In full view the yardstick is the exact planner that knows everything. In partial view it is the
+exact planner that knows only the cars that were seen or told of so far, which is what a credulous
+person knows (see `mirror_ppl.models.views`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Domain, total_reward
+from mirror_ppl.inference.experience import drive, experience, map_state, roll_out
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.views import ViewPlan
+
+CLEAR_DECISION = 0.2
+"""Difference of action values, in units of reward, above which a decision counts as clear."""
+
+
+def fixed_views(
+    domain: Domain,
+    batch: int,
+    generator: torch.Generator,
+    reach: tuple[float, ...] | None = None,
+    speech: bool = False,
+) -> ViewPlan:
+    """The same view of B rounds: up to ``reach`` in each direction (everything unless given).
+
+    Args:
+        domain: the world.
+        batch: number of rounds B.
+        generator: source of the numbers that a plan needs; they decide nothing here.
+        reach: distance for each direction; given, the observer takes the unseen to be absent.
+        speech: whether everything is also told.
+    """
+    farthest = (domain.reach_bins[-1],) * len(domain.directions)
+    some = torch.ones(batch, device=generator.device)
+    rates = {m.name: some * (m.name == "visual" or speech) for m in domain.modalities}
+    return ViewPlan(
+        reach=torch.tensor(reach or farthest, device=generator.device).expand(batch, -1),
+        keep=rates,
+        told={name: torch.zeros_like(some) for name in rates},
+        credulous=torch.full_like(some, reach is not None, dtype=torch.bool),
+        noise={
+            m.name: torch.rand(
+                batch,
+                domain.horizon + 1,
+                len(m.items),
+                2,
+                generator=generator,
+                device=generator.device,
+            )
+            for m in domain.modalities
+        },
+    )
+
+
+def returns(domain: Domain, start: Any, actions: Tensor) -> Tensor:
+    """Undiscounted returns ``[B]`` of rounds from ``start`` under ``actions`` ``[B, T]``."""
+    states = roll_out(domain, start, actions)
+    before = map_state(lambda part: part[:, :-1], states)
+    after = map_state(lambda part: part[:, 1:], states)
+    return total_reward(domain.rewards(before, actions, after)).sum(1)
+
+
+def planner_actions(domain: Domain, start: Any, steps: int, discount: float) -> Tensor:
+    """Actions ``[B, T]`` of the exact planner that knows everything."""
+    state, actions = start, []
+    for _ in range(steps):
+        actions.append(domain.reference_values(state, discount).argmax(-1))
+        state = domain.transition(state, actions[-1])
+    return torch.stack(actions, 1)
+
+
+@torch.no_grad()
+def self_model_quality(
+    self_model: SelfModel, rounds: int = 4000, seed: int = 1, discount: float = 0.9
+) -> dict[str, float]:
+    """Returns and agreements of a self-model, all on the same rounds.
+
+    Args:
+        self_model: the model.
+        rounds: number of rounds B.
+        seed: seed of the rounds.
+        discount: the discount that the self-model was trained with.
+
+    Returns:
+        By name: mean returns of the exact planner, of random actions and of the self-model in
+        ``full`` view (everything shown and told) and in ``clear`` view (everything shown, nothing
+        told); ``share_*``, how far these are on the way from random to exact; and for several
+        views ``agreement_*``, the share of decisions that agree with the exact planner of that
+        view, and ``clear_agreement_*``, of those in which more than ``CLEAR_DECISION`` is at
+        stake. Decisions are compared along rounds with one random action in five.
+    """
+    domain = self_model.domain
+    device = next(self_model.parameters()).device
+    generator = torch.Generator(device).manual_seed(seed)
+    start = domain.initial(rounds, generator)
+    steps = domain.horizon
+    anything = torch.randint(
+        len(domain.actions), (rounds, steps), generator=generator, device=device
+    )
+    best = float(returns(domain, start, planner_actions(domain, start, steps, 1.0)).mean())
+    worst = float(returns(domain, start, anything).mean())
+    report = {"return_exact": best, "return_random": worst}
+    views = {
+        "full": fixed_views(domain, rounds, generator, speech=True),
+        "clear": fixed_views(domain, rounds, generator),
+        "fog": fixed_views(domain, rounds, generator, (2.0, 2.0, 0.0, 0.0)),
+        "four_ahead_two_behind": fixed_views(domain, rounds, generator, (4.0, 4.0, 2.0, 2.0)),
+    }
+    for name, plan in views.items():
+        if name in ("full", "clear"):
+            own = drive(self_model, start, plan, steps, generator)
+            reached = float(returns(domain, start, own).mean())
+            report[f"return_{name}"] = reached
+            report[f"share_{name}"] = (reached - worst) / (best - worst)
+        actions = drive(self_model, start, plan, steps, generator, epsilon=0.2)
+        lived = experience(domain, start, actions, plan).rounds
+        belief = self_model.believe(
+            self_model.evidence(lived.observation, lived.visible, lived.actions)
+        )
+        own_values = self_model.action_values(belief[:, :-1])
+        exact = _exact_values(domain, start, actions, plan, discount)
+        agree = own_values.argmax(-1) == exact.argmax(-1)
+        stake = exact.amax(-1) - exact.amin(-1)
+        report[f"agreement_{name}"] = float(agree.float().mean())
+        report[f"clear_agreement_{name}"] = float(agree[stake > CLEAR_DECISION].float().mean())
+    return report
+
+
+def _exact_values(
+    domain: Domain, start: Any, actions: Tensor, plan: ViewPlan, discount: float
+) -> Tensor:
+    """Values ``[B, T, A]`` for whom the things seen or told of so far are all there is."""
+    states = roll_out(domain, start, actions)
+    seen = plan.visibility(domain, domain.observe(states))
+    unknown = domain.unknown_so_far(seen)["visual"]
+    known_world = domain.remove(states, unknown & plan.credulous[:, None, None])
+    return domain.reference_values(map_state(lambda part: part[:, :-1], known_world), discount)

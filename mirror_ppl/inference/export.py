@@ -1,0 +1,143 @@
+"""Posteriors as ArviZ ``InferenceData``, saved as netCDF.
+
+Groups: ``posterior`` and ``prior`` (implants of each person; sight in the domain's unit of
+distance), ``posterior_predictive``, ``prior_predictive``, ``observed_data`` and ``log_likelihood``
+(actions of the rounds that were learned from), ``predictions`` (probabilities of the actions of
+held-out rounds), ``constant_data`` and ``predictions_constant_data`` (what there was to see, and
+the truth where it is known). Attributes say which domain, setting, model and version.
+
+Draws of variational inference are independent, so effective sample sizes and r-hat, which describe
+chains, mean nothing for them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains import Domain, get_domain
+from mirror_ppl.files import write_whole
+from mirror_ppl.models.implants import SIGHT, sight_sites
+
+with warnings.catch_warnings():
+    # ArviZ announces its next major version at the first import of each day.
+    warnings.simplefilter("ignore", FutureWarning)
+    import arviz as az
+
+
+def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Draws ``[S, P, ...]`` with the indices of sight bins replaced by distances."""
+    bins = torch.tensor(domain.reach_bins)
+    sights = sight_sites(domain)
+    return {
+        name: (bins[value] if name in sights else value).squeeze(2) for name, value in draws.items()
+    }
+
+
+def to_inference_data(
+    train: Demonstrations,
+    test: Demonstrations,
+    posterior: Mapping[str, Tensor],
+    prior: Mapping[str, Tensor],
+    predicted: Mapping[str, Tensor],
+    attributes: Mapping[str, str | int | float],
+    generator: torch.Generator,
+) -> az.InferenceData:
+    """Collect everything about a fit.
+
+    Args:
+        train: rounds that were learned from.
+        test: held-out rounds.
+        posterior: draws ``[S, P, 1, ...]``.
+        prior: draws ``[S', P, 1, ...]``.
+        predicted: log-probabilities of actions ``[S, P, B, T, A]``: ``"posterior"`` and
+            ``"prior"`` of the training rounds, ``"test"`` of the held-out rounds under the
+            posterior.
+        attributes: what the file should say of itself.
+        generator: source of the predictive draws.
+    """
+    domain = get_domain(train.domain)
+
+    def group(values: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+        return {name: value.numpy()[None] for name, value in values.items()}
+
+    def drawn(log_probabilities: Tensor) -> dict[str, np.ndarray]:
+        flat = log_probabilities.exp().flatten(0, -2)
+        action = torch.multinomial(flat, 1, generator=generator)
+        return {"action": action.reshape(1, *log_probabilities.shape[:-1]).numpy().astype("int8")}
+
+    chosen = chosen_log_probability(predicted["posterior"], train)
+    data = az.from_dict(
+        posterior=group(in_units(domain, posterior)),
+        prior=group(in_units(domain, prior)),
+        posterior_predictive=drawn(predicted["posterior"]),
+        prior_predictive=drawn(predicted["prior"]),
+        observed_data={"action": train.actions.numpy().astype("int8")},
+        log_likelihood={"action": chosen.sum(-1).numpy()[None]},
+        predictions={"action_probability": predicted["test"].exp().numpy()[None]},
+        constant_data=_constants(train),
+        predictions_constant_data=_constants(test),
+        coords={
+            "person": list(train.people),
+            "direction": list(domain.directions),
+            "action_name": list(domain.actions),
+            "car": list(domain.modalities[0].items),
+            "visual_feature": list(domain.modalities[0].features),
+        },
+        dims=_dims({**posterior, **prior}),
+        attrs={key: str(value) for key, value in attributes.items()},
+    )
+    for name in data.groups():
+        data[name].attrs.update({key: str(value) for key, value in attributes.items()})
+        for variable in data[name].data_vars:
+            if str(variable).startswith(SIGHT):
+                data[name][variable].attrs["units"] = domain.modalities[0].units[0]
+    return data
+
+
+def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) -> Tensor:
+    """Log-probability ``[S, P, B, T]`` of what was done; 0 in padding."""
+    actions = rounds.actions.clamp(min=0).expand(log_probabilities.shape[:-1])
+    chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
+    return torch.where(rounds.mask, chosen, 0.0)
+
+
+def save_inference_data(data: az.InferenceData, path: Path) -> None:
+    """Write netCDF, whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_whole(path, lambda temporary: data.to_netcdf(str(temporary), engine="h5netcdf"))
+
+
+def _constants(rounds: Demonstrations) -> dict[str, Any]:
+    constants: dict[str, Any] = {
+        "observed_action": rounds.actions.numpy().astype("int8"),
+        "ego": rounds.ego.numpy(),
+        "visual": rounds.observations["visual"].numpy(),
+    }
+    constants |= {f"truth_{name}": value.numpy() for name, value in rounds.truth.items()}
+    if rounds.action_entropy is not None:
+        constants["action_entropy"] = rounds.action_entropy.numpy()
+    return constants
+
+
+def _dims(sites: Mapping[str, Tensor]) -> dict[str, list[str]]:
+    rounds = ["person", "round", "step"]
+    dims = {name: ["person"] for name in sites}
+    dims["residual_in"] = ["person", "residual_input", "residual_unit"]
+    dims["residual_out"] = ["person", "residual_unit_and_bias", "action_name"]
+    dims["action"] = rounds
+    dims["action_probability"] = ["person", "test_round", "step", "action_name"]
+    dims["observed_action"] = dims["action_entropy"] = rounds
+    dims["ego"] = ["person", "round", "time", "ego_feature"]
+    dims["visual"] = ["person", "round", "time", "car", "visual_feature"]
+    return dims

@@ -1,0 +1,83 @@
+"""Weights of self-models as files: safetensors, with a card in the file's own metadata."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from mirror_ppl.data import asset_path
+from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import AssetError, MirrorError
+from mirror_ppl.files import write_whole
+from mirror_ppl.models.self_model import SelfModel
+
+FORMAT = "mirror_ppl self-model 1"
+
+
+def shipped_weights(domain: str) -> Path:
+    """Path of the weights that ship for a domain.
+
+    Raises:
+        AssetError: none ship.
+    """
+    return asset_path(f"{domain}_self_model.safetensors")
+
+
+def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) -> None:
+    """Write weights and their card: how they were made, and how good they are.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    metadata = {
+        "format": FORMAT,
+        "domain": self_model.domain.name,
+        "domain_version": self_model.domain.version,
+        "card": json.dumps(card, indent=1),
+    }
+    tensors = {name: value.contiguous() for name, value in self_model.state_dict().items()}
+    write_whole(path, lambda temporary: save_file(tensors, temporary, metadata))
+
+
+def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, dict[str, Any]]:
+    """Read a self-model, ready for use, and its card.
+
+    Args:
+        path: a file of :func:`save_self_model`.
+        domain: name of the domain it has to be for; any unless given.
+
+    Raises:
+        AssetError: the file is missing or damaged, or is for another domain or version of it.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise AssetError(f"{path}: cannot be read as weights ({error})") from error
+    if metadata.get("format") != FORMAT:
+        raise AssetError(f"{path}: not a self-model of this program")
+    if domain is not None and metadata["domain"] != domain:
+        raise AssetError(f'{path}: is for the domain "{metadata["domain"]}", not "{domain}"')
+    try:
+        world = get_domain(metadata["domain"])
+        if metadata["domain_version"] != world.version:
+            raise AssetError(
+                f"{path}: is for version {metadata['domain_version']} of {world.name}, "
+                f"this is version {world.version}"
+            )
+        with torch.random.fork_rng(devices=[]):
+            self_model = SelfModel(world)
+        self_model.load_state_dict(tensors)
+        card = json.loads(metadata["card"])
+    except (KeyError, RuntimeError, ValueError, MirrorError) as error:
+        if isinstance(error, AssetError):
+            raise
+        raise AssetError(f"{path}: does not fit this program ({error})") from error
+    return self_model.eval(), card

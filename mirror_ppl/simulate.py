@@ -1,0 +1,96 @@
+"""`python -m mirror_ppl.simulate`: record rounds of simulated people."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from mirror_ppl.console import Progress, run
+
+PROGRAM = "python -m mirror_ppl.simulate"
+DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
+for python -m mirror_ppl.fit. How the people are made is told in docs/people.md."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to record."""
+
+    out: Path
+    """The netCDF file to write; one that is there is replaced, missing folders are created."""
+    domain: str = "driving"
+    """The world. So far there is driving: two lanes, four cars that never yield."""
+    setting: str = "fog"
+    """Its setting: clear (the whole road in sight) or fog (2 cells ahead, nothing behind)."""
+    population: str = "paper"
+    """Who: paper (sight limited by the setting alone) or diverse (each their own reach)."""
+    people: int = 10
+    """How many people, at least 1."""
+    rounds: int = 40
+    """How many rounds each of them plays, at least 1."""
+    seed: int = 0
+    """The same seed gives the same people in every setting, and the same command the same file."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda or cuda:0."""
+
+    def __post_init__(self) -> None:
+        for name in ("people", "rounds"):
+            if (number := getattr(self, name)) < 1:
+                raise ValueError(f"--{name} must be at least 1, not {number}")
+
+
+def main(options: Options) -> None:
+    """Simulate, write, and tell what was written.
+
+    Raises:
+        UnknownNameError: there is no such domain, setting, population or device.
+        OutputError: the file cannot be written.
+    """
+    from mirror_ppl.data import save_demonstrations
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.people import simulate
+
+    domain = get_domain(options.domain)
+    with Progress("simulate", domain.horizon) as progress:
+        demonstrations = simulate(
+            options.domain,
+            options.setting,
+            options.population,
+            options.people,
+            options.rounds,
+            options.seed,
+            _device(options.device),
+            progress,
+        )
+    provenance = {**demonstrations.provenance, "command": _command(options)}
+    path = save_demonstrations(options.out, replace(demonstrations, provenance=provenance))
+
+    assert demonstrations.rewards is not None and demonstrations.action_entropy is not None
+    reward = demonstrations.rewards.nansum(-1).mean().item()
+    entropy = demonstrations.action_entropy.nanmean().item()
+    print(f"{path}: {options.domain}, {options.setting}, population {options.population}")
+    print(f"  people {options.people}, rounds of each {options.rounds}, seed {options.seed}")
+    print(f"  mean reward of a round {reward:.3f}")
+    print(f"  mean entropy of an action {entropy:.4f} nats")
+
+
+def _command(options: Options) -> str:
+    """The command that makes the same recordings again, wherever it is to write them."""
+    values = {part.name: getattr(options, part.name) for part in fields(options)}
+    parts = [f"--{name} {value}" for name, value in values.items() if name != "out"]
+    return " ".join([PROGRAM, *parts])
+
+
+def _device(name: str) -> str:
+    import torch
+
+    from mirror_ppl.errors import UnknownNameError
+
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:  # an AssertionError where torch lacks CUDA
+        known = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+        raise UnknownNameError.of("device", name, known) from error
+    return name
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(Options, main, prog=PROGRAM, description=DESCRIPTION))

@@ -1,0 +1,39 @@
+"""Recordings for the tests of demonstrations and their files."""
+
+import torch
+
+NAN = float("nan")
+
+
+def fields(lengths, names="abcdefgh", seed=0):
+    """Arguments of Demonstrations: rounds of these lengths for each person, anything in padding."""
+    g = torch.Generator().manual_seed(seed)
+    P, B = len(lengths), max(1, *map(len, lengths))
+    T = max([1, *(length for rounds in lengths for length in rounds)])
+    padded = [list(rounds) + [0] * (B - len(rounds)) for rounds in lengths]
+
+    def numbers(*shape):
+        return torch.randn(P, B, *shape, generator=g)
+
+    def below(end, *shape):
+        return torch.randint(end, (P, B, *shape), generator=g)
+
+    return {
+        "domain": "driving",
+        "setting": "fog",
+        "people": tuple(names[:P]),
+        "ego": numbers(T + 1, 1),
+        "observations": {"visual": numbers(T + 1, 4, 2), "verbal": numbers(T + 1, 4, 3)},
+        "actions": below(2, T),
+        "round_counts": torch.tensor([len(rounds) for rounds in lengths]),
+        "lengths": torch.tensor(padded),
+        "told": {"visual": below(2, T, 4), "verbal": below(2, T, 4)},
+        "rewards": numbers(T),
+        "scenarios": below(8),
+        "truth": {"reach": torch.randn(P, generator=g), "bias": torch.full((P,), NAN)},
+        "action_entropy": numbers(T).abs(),
+        "provenance": {"command": "test", "seed": 3, "temperature": 0.1},
+    }
+
+
+RAGGED = [[3, 1], [], [2, 4, 1]]
