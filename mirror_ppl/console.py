@@ -8,7 +8,7 @@ from time import monotonic
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self, TextIO, TypeVar
 
-from mirror_ppl.errors import MirrorError
+from mirror_ppl.errors import MirrorError, UnknownNameError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,6 +82,22 @@ def _use_threads(threads: int) -> None:
         import torch
 
         torch.set_num_threads(threads)
+
+
+def usable_device(name: str) -> str:
+    """The name of a device that torch can compute on here.
+
+    Raises:
+        UnknownNameError: there is none of that name; lists those there are.
+    """
+    import torch
+
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:  # an AssertionError where torch lacks CUDA
+        known = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+        raise UnknownNameError.of("device", name, known) from error
+    return name
 
 
 class Progress:

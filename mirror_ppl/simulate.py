@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from mirror_ppl.console import Progress, run
+from mirror_ppl.console import Progress, run, usable_device
 
 PROGRAM = "python -m mirror_ppl.simulate"
 DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
@@ -57,7 +57,7 @@ def main(options: Options) -> None:
             options.people,
             options.rounds,
             options.seed,
-            _device(options.device),
+            usable_device(options.device),
             progress,
         )
     provenance = {**demonstrations.provenance, "command": _command(options)}
@@ -77,19 +77,6 @@ def _command(options: Options) -> str:
     values = {part.name: getattr(options, part.name) for part in fields(options)}
     parts = [f"--{name} {value}" for name, value in values.items() if name != "out"]
     return " ".join([PROGRAM, *parts])
-
-
-def _device(name: str) -> str:
-    import torch
-
-    from mirror_ppl.errors import UnknownNameError
-
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:  # an AssertionError where torch lacks CUDA
-        known = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-        raise UnknownNameError.of("device", name, known) from error
-    return name
 
 
 if __name__ == "__main__":

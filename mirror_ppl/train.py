@@ -3,12 +3,12 @@
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-from mirror_ppl.console import Progress, run
+from mirror_ppl.console import Progress, run, usable_device
 
 PROGRAM = "python -m mirror_ppl.train"
-DESCRIPTION = """Train the robot's self-model from nothing, measure it against the exact planner, and
-write its weights with a card that tells both. Takes about ten minutes on two cores. A run that is
-stopped goes on from its last finished phase when the same command is given again."""
+DESCRIPTION = """Train the robot's self-model from nothing, measure it against the exact planner,
+and write its weights with a card that tells both. Takes about ten minutes on two cores. A run that
+is stopped goes on from its last finished phase when the same command is given again."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def main(options: Options) -> None:
     )
     prepare_output_folder(options.out.parent)
     checkpoint = options.out.with_suffix(".checkpoint")
-    generator = torch.Generator(options.device).manual_seed(options.seed)
+    generator = torch.Generator(usable_device(options.device)).manual_seed(options.seed)
     with Progress("train", settings.phases) as progress:
         self_model = train_self_model(domain, settings, generator, progress.update, checkpoint)
     quality = self_model_quality(self_model, discount=settings.discount)

@@ -43,7 +43,7 @@ def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def to_inference_data(
     train: Demonstrations,
-    test: Demonstrations,
+    test: Demonstrations | None,
     posterior: Mapping[str, Tensor],
     prior: Mapping[str, Tensor],
     predicted: Mapping[str, Tensor],
@@ -54,7 +54,7 @@ def to_inference_data(
 
     Args:
         train: rounds that were learned from.
-        test: held-out rounds.
+        test: held-out rounds, if there are any.
         posterior: draws ``[S, P, 1, ...]``.
         prior: draws ``[S', P, 1, ...]``.
         predicted: log-probabilities of actions ``[S, P, B, T, A]``: ``"posterior"`` and
@@ -74,6 +74,10 @@ def to_inference_data(
         return {"action": action.reshape(1, *log_probabilities.shape[:-1]).numpy().astype("int8")}
 
     chosen = chosen_log_probability(predicted["posterior"], train)
+    held_out = {}
+    if test is not None:
+        held_out["predictions"] = {"action_probability": predicted["test"].exp().numpy()[None]}
+        held_out["predictions_constant_data"] = _constants(test)
     data = az.from_dict(
         posterior=group(in_units(domain, posterior)),
         prior=group(in_units(domain, prior)),
@@ -81,9 +85,8 @@ def to_inference_data(
         prior_predictive=drawn(predicted["prior"]),
         observed_data={"action": train.actions.numpy().astype("int8")},
         log_likelihood={"action": chosen.sum(-1).numpy()[None]},
-        predictions={"action_probability": predicted["test"].exp().numpy()[None]},
         constant_data=_constants(train),
-        predictions_constant_data=_constants(test),
+        **held_out,
         coords={
             "person": list(train.people),
             "direction": list(domain.directions),

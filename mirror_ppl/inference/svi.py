@@ -10,24 +10,39 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pyro
 import torch
 from pyro import poutine
 from pyro.infer import TraceEnum_ELBO, config_enumerate, infer_discrete
 from pyro.infer.autoguide import AutoGuide, AutoNormal, init_to_median
+from pyro.infer.autoguide.utils import deep_setattr
+from pyro.nn import PyroParam
 from torch import Tensor
+from torch.distributions import biject_to
 
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.files import write_whole
+from mirror_ppl.inference.exact import draw_combinations, log_joint
 from mirror_ppl.inference.views import combination_scores, discrete_sites, restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
+
+Report = Callable[[str, int, int, str], None]
+"""Told of long work: what it is, how many steps are done, of how many, and a message."""
+
+
+def silent(name: str, done: int, total: int, message: str) -> None:
+    """Report nothing."""
+
 
 Draws = dict[str, Tensor]
 """Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
 
 PRUNING_DRAWS = 4
+PRIOR_DRAWS = 100
+DISCRETE_DRAWS = 4
 PLATES = 2
 """People and their rounds; whatever is drawn or enumerated goes to the left of them."""
 
@@ -76,11 +91,31 @@ class ImplantPosterior:
     losses: tuple[float, ...]
 
 
+class PriorScaledNormal(AutoNormal):
+    """A mean-field guide that starts as wide as the prior: weights of which the data say nothing
+    are right from the first step, and the others have only to move.
+    """
+
+    def _setup_prototype(self, *args: Any, **kwargs: Any) -> None:
+        super()._setup_prototype(*args, **kwargs)
+        assert self.prototype_trace is not None
+        for name, site in self.prototype_trace.iter_stochastic_nodes():
+            prior = site["fn"]
+            draws = torch.stack([prior.sample() for _ in range(PRIOR_DRAWS)])
+            width = biject_to(prior.support).inv(draws).std(0)
+            width = width.mean(tuple(range(width.dim() - prior.event_dim)))
+            _, scale = self._get_loc_and_scale(name)
+            parameter = PyroParam(
+                width.expand(scale.shape).clone(), self.scale_constraint, prior.event_dim
+            )
+            deep_setattr(self.scales, name, parameter)
+
+
 def continuous_guide(human: HumanModel, table: ViewTable) -> AutoGuide:
     """A mean-field guide over the continuous sites of a human model, one factor a person."""
     hidden = list(discrete_sites(human))
     model = poutine.block(human.model, hide=hidden)
-    guide = AutoNormal(model, init_loc_fn=init_to_median, init_scale=0.1)
+    guide = PriorScaledNormal(model, init_loc_fn=init_to_median)
     guide(table)
     return guide
 
@@ -90,7 +125,7 @@ def fit_implants(
     table: ViewTable,
     options: FitOptions,
     seed: int,
-    report: Callable[[int, str], None] = lambda done, message: None,
+    report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
 ) -> ImplantPosterior:
     """Posterior of the implants of P people.
@@ -100,7 +135,7 @@ def fit_implants(
         table: views of the rounds to learn from.
         options: settings.
         seed: seed of everything random here.
-        report: called after each step with the number of steps done and a message.
+        report: told of gradient steps and of draws.
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused).
 
@@ -111,7 +146,9 @@ def fit_implants(
         torch.manual_seed(seed)
         guide = continuous_guide(human, table)
         table, losses = _optimize(human, table, guide, options, report, checkpoint)
-        draws = draw_implants(human, table, guide, options.draws)
+        draws = draw_implants(human, table, guide, options.draws, report)
+        order = [*draw_prior(human, 1, 1, seed)]
+        draws = {name: draws[name] for name in sorted(draws, key=[*order, *draws].index)}
     return ImplantPosterior(guide, draws, tuple(losses))
 
 
@@ -120,7 +157,7 @@ def _optimize(
     table: ViewTable,
     guide: AutoGuide,
     options: FitOptions,
-    report: Callable[[int, str], None],
+    report: Report,
     checkpoint: tuple[Path, str] | None,
 ) -> tuple[ViewTable, list[float]]:
     """Optimize the guide; returns the table without what was given up, and the losses."""
@@ -142,7 +179,7 @@ def _optimize(
         optimizer.step()
         schedule.step()
         losses.append(loss.item())
-        report(len(losses), f"negative ELBO {losses[-1]:.1f}")
+        report("fit", len(losses), options.steps, f"negative ELBO {losses[-1]:.1f}")
         if len(losses) % options.prune_every == 0 or len(losses) == options.steps:
             table = _prune(human, table, guide, options.prune_margin)
         if checkpoint is not None and len(losses) % options.checkpoint_every == 0:
@@ -204,27 +241,61 @@ def _restore(path: Path, run: str, guide, optimizer, schedule) -> tuple[list[flo
 
 
 @torch.no_grad()
-def draw_implants(human: HumanModel, table: ViewTable, guide: AutoGuide, number: int) -> Draws:
-    """Joint draws ``[S, P, 1, ...]`` of all sites from the guide and the enumerated posterior."""
-    model = config_enumerate(human.model, "parallel")
-    chunks = []
-    for _ in range(number):
-        continuous = guide(table)
-        sampled = infer_discrete(
-            poutine.condition(model, data=continuous), first_available_dim=-1 - PLATES
-        )
-        trace = poutine.trace(sampled).get_trace(table)
-        chunks.append(
-            {
-                name: site["value"]
-                for name, site in trace.nodes.items()
-                if site["type"] == "sample"
-                and (name in continuous or not site["is_observed"])
-                and not name.startswith("_")
-                and name not in ("person", "round")
-            }
-        )
-    return {name: torch.stack([chunk[name] for chunk in chunks]) for name in chunks[0]}
+def draw_implants(
+    human: HumanModel,
+    table: ViewTable,
+    guide: AutoGuide,
+    number: int,
+    report: Report = silent,
+) -> Draws:
+    """Joint draws ``[S, P, 1, ...]`` of all sites from the guide and the enumerated posterior.
+
+    Each draw of the continuous sites serves ``DISCRETE_DRAWS`` draws of the discrete ones, whose
+    exact posterior given the continuous ones is at hand.
+    """
+    only_views = set(discrete_sites(human)) == set(table.sites) == _enumerated(human, table)
+    draws = _draw_by_table if only_views else _draw_by_enumeration
+    chunks: list[Draws] = []
+    while sum(len(next(iter(chunk.values()))) for chunk in chunks) < number:
+        report("draw", min(number, len(chunks) * DISCRETE_DRAWS), number, "")
+        chunks.append(draws(human, table, guide))
+    report("draw", number, number, "")
+    return {name: torch.cat([chunk[name] for chunk in chunks])[:number] for name in chunks[0]}
+
+
+def _enumerated(human: HumanModel, table: ViewTable) -> set[str]:
+    """Every discrete site of the whole program, those that ``act`` samples included."""
+    trace = poutine.trace(human.model).get_trace(table)
+    return {
+        name
+        for name, site in trace.nodes.items()
+        if site["type"] == "sample" and not site["is_observed"] and site["fn"].has_enumerate_support
+    }
+
+
+def _draw_by_table(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
+    continuous = guide(table)
+    discrete = draw_combinations(human, table, log_joint(human, table, continuous), DISCRETE_DRAWS)
+    repeated = {
+        name: value.expand(DISCRETE_DRAWS, *value.shape) for name, value in continuous.items()
+    }
+    return repeated | discrete
+
+
+def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
+    continuous = guide(table)
+    sampled = infer_discrete(
+        poutine.condition(config_enumerate(human.model, "parallel"), data=continuous),
+        first_available_dim=-1 - PLATES,
+    )
+    trace = poutine.trace(sampled).get_trace(table)
+    return {
+        name: site["value"][None]
+        for name, site in trace.nodes.items()
+        if site["type"] == "sample"
+        and name not in ("person", "round", "actions")
+        and not name.startswith("_")
+    }
 
 
 @torch.no_grad()

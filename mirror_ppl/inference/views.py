@@ -337,8 +337,11 @@ def _prefixes(bits: Tensor) -> Tensor:
 
 
 def _keys(number: int) -> Tensor:
-    """Random 62-bit keys ``[number]``: sums of different sets of them differ, but for a chance of
-    about one in 2**62. Sorting numbers is a hundred times quicker than sorting rows."""
+    """Random 62-bit keys ``[number]``: sums of different sets of them differ.
+
+    But for a chance of about one in 2**62; and sorting numbers is a hundred times quicker than
+    sorting rows.
+    """
     return torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(0))
 
 

@@ -1,0 +1,187 @@
+"""`python -m mirror_ppl.fit`: infer what people see and how they decide."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from mirror_ppl.console import Progress, run, usable_device
+
+PROGRAM = "python -m mirror_ppl.fit"
+DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
+uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
+recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
+InferenceData), summary.json and sight.png. A fit that is stopped goes on from its checkpoint when
+the same command is given again."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to fit, and where the results go."""
+
+    demos: Path | None = None
+    """Recordings in the format of docs/demonstrations.md."""
+    domain: str = "driving"
+    """The world of the shipped recordings: driving."""
+    setting: str = "fog"
+    """The setting of the shipped recordings: clear or fog."""
+    population: str = "paper"
+    """The people of the shipped recordings: paper (sight limited by the setting alone) or diverse
+    (each their own reach ahead and behind)."""
+    out: Path = Path("runs/fit")
+    """Folder for the results; made if it is not there."""
+    train_rounds: int | None = None
+    """How many rounds of each person to learn from, from the first on. Default: 20 of recordings
+    with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
+    human_model: str | None = None
+    """A human model of your own: path/to/file.py:Class (see docs/extending.md)."""
+    self_model: Path | None = None
+    """Weights of the robot's self-model; those that ship unless given."""
+    steps: int = 150
+    """Gradient steps of variational inference."""
+    draws: int = 200
+    """Posterior draws."""
+    seed: int = 0
+    """Seed of everything random: the same seed gives the same summary."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda or cuda:0."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "draws", "train_rounds"):
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, not {number}")
+
+
+def main(options: Options) -> None:
+    """Fit, write the results, and print what was found.
+
+    Raises:
+        MirrorError: what was asked for cannot be done; nothing is written then.
+    """
+    began = monotonic()
+    demonstrations = _recordings(options)
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.files import prepare_output_folder, write_whole
+    from mirror_ppl.inference.export import save_inference_data
+    from mirror_ppl.inference.fitting import fit_people
+    from mirror_ppl.inference.svi import FitOptions
+    from mirror_ppl.models.loading import check_contract, load_human_model
+    from mirror_ppl.models.weights import load_self_model, shipped_weights
+    from mirror_ppl.plots.driving import save_sight_picture
+
+    device = usable_device(options.device)
+    weights = options.self_model or shipped_weights(demonstrations.domain)
+    self_model, _ = load_self_model(weights, demonstrations.domain)
+    human = load_human_model(options.human_model, self_model.to(device))
+    check_contract(human)
+    folder = prepare_output_folder(options.out)
+    checkpoint = folder / "fit.checkpoint"
+    with _Stages() as stages:
+        result = fit_people(
+            human,
+            demonstrations.to(device),
+            FitOptions(steps=options.steps, draws=options.draws),
+            options.seed,
+            options.train_rounds,
+            stages.report,
+            checkpoint,
+        )
+    summary = result.summary | {"seconds": round(monotonic() - began, 1)}
+    text = json.dumps(summary, indent=1) + "\n"
+    save_inference_data(result.data, folder / "posterior.nc")
+    save_sight_picture(result.data, folder / "sight.png")
+    write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
+    checkpoint.unlink(missing_ok=True)
+    _show(summary, get_domain(demonstrations.domain).modalities[0].units[0])
+    print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
+    print(f"{folder / 'summary.json'}: the numbers above")
+    print(f"{folder / 'sight.png'}: the road as each person sees it")
+
+
+def _recordings(options: Options):
+    from mirror_ppl.data import asset_path, load_demonstrations
+    from mirror_ppl.domains import get_domain, require_known
+
+    if options.demos is not None:
+        return load_demonstrations(options.demos)
+    require_known(options.setting, "setting", get_domain(options.domain).settings)
+    require_known(options.population, "population", ("paper", "diverse"))
+    name = f"{options.domain}_{options.setting}_{options.population}.nc"
+    return load_demonstrations(asset_path(name))
+
+
+class _Stages:
+    """Progress of one stage of work after the other."""
+
+    def __init__(self) -> None:
+        self.progress: Progress | None = None
+
+    def __enter__(self) -> _Stages:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self.progress is not None:
+            self.progress.__exit__(*(error or (None, None, None)))
+            self.progress = None
+
+    def report(self, name: str, done: int, total: int, message: str) -> None:
+        if self.progress is None or self.progress.name != name:
+            self.__exit__(None, None, None)
+            self.progress = Progress(name, total).__enter__()
+        self.progress.update(done, message)
+
+
+def _show(summary: dict[str, Any], unit: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    people = summary["people"]
+    table = Table(
+        title=f"What each person sees ({unit}) and how they decide: {summary['domain']}, "
+        f"{summary['setting']}",
+        caption="median [90% interval] truth; NLL in nats an action, floor: their own entropy",
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("person")
+    names = list(people[0]["implants"])
+    for name in names:
+        table.add_column(name.replace("sight_", "").replace("_", " "), justify="right")
+    for name in ("NLL", "floor", "accuracy"):
+        table.add_column(name, justify="right")
+    for person in people:
+        cells = [_cell(person["implants"][name]) for name in names]
+        test = person["test"] or {}
+        scores = [_number(test.get(name), 3) for name in ("nll", "floor", "accuracy")]
+        table.add_row(f"{person['id']}", *cells, *scores)
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=40 + 18 * len(names))
+    console.print(table)
+    tested = [person["test"] for person in people if person["test"]]
+    if tested:
+        nll = sum(test["nll"] for test in tested) / len(tested)
+        line = f"Held-out actions: {nll:.3f} nats an action on average"
+        floors = [test["floor"] for test in tested if test["floor"] is not None]
+        if floors:
+            line += f", {nll - sum(floors) / len(floors):.3f} above the people's own entropy"
+        print(line)
+
+
+def _cell(implant: dict[str, float | None]) -> str:
+    text = f"{_number(implant['median'])} [{_number(implant['q05'])}, {_number(implant['q95'])}]"
+    return text if implant["truth"] is None else f"{text} {_number(implant['truth'])}"
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.{digits}f}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(Options, main, prog=PROGRAM, description=DESCRIPTION))

@@ -1,0 +1,1 @@
+"""Guides, variational inference with exact enumeration, training, and ArviZ export."""

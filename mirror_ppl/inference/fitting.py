@@ -1,0 +1,178 @@
+"""The main job: from recordings to every person's posterior, predictions and a summary."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl import __version__
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.inference.summary import summarize
+from mirror_ppl.inference.svi import (
+    Draws,
+    FitOptions,
+    ImplantPosterior,
+    Report,
+    draw_prior,
+    fit_implants,
+    predict_actions,
+    silent,
+)
+from mirror_ppl.inference.views import Screening, build_view_table
+from mirror_ppl.models.human import HumanModel
+
+if TYPE_CHECKING:
+    import arviz as az
+
+PRIOR_DRAWS = 100
+TRAIN_ROUNDS, TEST_ROUNDS = 20, range(30, 36)
+"""Rounds 1-20 train and 31-36 test (21-30 are for validation, 37-40 spare), counted from 0."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Everything that came out of fitting P people.
+
+    Attributes:
+        posterior: guide, draws and losses.
+        data: the posterior and predictions as ArviZ ``InferenceData``.
+        summary: what ``summary.json`` holds.
+    """
+
+    posterior: ImplantPosterior
+    data: az.InferenceData
+    summary: dict[str, Any]
+
+
+def split_rounds(
+    demonstrations: Demonstrations, train_rounds: int | None = None
+) -> tuple[Demonstrations, Demonstrations | None]:
+    """Rounds to learn from and held-out rounds.
+
+    Recordings of 36 rounds or more are split as the supplement has it: 20 to train, rounds 31 to
+    36 to test. Of shorter ones three quarters train and the rest is held out.
+
+    Args:
+        demonstrations: all rounds.
+        train_rounds: number of rounds to learn from instead, from the first one on. Where that
+            reaches into the test rounds, those that follow it are held out.
+
+    Returns:
+        Training rounds, and the held-out ones or ``None`` if none are left.
+
+    Raises:
+        DemonstrationsError: there are fewer rounds than asked for.
+    """
+    rounds = demonstrations.shape[1]
+    paper = rounds >= TEST_ROUNDS.stop
+    if train_rounds is None:
+        train_rounds = TRAIN_ROUNDS if paper else max(1, -(-3 * rounds // 4))
+    if not 1 <= train_rounds <= rounds:
+        raise DemonstrationsError(f"cannot train on {train_rounds} of {rounds} rounds")
+    paper = paper and train_rounds <= TEST_ROUNDS.start
+    test = list(TEST_ROUNDS if paper else range(train_rounds, rounds))
+    train = demonstrations.select_rounds(list(range(train_rounds)))
+    return train, demonstrations.select_rounds(test) if test else None
+
+
+def fit_people(
+    human: HumanModel,
+    demonstrations: Demonstrations,
+    options: FitOptions,
+    seed: int,
+    train_rounds: int | None = None,
+    report: Report = silent,
+    checkpoint: Path | None = None,
+) -> Fit:
+    """Infer the implants of everybody in recordings, and predict their held-out actions.
+
+    Args:
+        human: the model of people.
+        demonstrations: rounds of P people.
+        options: settings of inference.
+        seed: seed of everything random.
+        train_rounds: see :func:`split_rounds`.
+        report: told of progress.
+        checkpoint: file to continue from; written on the way, removed by nobody.
+
+    Raises:
+        DemonstrationsError: too few rounds.
+        HumanModelError: the human model breaks its contract.
+        CheckpointError: the checkpoint is damaged or of another run.
+    """
+    train, test = split_rounds(demonstrations, train_rounds)
+    people = train.num_people
+    table = build_view_table(
+        human,
+        train,
+        screening=Screening(),
+        report=lambda done: report("views", done, people, "people"),
+    )
+    run = _identity(human, train, options, seed)
+    posterior = fit_implants(
+        human,
+        table,
+        options,
+        seed,
+        report,
+        None if checkpoint is None else (checkpoint, run),
+    )
+    prior = draw_prior(human, people, PRIOR_DRAWS, seed)
+
+    def predicted(rounds: Demonstrations, draws: Draws) -> Tensor:
+        # Only what some draw sees is looked at: exact views, without screening or merging.
+        candidates = [
+            table.combination({site: draws[site][:, person, 0] for site in table.sites}).unique()
+            for person in range(people)
+        ]
+        return predict_actions(human, build_view_table(human, rounds, candidates), draws)
+
+    report("predict", 0, 3, "")
+    log_probabilities = {"posterior": predicted(train, posterior.draws)}
+    report("predict", 1, 3, "")
+    log_probabilities["prior"] = predicted(train, prior)
+    report("predict", 2, 3, "")
+    if test is not None:
+        log_probabilities["test"] = predicted(test, posterior.draws)
+    report("predict", 3, 3, "")
+
+    from mirror_ppl.inference.export import in_units, to_inference_data
+
+    domain = get_domain(train.domain)
+    attributes = {
+        "domain": domain.name,
+        "domain_version": domain.version,
+        "setting": train.setting,
+        "human_model": type(human).__name__,
+        "version": __version__,
+        "seed": seed,
+    }
+    generator = torch.Generator().manual_seed(seed)
+    data = to_inference_data(
+        train, test, posterior.draws, prior, log_probabilities, attributes, generator
+    )
+    summary = attributes | {
+        "options": asdict(options),
+        "people": summarize(in_units(domain, posterior.draws), train, test, log_probabilities),
+    }
+    return Fit(posterior, data, summary)
+
+
+def _identity(human: HumanModel, train: Demonstrations, options: FitOptions, seed: int) -> str:
+    """What a checkpoint belongs to: recordings, model and options, as a hash."""
+    digest = hashlib.sha256()
+    parts = {**train.variables(), **human.state_dict()}
+    for name in sorted(parts):
+        digest.update(name.encode())
+        digest.update(parts[name].detach().cpu().numpy().tobytes())
+    description = [type(human).__qualname__, __version__, seed, asdict(options)]
+    digest.update(json.dumps(description, sort_keys=True).encode())
+    return digest.hexdigest()

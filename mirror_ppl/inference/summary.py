@@ -1,0 +1,95 @@
+"""What a fit says of each person, in numbers that a person reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+
+QUANTILES = {"median": 0.5, "q05": 0.05, "q95": 0.95}
+
+
+def summarize(
+    draws: Mapping[str, Tensor],
+    train: Demonstrations,
+    test: Demonstrations | None,
+    log_probabilities: Mapping[str, Tensor],
+) -> list[dict[str, Any]]:
+    """One entry a person: ``id``, ``rounds``, ``implants`` and ``test``.
+
+    Args:
+        draws: posterior draws ``[S, P, ...]``; implants that are one number a person are told of.
+        train: rounds that were learned from.
+        test: held-out rounds, if there are any.
+        log_probabilities: of actions ``[S, P, B, T, A]``, ``"test"`` being those of ``test``.
+
+    Returns:
+        ``implants``: by name ``median``, ``q05``, ``q95`` and ``truth`` (``None`` where unknown);
+        quantiles are values that were drawn. ``test``: ``nll`` in nats an action, ``accuracy`` and
+        ``floor``, the person's own entropy (``None`` where unknown); ``None`` without held-out
+        rounds.
+    """
+    scalars = {name: value for name, value in draws.items() if value.dim() == 2}  # noqa: PLR2004
+    held_out = None if test is None else score(log_probabilities["test"], test)
+    return [
+        {
+            "id": name,
+            "rounds": int(train.round_counts[person]),
+            "implants": {
+                site: _quantiles(value[:, person]) | {"truth": _truth(train, site, person)}
+                for site, value in scalars.items()
+            },
+            "test": None if held_out is None else held_out[person],
+        }
+        for person, name in enumerate(train.people)
+    ]
+
+
+def predictive(log_probabilities: Tensor) -> Tensor:
+    """Log posterior predictive ``[P, B, T, A]`` of draws ``[S, P, B, T, A]``."""
+    return torch.logsumexp(log_probabilities, 0) - np.log(len(log_probabilities))
+
+
+def score(log_probabilities: Tensor, rounds: Demonstrations) -> list[dict[str, Any] | None]:
+    """Negative log-likelihood, accuracy and floor of each person's actions."""
+    mixed = predictive(log_probabilities)
+    actions = rounds.actions.clamp(min=0)
+    chosen = mixed.gather(-1, actions[..., None]).squeeze(-1)
+    right = mixed.argmax(-1) == actions
+    results: list[dict[str, Any] | None] = []
+    for person in range(rounds.num_people):
+        steps = rounds.mask[person]
+        if not steps.any():
+            results.append(None)
+            continue
+        floor = None
+        if rounds.action_entropy is not None:
+            entropy = rounds.action_entropy[person][steps].mean()
+            floor = None if entropy.isnan() else float(entropy)
+        results.append(
+            {
+                "nll": float(-chosen[person][steps].mean()),
+                "accuracy": float(right[person][steps].float().mean()),
+                "floor": floor,
+            }
+        )
+    return results
+
+
+def _quantiles(values: Tensor) -> dict[str, float]:
+    numbers = values.double().numpy()
+    return {
+        name: float(np.quantile(numbers, level, method="inverted_cdf"))
+        for name, level in QUANTILES.items()
+    }
+
+
+def _truth(train: Demonstrations, site: str, person: int) -> float | None:
+    if site not in train.truth or train.truth[site][person].isnan():
+        return None
+    return float(train.truth[site][person])

@@ -1,0 +1,6 @@
+"""The Pyro programs: the robot's self-model, and the model of people that is made of it."""
+
+from mirror_ppl.models.human import HumanModel, Implants, View
+from mirror_ppl.models.self_model import Rounds, SelfModel
+
+__all__ = ["HumanModel", "Implants", "Rounds", "SelfModel", "View"]

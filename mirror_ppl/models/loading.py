@@ -1,0 +1,128 @@
+"""Human models from files of other people, and what such a class has to offer."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+
+import pyro
+import torch
+from pyro import poutine
+
+from mirror_ppl.errors import HumanModelError, MirrorError
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.self_model import SelfModel
+
+
+def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
+    """Make a human model.
+
+    Args:
+        specification: ``path/to/file.py:Class``, a class derived from :class:`HumanModel`; the
+            package's own model unless given.
+        self_model: the robot's networks.
+
+    Raises:
+        HumanModelError: the file or class is missing, does not import, or is not a human model.
+    """
+    if specification is None:
+        return HumanModel(self_model)
+    path_text, colon, name = specification.rpartition(":")
+    if not colon or not name.isidentifier():
+        raise HumanModelError(f'"{specification}" is not of the form path/to/file.py:Class')
+    path = Path(path_text)
+    if not path.is_file():
+        raise HumanModelError(f"{path}: there is no such file")
+    module_name = f"_human_model_{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise HumanModelError(f"{path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise HumanModelError(f"{path} does not import: {_where(error, path)}") from error
+    chosen = getattr(module, name, None)
+    if not (isinstance(chosen, type) and issubclass(chosen, HumanModel)):
+        classes = [
+            key
+            for key, value in vars(module).items()
+            if isinstance(value, type) and issubclass(value, HumanModel) and value is not HumanModel
+        ]
+        raise HumanModelError(
+            f"{path} has no class {name} derived from mirror_ppl.models.HumanModel; "
+            f"it has: {', '.join(classes) or 'none'}"
+        )
+    try:
+        return chosen(self_model)
+    except Exception as error:
+        raise HumanModelError(f"{name} cannot be made: {_where(error, path)}") from error
+
+
+@torch.no_grad()
+def check_contract(human: HumanModel) -> None:
+    """Try a human model on a made-up round, so that faults are found before long work.
+
+    Raises:
+        HumanModelError: a method fails or returns the wrong thing; names the method and the line.
+    """
+    domain = human.domain
+    device = next(human.parameters()).device
+    generator = torch.Generator(device).manual_seed(0)
+    people, steps, actions = 2, 3, len(domain.actions)
+    states = [domain.initial(people, generator)]
+    done = torch.zeros(people, steps, dtype=torch.long, device=device)
+    for step in range(steps - 1):
+        states.append(domain.transition(states[-1], done[:, step]))
+    observed = [domain.observe(state) for state in states]
+    observation = {name: torch.stack([part[name] for part in observed], 1) for name in observed[0]}
+    told = {
+        m.name: torch.zeros(people, steps, len(m.items), dtype=torch.bool, device=device)
+        for m in domain.modalities
+    }
+    method = "prior"
+    try:
+        with (
+            torch.random.fork_rng(devices=[]),
+            poutine.block(),
+            pyro.plate("person", people, dim=-2),
+        ):
+            torch.manual_seed(0)
+            implants = human.prior()
+            discrete = {
+                name: value.flatten()[:people].expand(people)
+                for name, value in implants.items()
+                if value.dim() <= 2  # noqa: PLR2004 - [P, 1]: one number a person
+            }
+            method = "perceive"
+            view = human.perceive(discrete, observation, told)
+            method = "believe"
+            belief = human.believe(view, observation, done)[:, None]
+            method = "act"
+            values = human.self_model.action_values(belief)
+            log_probabilities = human.act(implants, belief, values)
+            expected = (people, 1, steps, actions)
+            if tuple(log_probabilities.shape[-4:]) != expected:
+                raise HumanModelError(
+                    f"act returned shape {tuple(log_probabilities.shape)}, expected "
+                    f"{expected} for (people, views, steps, actions)"
+                )
+            total = log_probabilities.exp().sum(-1)
+            if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
+                raise HumanModelError("act has to return log-probabilities: they do not sum to 1")
+    except MirrorError:
+        raise
+    except Exception as error:
+        name = type(human).__name__
+        raise HumanModelError(f"{name}.{method} fails: {_where(error)}") from error
+
+
+def _where(error: Exception, path: Path | None = None) -> str:
+    """The exception in one line, with the last line of the user's own file that it passed."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if path is not None and Path(frame.filename) == path.resolve()]
+    line = (own or frames)[-1]
+    return f"{type(error).__name__}: {error} ({Path(line.filename).name}, line {line.lineno})"

@@ -1,0 +1,1 @@
+"""Figures, as functions of ArviZ and xarray objects."""

@@ -1,0 +1,2 @@
+def save_sight_picture(data, path):
+    pass
