@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -125,7 +126,7 @@ def fit_people(
         report,
         None if checkpoint is None else (checkpoint, run),
     )
-    prior = draw_prior(human, people, PRIOR_DRAWS, seed)
+    prior = draw_prior(human, table, PRIOR_DRAWS, seed)
 
     def predicted(rounds: Demonstrations, draws: Draws) -> Tensor:
         # Only what some draw sees is looked at: exact views, without screening or merging.
@@ -133,7 +134,7 @@ def fit_people(
             table.combination({site: draws[site][:, person, 0] for site in table.sites}).unique()
             for person in range(people)
         ]
-        return predict_actions(human, build_view_table(human, rounds, candidates), draws)
+        return predict_actions(human, build_view_table(human, rounds, candidates), draws).cpu()
 
     report("predict", 0, 3, "")
     log_probabilities = {"posterior": predicted(train, posterior.draws)}
@@ -143,6 +144,12 @@ def fit_people(
     if test is not None:
         log_probabilities["test"] = predicted(test, posterior.draws)
     report("predict", 3, 3, "")
+
+    # Results live where everybody can read them.
+    train, test = train.to("cpu"), None if test is None else test.to("cpu")
+    drawn, prior = (
+        {name: value.cpu() for name, value in draws.items()} for draws in (posterior.draws, prior)
+    )
 
     from mirror_ppl.inference.export import in_units, to_inference_data
 
@@ -156,12 +163,10 @@ def fit_people(
         "seed": seed,
     }
     generator = torch.Generator().manual_seed(seed)
-    data = to_inference_data(
-        train, test, posterior.draws, prior, log_probabilities, attributes, generator
-    )
+    data = to_inference_data(train, test, drawn, prior, log_probabilities, attributes, generator)
     summary = attributes | {
         "options": asdict(options),
-        "people": summarize(in_units(domain, posterior.draws), train, test, log_probabilities),
+        "people": summarize(in_units(domain, drawn), train, test, log_probabilities),
     }
     return Fit(posterior, data, summary)
 
@@ -173,6 +178,10 @@ def _identity(human: HumanModel, train: Demonstrations, options: FitOptions, see
     for name in sorted(parts):
         digest.update(name.encode())
         digest.update(parts[name].detach().cpu().numpy().tobytes())
-    description = [type(human).__qualname__, __version__, seed, asdict(options)]
+    try:
+        source = inspect.getsource(type(human))
+    except (OSError, TypeError):  # a class made in a session has no file
+        source = type(human).__qualname__
+    description = [source, __version__, seed, asdict(options)]
     digest.update(json.dumps(description, sort_keys=True).encode())
     return digest.hexdigest()

@@ -27,6 +27,7 @@ from mirror_ppl.files import write_whole
 from mirror_ppl.inference.exact import draw_combinations, log_joint
 from mirror_ppl.inference.views import combination_scores, discrete_sites, restricted
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.sites import discrete_names, latent_sites, latent_values
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 Report = Callable[[str, int, int, str], None]
@@ -113,8 +114,7 @@ class PriorScaledNormal(AutoNormal):
 
 def continuous_guide(human: HumanModel, table: ViewTable) -> AutoGuide:
     """A mean-field guide over the continuous sites of a human model, one factor a person."""
-    hidden = list(discrete_sites(human))
-    model = poutine.block(human.model, hide=hidden)
+    model = poutine.block(human.model, hide=list(_enumerated(human, table)))
     guide = PriorScaledNormal(model, init_loc_fn=init_to_median)
     guide(table)
     return guide
@@ -147,8 +147,7 @@ def fit_implants(
         guide = continuous_guide(human, table)
         table, losses = _optimize(human, table, guide, options, report, checkpoint)
         draws = draw_implants(human, table, guide, options.draws, report)
-        order = [*draw_prior(human, 1, 1, seed)]
-        draws = {name: draws[name] for name in sorted(draws, key=[*order, *draws].index)}
+        draws = {name: draws[name] for name in draw_prior(human, table, 1, seed)}
     return ImplantPosterior(guide, draws, tuple(losses))
 
 
@@ -265,12 +264,7 @@ def draw_implants(
 
 def _enumerated(human: HumanModel, table: ViewTable) -> set[str]:
     """Every discrete site of the whole program, those that ``act`` samples included."""
-    trace = poutine.trace(human.model).get_trace(table)
-    return {
-        name
-        for name, site in trace.nodes.items()
-        if site["type"] == "sample" and not site["is_observed"] and site["fn"].has_enumerate_support
-    }
+    return discrete_names(poutine.trace(human.model).get_trace(table))
 
 
 def _draw_by_table(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
@@ -289,29 +283,25 @@ def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) 
         first_available_dim=-1 - PLATES,
     )
     trace = poutine.trace(sampled).get_trace(table)
-    return {
-        name: site["value"][None]
-        for name, site in trace.nodes.items()
-        if site["type"] == "sample"
-        and name not in ("person", "round", "actions")
-        and not name.startswith("_")
-    }
+    values = {**continuous, **latent_values(trace)}
+    return {name: value[None] for name, value in values.items()}
 
 
 @torch.no_grad()
-def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
-    """Draws ``[S, P, 1, ...]`` of the prior's sites, ``act``'s own sites left out."""
+def draw_prior(human: HumanModel, table: ViewTable, number: int, seed: int) -> Draws:
+    """Draws ``[S, P, 1, ...]`` of the prior of all implants, in the order of the program."""
     with (
         torch.random.fork_rng(devices=[]),
         pyro.plate("draw", number, dim=-1 - PLATES),
-        pyro.plate("person", people, dim=-PLATES),
+        pyro.plate("person", table.people, dim=-PLATES),
+        poutine.trace() as trace,
     ):
         torch.manual_seed(seed)
-        trace = poutine.trace(human.prior).get_trace()
+        # A single view is enough for the sites that act() may add.
+        human.act(human.prior(), table.belief[:, :1], table.values[:, :1])
     return {
         name: site["value"].expand(site["fn"].batch_shape + site["fn"].event_shape)
-        for name, site in trace.nodes.items()
-        if site["type"] == "sample" and not site["is_observed"]
+        for name, site in latent_sites(trace.trace).items()
     }
 
 
@@ -323,7 +313,7 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
     seeing what the draw says they see.
     """
     number = next(iter(draws.values())).shape[0]
-    person = torch.arange(table.people)[:, None]
+    person = torch.arange(table.people, device=table.index.device)[:, None]
     results = []
     for draw in range(number):
         own = {name: value[draw] for name, value in draws.items()}

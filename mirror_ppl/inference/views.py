@@ -20,6 +20,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.sites import discrete_names, latent_sites, latent_values
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
 
 MAX_COMBINATIONS = 100_000
@@ -51,10 +52,11 @@ def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of the discrete sites of a human model's prior, by name."""
     with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
         trace = poutine.trace(human.prior).get_trace()
+    sites = latent_sites(trace)
     return {
-        name: site["fn"].enumerate_support(expand=False).flatten()
-        for name, site in trace.nodes.items()
-        if site["type"] == "sample" and not site["is_observed"] and site["fn"].has_enumerate_support
+        name: sites[name]["fn"].enumerate_support(expand=False).flatten()
+        for name in sites
+        if name in discrete_names(trace)
     }
 
 
@@ -156,9 +158,10 @@ def build_view_table(
     axes = torch.meshgrid(*supports.values(), indexing="ij") if supports else ()
     grid = {name: axis.flatten() for name, axis in zip(supports, axes, strict=True)}
     observation = demonstrations.observation()
+    everything = torch.arange(prod(sizes), device=demonstrations.actions.device)
     people = []
     for person in range(demonstrations.num_people):
-        alive = torch.arange(prod(sizes)) if candidates is None else candidates[person]
+        alive = everything if candidates is None else candidates[person]
         people.append(_person(human, demonstrations, observation, person, grid, alive, screening))
         report(person + 1)
     most = max(len(part["actions"]) for part in people)
@@ -210,10 +213,10 @@ def _person(
 ) -> dict[str, Tensor]:
     """Views of one person's rounds, and index ``[B, M]`` of each combination's view."""
     combinations = max([len(values) for values in grid.values()], default=1)
-    index = torch.full((demonstrations.shape[1], combinations), NO_VIEW)
+    index = torch.full((demonstrations.shape[1], combinations), NO_VIEW, device=alive.device)
     rounds: list[dict[str, Tensor]] = []
     resolution = 0.0 if screening is None else screening.resolution
-    screen = None if screening is None else _Screen(human, screening, combinations)
+    screen = None if screening is None else _Screen(human, screening, index[0])
     total = 0
     # Somebody without rounds still needs one view, of padding, to be looked up.
     for number in range(max(int(demonstrations.round_counts[person]), 1)):
@@ -285,10 +288,10 @@ def _alike(values: Tensor, real: Tensor, resolution: float) -> tuple[Tensor, Ten
 class _Screen:
     """Running log-likelihoods ``[ways, M]`` of combinations, and who is still worth following."""
 
-    def __init__(self, human: HumanModel, screening: Screening, combinations: int) -> None:
+    def __init__(self, human: HumanModel, screening: Screening, combinations: Tensor) -> None:
         self.human = human
         self.screening = screening
-        self.score = torch.zeros(screening.ways, combinations)
+        self.score = torch.zeros(screening.ways, len(combinations), device=combinations.device)
         self.sites: dict[str, Tensor] | None = None
 
     def keep(self, alive: Tensor, inverse: Tensor, part: Mapping[str, Tensor]) -> Tensor:
@@ -311,11 +314,8 @@ class _Screen:
         ):
             torch.manual_seed(self.screening.seed)
             log_probabilities = self.human.act(self.human.prior(), belief, values)
-        self.sites = {
-            name: site["value"]
-            for name, site in trace.trace.nodes.items()
-            if site["type"] == "sample" and name not in ("way", "person")
-        }
+        if self.sites is None:
+            self.sites = latent_values(trace.trace)
         return log_probabilities
 
 
@@ -331,25 +331,26 @@ def _bits(view: View, real: Tensor) -> Tensor:
 
 def _prefixes(bits: Tensor) -> Tensor:
     """A number ``[M, T]`` for each beginning of each view, the same for the same beginnings."""
-    keys = _keys(bits.shape[1] * bits.shape[2]).unflatten(0, bits.shape[1:])
-    steps = torch.arange(bits.shape[1]) * _keys(1)
+    keys = _keys(bits.shape[1] * bits.shape[2], bits.device).unflatten(0, bits.shape[1:])
+    steps = torch.arange(bits.shape[1], device=bits.device) * _keys(1, bits.device)
     return (bits * keys).sum(-1).cumsum(-1) + steps
 
 
-def _keys(number: int) -> Tensor:
+def _keys(number: int, device: torch.device) -> Tensor:
     """Random 62-bit keys ``[number]``: sums of different sets of them differ.
 
     But for a chance of about one in 2**62; and sorting numbers is a hundred times quicker than
     sorting rows.
     """
-    return torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(0))
+    keys = torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(0))
+    return keys.to(device)
 
 
 def _first_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
     """First of each set of equal rows of ``[M, N]``, and the number of each row's set."""
-    values, inverse = torch.unique(rows @ _keys(rows.shape[1]), return_inverse=True)
-    first = torch.full((len(values),), len(rows))
-    first.scatter_reduce_(0, inverse, torch.arange(len(rows)), "amin")
+    values, inverse = torch.unique(rows @ _keys(rows.shape[1], rows.device), return_inverse=True)
+    first = torch.full((len(values),), len(rows), device=rows.device)
+    first.scatter_reduce_(0, inverse, torch.arange(len(rows), device=rows.device), "amin")
     return first, inverse
 
 

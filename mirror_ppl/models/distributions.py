@@ -29,8 +29,8 @@ class GaussianChain(TorchDistribution):
         input_dims: 1 if each ``u_t`` is a vector, 0 if it is a number (an action's index).
     """
 
-    arg_constraints = {}  # noqa: RUF012 - the base class declares it so
-    support = constraints.real_vector
+    arg_constraints = {}  # noqa: RUF012 # pyright: ignore[reportAssignmentType]
+    support = constraints.independent(constraints.real, 2)  # pyright: ignore[reportAssignmentType]
     has_rsample = True
 
     def __init__(self, initial: Gaussian, step: Step, inputs: Tensor, input_dims: int) -> None:
@@ -44,11 +44,13 @@ class GaussianChain(TorchDistribution):
         super().__init__(batch, event, validate_args=False)
 
     def expand(self, batch_shape: torch.Size, _instance: object = None) -> GaussianChain:
+        """Itself: there is one trajectory for each of its inputs."""
         if torch.Size(batch_shape) != self.batch_shape:
             raise ValueError("a GaussianChain has one trajectory for each of its inputs")
         return self
 
     def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+        """Draw trajectories ``[..., T + 1, Z]``, differentiable in the parameters."""
         mean, scale = self.initial
         shape = torch.Size(sample_shape) + mean.shape
         latent = mean + scale * torch.randn(shape, dtype=mean.dtype, device=mean.device)
@@ -60,6 +62,7 @@ class GaussianChain(TorchDistribution):
         return torch.stack(trajectory, -2)
 
     def log_prob(self, value: Tensor) -> Tensor:
+        """Log density ``[...]`` of trajectories ``[..., T + 1, Z]``, all steps at once."""
         first = Normal(*self.initial, validate_args=False).log_prob(value[..., 0, :])
         rest = Normal(*self.step(value[..., :-1, :], self.inputs), validate_args=False)
         return first.sum(-1) + rest.log_prob(value[..., 1:, :]).sum((-1, -2))

@@ -148,5 +148,4 @@ class HumanModel(nn.Module):
                     obs=table.recorded,
                 )
         if world is not None:
-            with pyro.plate("worlds", 1, dim=-2):
-                self.self_model.model(world)
+            self.self_model.model(world)

@@ -58,7 +58,7 @@ def policy_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tens
     def number(value: float) -> Tensor:
         return torch.tensor(value, dtype=like.dtype, device=like.device)
 
-    def weights(rows: int, columns: int, scale: float) -> Tensor:
+    def weights(rows: int, columns: int, scale: float) -> dist.TorchDistribution:
         zero = torch.zeros(rows, columns, dtype=like.dtype, device=like.device)
         return dist.Normal(zero, scale).to_event(2)
 

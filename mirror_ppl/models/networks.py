@@ -1,6 +1,6 @@
 """The small networks of the self-model, each named by the density that it parameterizes.
 
-Sizes are those of the supplement, section D. Shape letters are those of ``mirror_ppl.domains.base``.
+Sizes are those of the supplement, section D; shape letters those of ``mirror_ppl.domains.base``.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class GaussianHead(nn.Module):
             self.linear.bias[size:] += offset
 
     def forward(self, features: Tensor) -> Gaussian:
+        """Of ``features`` ``[..., H]``; mean and scale ``[..., size]``."""
         mean, raw = self.linear(features).chunk(2, -1)
         return Gaussian(mean, softplus(raw) + MIN_SCALE)
 
@@ -114,7 +115,7 @@ class Encoder(nn.Module):
         return self.action(torch.cat([none, actions], -1))
 
     def forward(self, previous: Tensor, evidence: Tensor) -> Gaussian:
-        """Of ``previous`` ``[..., Z]`` and the ``evidence`` ``[..., H]`` of ``x_t, v_t, a_{t-1}``."""
+        """Of ``previous`` ``[..., Z]`` and ``evidence`` ``[..., H]`` of ``x_t, v_t, a_{t-1}``."""
         features = torch.relu(self.previous(previous) + evidence)
         change = self.head(self.body(features))
         return Gaussian(previous + change.mean, change.scale)
@@ -130,6 +131,7 @@ class ItemEmbedding(nn.Module):
         self.bias = nn.Parameter(torch.zeros(items, hidden))
 
     def forward(self, symbols: Tensor) -> Tensor:
+        """Of ``symbols`` ``[..., K, D]``; contributions ``[..., K, H]``."""
         return torch.einsum("...kd,kdh->...kh", symbols, self.weight) + self.bias
 
 

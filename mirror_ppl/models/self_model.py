@@ -9,7 +9,7 @@ observations, and a Q-network on ``z_t``.
 
 Departures, each with its reason in ``docs/decisions.md``:
 
-- observations enter as discrete symbols (the supplement calls them discrete) and leave as Gaussians;
+- observations enter as discrete symbols, as the supplement calls them, and leave as Gaussians;
 - transition and encoder predict the change of the state instead of the state;
 - the ego's own state is decoded like a modality that is always visible.
 """
@@ -34,6 +34,7 @@ from mirror_ppl.models.networks import (
     Reward,
     Transition,
 )
+from mirror_ppl.models.sites import latent_values
 
 LATENT = 48
 
@@ -84,7 +85,7 @@ class SelfModel(nn.Module):
     def model(self, rounds: Rounds) -> Tensor:
         """The generative program, conditioned on what is true; returns ``z`` ``[B, T + 1, Z]``."""
         actions = rounds.actions
-        with pyro.plate("round", actions.shape[0]):
+        with pyro.plate("self_model_round", actions.shape[0]):
             z = pyro.sample(
                 "z", GaussianChain(self.prior(actions.shape[:1]), self.transition, actions, 0)
             )
@@ -99,7 +100,7 @@ class SelfModel(nn.Module):
         """The amortized guide: the encoder on what is visible; returns ``z`` ``[B, T + 1, Z]``."""
         evidence = self.evidence(rounds.observation, rounds.visible, rounds.actions)
         nothing = evidence.new_zeros(*evidence.shape[:-2], self.latent)
-        with pyro.plate("round", evidence.shape[0]):
+        with pyro.plate("self_model_round", evidence.shape[0]):
             return pyro.sample(
                 "z",
                 GaussianChain(
@@ -116,7 +117,7 @@ class SelfModel(nn.Module):
         replayed = poutine.replay(self.model, trace=guide_trace)
         model_trace = poutine.trace(replayed).get_trace(rounds)
         bound = model_trace.log_prob_sum() - guide_trace.log_prob_sum()
-        return bound, guide_trace.nodes["_RETURN"]["value"]
+        return torch.as_tensor(bound), latent_values(guide_trace)["z"]
 
     def prior(self, batch: torch.Size) -> Gaussian:
         """``p(z_0)``: a standard Gaussian, ``[*batch, Z]``."""

@@ -106,8 +106,10 @@ class ViewedActions(TorchDistribution):
         real: which rounds are real ``[P, B]``; the others have probability one.
     """
 
-    arg_constraints = {}  # noqa: RUF012 - the base class declares it so
-    support = constraints.independent(constraints.nonnegative_integer, 1)
+    arg_constraints = {}  # noqa: RUF012 # pyright: ignore[reportAssignmentType]
+    support = constraints.independent(  # pyright: ignore[reportAssignmentType]
+        constraints.nonnegative_integer, 1
+    )
 
     def __init__(self, log_likelihoods: Tensor, view: Tensor, real: Tensor) -> None:
         self.log_likelihoods = log_likelihoods

@@ -46,7 +46,7 @@ class ViewPlan:
     noise: dict[str, Tensor]
 
     def visibility(self, domain: Domain, observation: Observation, first: int = 0) -> Visibility:
-        """What is visible ``[B, T', K]`` of observations ``[B, T', ...]`` from step ``first`` on."""
+        """What is visible ``[B, T', K]`` of observations ``[B, T', ...]`` from step ``first``."""
         direction, distance = domain.distance(observation)
         batch = torch.arange(len(self.reach), device=self.reach.device)[:, None, None]
         within = {
