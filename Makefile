@@ -38,7 +38,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install -qq -c constraints.txt -e '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## Fit a simulated person who drives in fog; results in runs/demo
+demo: $(STAMP) ## Fit ten simulated people who drive in fog; results in runs/demo
 	$(BIN)/python -m mirror_ppl.fit --domain driving --setting fog --out runs/demo
 
 check: $(STAMP) ## Style, format and types

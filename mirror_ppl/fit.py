@@ -67,7 +67,7 @@ def main(options: Options) -> None:
     from mirror_ppl.domains import get_domain
     from mirror_ppl.files import prepare_output_folder, write_whole
     from mirror_ppl.inference.export import save_inference_data
-    from mirror_ppl.inference.fitting import fit_people
+    from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -78,6 +78,9 @@ def main(options: Options) -> None:
     self_model, _ = load_self_model(weights, demonstrations.domain)
     human = load_human_model(options.human_model, self_model.to(device))
     check_contract(human)
+    # Faults of the recordings come to light before anything is written.
+    check_world(demonstrations)
+    split_rounds(demonstrations, options.train_rounds)
     folder = prepare_output_folder(options.out)
     checkpoint = folder / "fit.checkpoint"
     with _Stages() as stages:

@@ -23,9 +23,9 @@ class LatePerson(HumanModel):
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of actions ``[..., T, A]``; some follow the belief before."""
-        # Few actions are late unless the recordings say otherwise: mean 0.2.
-        late = pyro.sample("late", dist.Beta(torch.tensor(1.0), torch.tensor(4.0)))
-        late = late[..., None, None]  # [..., P, 1] -> [..., P, 1, 1, 1], beside [..., P, V, T, A]
+        one = belief.new_ones(())  # on the belief's device
+        late = pyro.sample("late", dist.Beta(one, 4 * one))  # [..., P, 1]; mean 0.2
+        late = late[..., None, None]  # [..., P, 1, 1, 1], beside [..., P, V, T, A]
         now = super().act(implants, belief, values)
         # The first action has no belief before it.
         before = torch.cat([now[..., :1, :], now[..., :-1, :]], -2)

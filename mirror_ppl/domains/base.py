@@ -112,6 +112,10 @@ class Domain(Protocol):
         """Which items may be communicated now."""
         ...
 
+    def faults(self, observation: Observation) -> dict[str, Tensor]:
+        """What cannot be in this world: which observations ``[...]`` break each rule, by rule."""
+        ...
+
     def unknown_so_far(self, visibility: Visibility) -> Visibility:
         """Items ``[..., T, K]`` of which nothing was seen or told up to each step."""
         ...

@@ -211,6 +211,27 @@ class Driving:
         on_road = ahead.abs() < ROAD_END
         return {"visual": on_road & (ahead >= 0), "verbal": on_road}
 
+    def faults(self, observation: Observation) -> dict[str, Tensor]:
+        """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
+        lane, visual = observation["ego"], observation["visual"]
+        lanes = torch.tensor(CAR_LANES, device=lane.device)
+        ahead, offset = visual.unbind(-1)
+        return {
+            "ego lane has to be 0 or 1": ((lane != 0) & (lane != 1)).any(-1),
+            f"distance_ahead has to be a whole number of cells from -{ROAD_END} to {ROAD_END}": (
+                (ahead != ahead.round()) | (ahead.abs() > ROAD_END)
+            ).any(-1),
+            "lane_offset has to be the car's lane (left cars 0, right cars 1) minus the ego's": (
+                offset != lanes - lane
+            ).any(-1),
+            "verbal position has to be the visual one": (
+                observation["verbal"][..., :2] != visual
+            ).any((-1, -2)),
+            "relative_speed has to be -1, 0 or 1": (
+                ~torch.isin(observation["verbal"][..., 2], torch.tensor([-1.0, 0.0, 1.0]))
+            ).any(-1),
+        }
+
     def unknown_so_far(self, visibility: Visibility) -> Visibility:
         """Visual items ``[..., T, 4]`` of cars neither seen nor told of at this step or before."""
         known = (visibility["visual"] | visibility["verbal"]).long().cummax(-2).values.bool()

@@ -13,7 +13,7 @@ chains, mean nothing for them.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.files import write_whole
 from mirror_ppl.models.implants import SIGHT, sight_sites
@@ -94,9 +95,12 @@ def to_inference_data(
             "car": list(domain.modalities[0].items),
             "visual_feature": list(domain.modalities[0].features),
         },
-        dims=_dims({**posterior, **prior}),
+        dims=_dims([*posterior, *prior, *(TRUTH + name for name in train.truth)]),
         attrs={key: str(value) for key, value in attributes.items()},
     )
+    if test is not None:
+        # In from_dict a variable has the same dimensions in each group.
+        data.rename({"round": "test_round"}, groups="predictions_constant_data", inplace=True)
     for name in data.groups():
         data[name].attrs.update({key: str(value) for key, value in attributes.items()})
         for variable in data[name].data_vars:
@@ -127,15 +131,15 @@ def _constants(rounds: Demonstrations) -> dict[str, Any]:
         "ego": rounds.ego.numpy(),
         "visual": rounds.observations["visual"].numpy(),
     }
-    constants |= {f"truth_{name}": value.numpy() for name, value in rounds.truth.items()}
+    constants |= {TRUTH + name: value.numpy() for name, value in rounds.truth.items()}
     if rounds.action_entropy is not None:
         constants["action_entropy"] = rounds.action_entropy.numpy()
     return constants
 
 
-def _dims(sites: Mapping[str, Tensor]) -> dict[str, list[str]]:
+def _dims(one_a_person: Iterable[str]) -> dict[str, list[str]]:
     rounds = ["person", "round", "step"]
-    dims = {name: ["person"] for name in sites}
+    dims = {name: ["person"] for name in one_a_person}
     dims["residual_in"] = ["person", "residual_input", "residual_unit"]
     dims["residual_out"] = ["person", "residual_unit_and_bias", "action_name"]
     dims["action"] = rounds

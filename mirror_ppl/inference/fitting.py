@@ -84,6 +84,25 @@ def split_rounds(
     return train, demonstrations.select_rounds(test) if test else None
 
 
+def check_world(demonstrations: Demonstrations) -> None:
+    """Make sure that what was recorded can be in the domain's world.
+
+    Raises:
+        DemonstrationsError: it cannot; says where and why.
+    """
+    domain = get_domain(demonstrations.domain)
+    times = torch.arange(demonstrations.ego.shape[2], device=demonstrations.ego.device)
+    lengths = demonstrations.lengths[..., None]
+    real = (times <= lengths) & (lengths > 0)
+    for rule, broken in domain.faults(demonstrations.observation()).items():
+        where = (broken & real).nonzero()
+        if len(where):
+            person, number, time = where[0].tolist()
+            raise DemonstrationsError(
+                f"person {demonstrations.people[person]}, round {number}, time {time}: {rule}"
+            )
+
+
 def fit_people(
     human: HumanModel,
     demonstrations: Demonstrations,
@@ -97,7 +116,7 @@ def fit_people(
 
     Args:
         human: the model of people.
-        demonstrations: rounds of P people.
+        demonstrations: rounds of P people; see :func:`check_world`.
         options: settings of inference.
         seed: seed of everything random.
         train_rounds: see :func:`split_rounds`.

@@ -84,13 +84,31 @@ class Loss:
 
 
 def self_model_loss(
-    self_model: SelfModel, target: torch.nn.Module, lived: Experience, options: SelfModelOptions
+    self_model: SelfModel,
+    target: torch.nn.Module,
+    lived: Experience,
+    options: SelfModelOptions,
+    on_means: bool,
 ) -> Loss:
-    """Loss of a batch of rounds; ``target`` is the slow copy of the Q-network."""
-    bound, z = self_model.elbo(lived.rounds)
-    batch, steps = lived.rounds.actions.shape
+    """Loss of a batch of rounds.
+
+    Args:
+        self_model: what is trained.
+        target: the slow copy of its Q-network.
+        lived: rounds and outcomes.
+        options: settings.
+        on_means: learn values at the encoder's means, which is what everything that uses them
+            believes in, and not at draws of the guide, which keep the guide from being vague about
+            what values depend on. Training takes turns.
+    """
+    rounds = lived.rounds
+    bound, z = self_model.elbo(rounds)
+    batch, steps = rounds.actions.shape
     negative_elbo = -bound / (batch * (steps + 1))
     belief = z[:, :-1]
+    if on_means:
+        evidence = self_model.evidence(rounds.observation, rounds.visible, rounds.actions)
+        belief = self_model.believe(evidence[:, :-1])
     goals = []
     with torch.no_grad():
         for action, outcome in enumerate(lived.outcomes):
@@ -126,13 +144,14 @@ def train_self_model(
         checkpoint: file that is written after each phase and continued from if it exists.
 
     Raises:
-        CheckpointError: if the checkpoint belongs to other options or cannot be read.
+        CheckpointError: if the checkpoint belongs to another run (domain, options or seed) or
+            cannot be read.
     """
     device = generator.device
     seed = int(torch.randint(2**31, (1,), generator=generator, device=device))
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        trainer = _Trainer(domain, options, generator)
+        trainer = _Trainer(domain, options, generator, seed)
         trainer.run(report, checkpoint)
     return trainer.self_model.eval()
 
@@ -141,10 +160,16 @@ class _Trainer:
     """State of a training run; everything that a checkpoint has to hold."""
 
     def __init__(
-        self, domain: Domain, options: SelfModelOptions, generator: torch.Generator
+        self, domain: Domain, options: SelfModelOptions, generator: torch.Generator, seed: int
     ) -> None:
         self.domain = domain
         self.options = options
+        self.run_id = {
+            "domain": domain.name,
+            "domain_version": domain.version,
+            "options": asdict(options),
+            "seed": seed,
+        }
         self.generator = generator
         self.self_model = SelfModel(domain).to(generator.device)
         self.target = copy.deepcopy(self.self_model.q_network)
@@ -172,7 +197,7 @@ class _Trainer:
     def _save(self, path: Path) -> None:
         starts = [map_state(lambda part: part.to(torch.int16), start) for start in self.starts]
         content = {
-            "options": asdict(self.options),
+            "run": self.run_id,
             "phase": self.phase,
             "self_model": self.self_model.state_dict(),
             "target": self.target.state_dict(),
@@ -188,10 +213,15 @@ class _Trainer:
     def _restore(self, path: Path) -> None:
         try:
             content = torch.load(path, weights_only=True)
+            own = content["run"]
         except Exception as error:
-            raise CheckpointError(f"{path}: not a checkpoint of this program") from error
-        if content.get("options") != asdict(self.options):
-            raise CheckpointError(f"{path}: made with other options; remove it to start anew")
+            raise CheckpointError(
+                f"{path} is not a checkpoint of this program; remove it"
+            ) from error
+        if own != self.run_id:
+            raise CheckpointError(
+                f"{path} belongs to a run with other options or seed; remove it to start anew"
+            )
         self.self_model.load_state_dict(content["self_model"])
         self.target.load_state_dict(content["target"])
         self.optimizer.load_state_dict(content["optimizer"])
@@ -230,7 +260,7 @@ class _Trainer:
         starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
         actions = torch.cat(self.actions)
         elbo = bellman = 0.0
-        for _ in range(options.steps):
+        for step in range(options.steps):
             chosen = torch.randint(
                 len(actions),
                 (options.batch,),
@@ -240,7 +270,9 @@ class _Trainer:
             plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
             start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
             lived = experience(self.domain, start, actions[chosen], plan)
-            loss = self_model_loss(self.self_model, self.target, lived, options)
+            loss = self_model_loss(
+                self.self_model, self.target, lived, options, on_means=step % 2 == 1
+            )
             self.optimizer.zero_grad()
             loss.total.backward()
             torch.nn.utils.clip_grad_norm_(self.self_model.parameters(), 5.0)

@@ -61,6 +61,7 @@ class Transition(nn.Module):
     def forward(self, previous: Tensor, action: Tensor) -> Gaussian:
         """Of ``previous`` ``[..., Z]`` and ``action`` (index) ``[...]``."""
         chosen = nn.functional.one_hot(action, self.actions).to(previous.dtype)
+        chosen = chosen.expand(*previous.shape[:-1], -1)
         change = self.head(self.body(torch.cat([previous, chosen], -1)))
         return Gaussian(previous + change.mean, change.scale)
 
@@ -163,6 +164,7 @@ class Reward(nn.Module):
     def forward(self, latent: Tensor, action: Tensor) -> Gaussian:
         """Of ``latent`` ``[..., Z]`` and ``action`` ``[...]``; mean and scale ``[...]``."""
         chosen = nn.functional.one_hot(action, self.actions).to(latent.dtype)
+        chosen = chosen.expand(*latent.shape[:-1], -1)
         mean, scale = self.head(self.body(torch.cat([latent, chosen], -1)))
         return Gaussian(mean.squeeze(-1), scale.squeeze(-1))
 

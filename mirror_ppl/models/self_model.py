@@ -112,7 +112,7 @@ class SelfModel(nn.Module):
             )
 
     def elbo(self, rounds: Rounds) -> tuple[Tensor, Tensor]:
-        """One-particle evidence lower bound, summed over rounds, and the ``z`` it was taken at."""
+        """One-particle evidence lower bound in nats, summed over rounds, and the ``z`` it is at."""
         guide_trace = poutine.trace(self.guide).get_trace(rounds)
         replayed = poutine.replay(self.model, trace=guide_trace)
         model_trace = poutine.trace(replayed).get_trace(rounds)

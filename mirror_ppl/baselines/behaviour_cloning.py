@@ -1,0 +1,418 @@
+"""Behaviour cloning: a recurrent network from what could be seen to what a person does.
+
+Implements the baseline BC of MIRROR (Chen, Fong and Soh, RSS 2022; supplement, section D)::
+
+    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])          48 units
+    a_t ~ Categorical(softmax(output(relu(layer(h_t)))))          one layer of 32
+
+with a network of its own for each person, fitted to that person's rounds by maximum likelihood.
+``x_t`` are the domain's symbols of all items of all modalities and ``v_t`` masks: which items the
+setting lets an unaided person see, or were told.
+
+Departures from the supplement:
+
+- It feeds ``x_t, a_t`` to predict ``a_t``. The action at t cannot be an input to its own
+  prediction, so the GRU reads ``a_{t-1}`` ("none yet" at first), as the supplement's other
+  recurrent clone, that of CARLA, does.
+- It does not say whether BC reads all items or only those in sight. ``sight`` has both. With
+  "setting" the clone is *given* the sight that MIRROR has to infer wherever the setting alone
+  limits people's sight; with "everything" it has as much to go by as MIRROR has.
+- Masks are inputs, so that what is communicated can enter.
+- Weights on inputs begin at zero: a symbol that the recordings lack adds nothing. The output's bias
+  begins at the frequencies of the person's actions.
+- Early stopping, and a choice among weight decays, by the person's validation rounds; see
+  `BehaviourCloneOptions` for what was searched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains import Domain, Observation, Visibility, get_domain, require_known
+from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.people.populations import derived_generator
+
+Sight = Literal["setting", "everything"]
+"""Which items a clone reads: those that the setting shows or that were told, or all visual ones."""
+SIGHTS: tuple[Sight, ...] = get_args(Sight)
+
+
+@dataclass(frozen=True)
+class BehaviourCloneOptions:
+    """Settings of behaviour cloning.
+
+    SEARCHED
+
+    Attributes:
+        sight: a name in ``SIGHTS``: which items the clone reads.
+        hidden: units of the GRU (supplement: 48).
+        layer: units of the layer after it (supplement: 32).
+        learning_rate: of AdamW.
+        weight_decays: decoupled weight decays of AdamW on all weights but biases. A network is
+            trained with each, and each person keeps the one that predicts their validation rounds
+            best.
+        epochs: most gradient steps with each weight decay; a step uses all training rounds, or
+            ``batch`` of them.
+        batch: most rounds of a person in a gradient step, drawn without replacement.
+        check_every: gradient steps between looks at the validation rounds.
+        patience: looks without a better one after which a person's training ends.
+    """
+
+    sight: Sight = "setting"
+    hidden: int = 48
+    layer: int = 32
+    learning_rate: float = 0.03
+    weight_decays: tuple[float, ...] = (1.0, 4.0, 10.0)
+    epochs: int = 400
+    batch: int = 20
+    check_every: int = 3
+    patience: int = 10
+
+    def __post_init__(self) -> None:
+        require_known(self.sight, "sight", SIGHTS)
+        for name in ("hidden", "layer", "epochs", "batch", "check_every", "patience"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
+        if not self.weight_decays or not all(decay >= 0 for decay in self.weight_decays):
+            raise ValueError(f"weight_decays must be some and not negative: {self.weight_decays}")
+
+
+def network_inputs(
+    domain: Domain, observation: Observation, visible: Visibility, previous: Tensor
+) -> Tensor:
+    """What a recurrent network reads at each step, ``[..., I]``; zero for all that is not visible.
+
+    Args:
+        domain: the world.
+        observation: everything that there was to observe, ego ``[..., E]`` and modalities
+            ``[..., K, F]`` in the domain's units.
+        visible: seen or told, ``[..., K]`` for each modality.
+        previous: indices ``[...]`` of the actions before, A where there was none.
+    """
+    symbols = domain.symbols(observation)
+    dtype = symbols["ego"].dtype
+    parts = [symbols["ego"]]
+    for modality in domain.modalities:
+        mask = visible[modality.name].to(dtype)
+        parts += [(symbols[modality.name] * mask[..., None]).flatten(-2), mask]
+    parts.append(one_hot(previous, len(domain.actions) + 1).to(dtype))
+    return torch.cat(parts, -1)
+
+
+def input_size(domain: Domain) -> int:
+    """I, the number of inputs that `network_inputs` makes."""
+    items = sum(len(m.items) * (domain.symbol_sizes[m.name] + 1) for m in domain.modalities)
+    return domain.symbol_sizes["ego"] + items + len(domain.actions) + 1
+
+
+class BehaviourClone(nn.Module):
+    """``p(a_t | x_{1:t}, v_{1:t}, a_{1:t-1})`` of each of P people, their networks side by side.
+
+    Made by `fit_behaviour_clone`. No network shares anything with another.
+
+    Args:
+        domain: the world.
+        people: P ids.
+        sight: which items the networks read.
+        weights: by name, as `_initial_weights` makes them, ``[P, ...]``.
+    """
+
+    def __init__(
+        self, domain: Domain, people: Sequence[str], sight: Sight, weights: Mapping[str, Tensor]
+    ) -> None:
+        super().__init__()
+        self.domain = domain
+        self.people = tuple(people)
+        self.sight: Sight = sight
+        self.weights = nn.ParameterDict(
+            {name: nn.Parameter(value.clone()) for name, value in weights.items()}
+        )
+
+    @property
+    def hidden(self) -> int:
+        """H, the number of the GRU's units."""
+        return self.weights["recurrent"].shape[1]
+
+    def inputs(self, demonstrations: Demonstrations) -> Tensor:
+        """What the networks read at each step of recorded rounds, ``[P, B, T, I]``."""
+        observation = demonstrations.observation()
+        steps = demonstrations.shape[2]
+        visible = self.domain.visibility(demonstrations.setting, observation)
+        if self.sight == "everything":
+            visible = visible | {"visual": torch.ones_like(visible["visual"])}
+        visible = {
+            name: mask[:, :, :steps] | demonstrations.told[name] for name, mask in visible.items()
+        }
+        observation = {name: value[:, :, :steps] for name, value in observation.items()}
+        actions = demonstrations.actions
+        none = torch.full_like(actions[:, :, :1], len(self.domain.actions))
+        # Padding has the action -1, which is nobody's business but has to have a symbol.
+        previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
+        return network_inputs(self.domain, observation, visible, previous)
+
+    def start(self, rounds: int) -> Tensor:
+        """The hidden state before the first step of B rounds, ``[P, B, H]`` of zeros."""
+        return self.weights["recurrent"].new_zeros(len(self.people), rounds, self.hidden)
+
+    def step(self, hidden: Tensor, inputs: Tensor) -> Tensor:
+        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` ``[P, B, H]`` and ``inputs`` ``[P, B, I]``."""
+        return self._update(hidden, self._project(inputs))
+
+    def act(self, hidden: Tensor) -> Tensor:
+        """Log-probabilities of the actions ``[P, B, A]`` in hidden states ``[P, B, H]``."""
+        own = self.weights
+        layer = torch.relu(torch.baddbmm(own["layer_bias"], hidden, own["layer"]))
+        return torch.baddbmm(own["output_bias"], layer, own["output"]).log_softmax(-1)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Log-probabilities of the actions ``[P, B, T, A]`` of ``inputs`` ``[P, B, T, I]``."""
+        _, rounds, steps, _ = inputs.shape
+        gates = self._project(inputs.flatten(1, 2)).unflatten(1, (rounds, steps))
+        hidden, states = self.start(rounds), []
+        for gate in gates.unbind(2):
+            hidden = self._update(hidden, gate)
+            states.append(hidden)
+        return self.act(torch.stack(states, 2).flatten(1, 2)).unflatten(1, (rounds, steps))
+
+    @torch.no_grad()
+    def log_probabilities(self, demonstrations: Demonstrations) -> Tensor:
+        """Log-probabilities in nats of all actions at every step, ``[P, B, T, A]``.
+
+        Each is of what came before the action alone. In padding they mean nothing.
+
+        Args:
+            demonstrations: rounds of some of the people, in any order; P is their number.
+
+        Raises:
+            DemonstrationsError: they are of another domain.
+            UnknownNameError: there is somebody whose clone this is not.
+        """
+        return self._of(demonstrations)(self.inputs(demonstrations))
+
+    def _of(self, demonstrations: Demonstrations) -> BehaviourClone:
+        """The clones of these people, in their order."""
+        if demonstrations.domain != self.domain.name:
+            raise DemonstrationsError(
+                f"demonstrations of {demonstrations.domain}, expected {self.domain.name}"
+            )
+        if demonstrations.people == self.people:
+            return self
+        index = [
+            self.people.index(require_known(person, "person", self.people))
+            for person in demonstrations.people
+        ]
+        weights = {name: value[index] for name, value in self.weights.items()}
+        return BehaviourClone(self.domain, demonstrations.people, self.sight, weights)
+
+    def _project(self, inputs: Tensor) -> Tensor:
+        """The inputs' part ``[P, N, 3 H]`` of the gates, of ``inputs`` ``[P, N, I]``."""
+        # Most symbols never occur in a batch, and columns of zeros add nothing.
+        used = inputs.flatten(0, -2).any(0)
+        weight = self.weights["input"][:, used]
+        return torch.baddbmm(self.weights["input_bias"], inputs[..., used], weight)
+
+    def _update(self, hidden: Tensor, gates: Tensor) -> Tensor:
+        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` and the inputs' part of the gates."""
+        own = torch.baddbmm(self.weights["recurrent_bias"], hidden, self.weights["recurrent"])
+        size = 2 * self.hidden
+        reset, keep = torch.sigmoid(gates[..., :size] + own[..., :size]).chunk(2, -1)
+        new = torch.tanh(gates[..., size:] + reset * own[..., size:])
+        return new + keep * (hidden - new)
+
+
+def fit_behaviour_clone(
+    train: Demonstrations,
+    validation: Demonstrations,
+    options: BehaviourCloneOptions,
+    seed: int,
+    report: Callable[[int, str], None] = lambda done, message: None,
+) -> BehaviourClone:
+    """Clone P people, each from their own rounds and by a network of their own.
+
+    Args:
+        train: rounds to learn from, of any lengths and numbers.
+        validation: rounds of the same people in the same order, by which training is stopped and
+            the weight decay chosen.
+        options: settings.
+        seed: seed of everything random here; with a person's id and rounds it determines their
+            network.
+        report: called now and then with the number of gradient steps done, of
+            ``options.epochs`` for each of ``options.weight_decays``, and a message.
+
+    Returns:
+        The clone, on the device of the training rounds.
+
+    Raises:
+        DemonstrationsError: somebody has no round to learn from or none to validate with; or the
+            validation rounds are of another domain or other people.
+    """
+    if validation.domain != train.domain or validation.people != train.people:
+        raise DemonstrationsError(
+            f"validation rounds are of {validation.domain}, {', '.join(validation.people)}; "
+            f"expected those of training: {train.domain}, {', '.join(train.people)}"
+        )
+    for purpose, part in (("training", train), ("validation", validation)):
+        for person, count in zip(part.people, part.round_counts.tolist(), strict=True):
+            if count == 0:
+                raise DemonstrationsError(f"person {person!r} has no {purpose} round")
+    best_weights: dict[str, Tensor] = {}
+    best: Tensor | None = None
+    for number, decay in enumerate(options.weight_decays):
+        # Anew for each: every weight decay has the same initial weights and the same batches.
+        generators = [derived_generator(seed, "behaviour clone", name) for name in train.people]
+        clone = BehaviourClone(
+            get_domain(train.domain),
+            train.people,
+            options.sight,
+            _initial_weights(train, options, generators),
+        ).to(train.actions.device)
+        done = number * options.epochs
+        weights, nll = _train(
+            clone,
+            (train, validation),
+            options,
+            decay,
+            generators,
+            lambda step, message, done=done: report(done + step, message),
+        )
+        if best is None:
+            best_weights, best = weights, nll
+        else:
+            best = _keep_better(best_weights, weights, best, nll, nll < best)
+    return BehaviourClone(get_domain(train.domain), train.people, options.sight, best_weights)
+
+
+def held_out_nll(clone: BehaviourClone, demonstrations: Demonstrations) -> Tensor:
+    """Mean negative log-likelihood of a person's actions, in nats per action, ``[P]``.
+
+    It is NaN for people who have no rounds.
+
+    Args:
+        clone: of these people and perhaps others.
+        demonstrations: rounds that the clone has not learned from.
+
+    Raises:
+        DemonstrationsError: they are of another domain.
+        UnknownNameError: there is somebody whose clone this is not.
+    """
+    return _mean_nll(clone.log_probabilities(demonstrations), demonstrations.actions)
+
+
+def _mean_nll(log_probabilities: Tensor, actions: Tensor) -> Tensor:
+    """Mean over real actions ``[P, B, T]`` of their negative log-likelihood, ``[P]``."""
+    real = actions >= 0
+    own = log_probabilities.gather(-1, actions.clamp(min=0)[..., None]).squeeze(-1)
+    return -torch.where(real, own, 0.0).sum((1, 2)) / real.sum((1, 2))
+
+
+def _initial_weights(
+    train: Demonstrations, options: BehaviourCloneOptions, generators: Sequence[torch.Generator]
+) -> dict[str, Tensor]:
+    """Weights ``[P, inputs, outputs]`` and biases ``[P, 1, outputs]`` of each layer by name."""
+    domain = get_domain(train.domain)
+    hidden, layer, actions = options.hidden, options.layer, len(domain.actions)
+    # The usual initial values of torch but for inputs and output; see the module's description.
+    shapes = {
+        "recurrent": (hidden, 3 * hidden, hidden),
+        "recurrent_bias": (1, 3 * hidden, hidden),
+        "input_bias": (1, 3 * hidden, hidden),
+        "layer": (hidden, layer, hidden),
+        "layer_bias": (1, layer, hidden),
+        "output": (layer, actions, layer),
+    }
+    weights = {}
+    for name, (before, after, fan_in) in shapes.items():
+        drawn = torch.stack([torch.rand(before, after, generator=own) for own in generators])
+        weights[name] = (2 * drawn - 1) * fan_in**-0.5
+    weights["input"] = torch.zeros(len(train.people), input_size(domain), 3 * hidden)
+    chosen = torch.stack([(train.actions == action).sum((1, 2)) for action in range(actions)], -1)
+    # One more of each, lest an action that was never taken counts as impossible.
+    weights["output_bias"] = ((chosen + 1) / (chosen + 1).sum(-1, True)).log()[:, None].cpu()
+    return weights
+
+
+def _train(
+    clone: BehaviourClone,
+    parts: tuple[Demonstrations, Demonstrations],
+    options: BehaviourCloneOptions,
+    decay: float,
+    generators: Sequence[torch.Generator],
+    report: Callable[[int, str], None],
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Weights of each person's best look at the validation rounds, and their NLL then, ``[P]``."""
+    (inputs, unseen), (actions, unseen_actions) = (
+        [clone.inputs(part) for part in parts],
+        [part.actions for part in parts],
+    )
+    biases = [value for name, value in clone.weights.items() if name.endswith("bias")]
+    others = [value for name, value in clone.weights.items() if not name.endswith("bias")]
+    optimizer = torch.optim.AdamW(
+        [{"params": others, "weight_decay": decay}, {"params": biases, "weight_decay": 0.0}],
+        options.learning_rate,
+    )
+    best_weights = {name: value.detach().clone() for name, value in clone.weights.items()}
+    best = inputs.new_full((len(clone.people),), torch.inf)
+    looks_since = torch.zeros_like(best)
+    for step in range(options.epochs + 1):
+        if step % options.check_every == 0 or step == options.epochs:
+            with torch.no_grad():
+                nll = _mean_nll(clone(unseen), unseen_actions)
+            better = (nll < best) & (looks_since < options.patience)
+            best = _keep_better(best_weights, clone.weights, best, nll, better)
+            looks_since = torch.where(better, 0, looks_since + 1)
+            report(step, f"validation {best.mean().item():.3f} nats an action")
+            if bool((looks_since >= options.patience).all()):
+                break
+        if step == options.epochs:
+            break
+        own_inputs, own_actions = _batch(
+            inputs, actions, parts[0].round_counts.tolist(), options.batch, generators
+        )
+        optimizer.zero_grad()
+        # A sum: people share no weight, so each network follows its own person's mean alone.
+        _mean_nll(clone(own_inputs), own_actions).sum().backward()
+        optimizer.step()
+    return best_weights, best
+
+
+def _keep_better(
+    kept: dict[str, Tensor],
+    new: Mapping[str, Tensor],
+    kept_nll: Tensor,
+    new_nll: Tensor,
+    better: Tensor,
+) -> Tensor:
+    """Replace in ``kept`` the weights of the people marked in ``better`` ``[P]``; their NLL."""
+    for name, value in new.items():
+        kept[name][better] = value.detach()[better]
+    return torch.where(better, new_nll, kept_nll)
+
+
+def _batch(
+    inputs: Tensor,
+    actions: Tensor,
+    counts: Sequence[int],
+    size: int,
+    generators: Sequence[torch.Generator],
+) -> tuple[Tensor, Tensor]:
+    """Inputs and actions of ``size`` rounds of each person, of all if they have no more."""
+    if inputs.shape[1] <= size:
+        return inputs, actions
+    index = torch.zeros(len(counts), size, dtype=torch.long)
+    padding = torch.ones(len(counts), size, dtype=torch.bool)
+    for person, (count, generator) in enumerate(zip(counts, generators, strict=True)):
+        own = torch.randperm(count, generator=generator)[:size]
+        index[person, : len(own)] = own
+        padding[person, : len(own)] = False
+    index, padding = index.to(actions.device), padding.to(actions.device)
+    person = torch.arange(len(counts), device=actions.device)[:, None]
+    return inputs[person, index], actions[person, index].masked_fill(padding[..., None], -1)

@@ -1,0 +1,70 @@
+"""What figures read of an ``InferenceData`` that :mod:`mirror_ppl.inference.export` made."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from mirror_ppl.domains import require_known
+from mirror_ppl.errors import DemonstrationsError
+
+if TYPE_CHECKING:
+    import arviz as az
+
+SAMPLE = ("chain", "draw")
+TRUTH = "truth_"
+
+# Okabe and Ito's colours, which people of any colour vision tell apart.
+BLUE, ORANGE, PURPLE, BLACK, GREY = "#0072B2", "#E69F00", "#CC79A7", "#000000", "#8a8a8a"
+POSTERIOR, PRIOR, TRUE, OBSERVED = BLUE, GREY, ORANGE, BLACK
+
+
+def people(data: az.InferenceData) -> list[str]:
+    """Ids of the P people."""
+    return [str(person) for person in data["posterior"]["person"].values]
+
+
+def of_person(data: az.InferenceData, group: str, person: str) -> xr.Dataset:
+    """One group's variables of one person.
+
+    Raises:
+        UnknownNameError: there is nobody of that id.
+    """
+    known = people(data)
+    return data[group].isel(person=known.index(require_known(person, "person", known)))
+
+
+def draws(values: xr.DataArray) -> np.ndarray:
+    """Draws of a variable, chains one after the other, ``[S, ...]``."""
+    return values.stack(sample=SAMPLE).transpose("sample", ...).values
+
+
+def truth(data: az.InferenceData, name: str, person: str) -> float | None:
+    """True value of a simulated person's implant; ``None`` where it is not known."""
+    constants = of_person(data, "constant_data", person)
+    if TRUTH + name not in constants:
+        return None
+    value = float(constants[TRUTH + name])
+    return None if np.isnan(value) else value
+
+
+def round_of(dataset: xr.Dataset, dimension: str, number: int) -> xr.Dataset:
+    """One round of a person.
+
+    Args:
+        dataset: the person's, with ``observed_action``, which is -1 in padding.
+        dimension: ``"round"`` or ``"test_round"``.
+        number: the round, counted from 0.
+
+    Raises:
+        DemonstrationsError: the person has no such round.
+    """
+    recorded = (dataset["observed_action"] >= 0).any("step").sum().item()
+    if not 0 <= number < recorded:
+        raise DemonstrationsError(
+            f"there is no round {number} of {dataset['person'].item()}, "
+            f"expected one of {recorded}, counted from 0"
+        )
+    return dataset.isel({dimension: number})

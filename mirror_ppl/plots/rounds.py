@@ -1,0 +1,218 @@
+"""Recorded rounds of driving beside what the posterior predicts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from mirror_ppl.domains.driving import CAR_LANES, ROAD_END, SWITCH
+from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.plots.driving import DARK_TO_LIGHT, DISTANCES, sight_probability
+from mirror_ppl.plots.reading import (
+    BLUE,
+    OBSERVED,
+    POSTERIOR,
+    PRIOR,
+    PURPLE,
+    SAMPLE,
+    draws,
+    of_person,
+    people,
+    round_of,
+)
+
+if TYPE_CHECKING:
+    import arviz as az
+
+LANE_NAMES = ("left lane", "right lane")
+LEVELS = (0.05, 0.5, 0.95)
+"""Quantiles of which intervals are drawn: the median and the ends of 90%."""
+
+
+def plot_round(
+    data: az.InferenceData, person: str, round: int, *, held_out: bool = False
+) -> Figure:
+    """Draw one round over time: the cars, what the person sees of them, and what they did.
+
+    Each lane is drawn with distances upwards and time to the right, shaded as
+    :func:`mirror_ppl.plots.driving.plot_sight` shades the road. Below stands the posterior
+    predictive probability of switching lanes, and what the person did.
+
+    Args:
+        data: with the groups of :mod:`mirror_ppl.inference.export`.
+        person: id of the person.
+        round: number of the round, counted from 0.
+        held_out: count the held-out rounds, not those that were learned from.
+
+    Raises:
+        UnknownNameError: there is nobody of that id.
+        DemonstrationsError: the person has no such round.
+    """
+    if held_out and "predictions" not in data.groups():
+        raise DemonstrationsError("there are no held-out rounds")
+    group = "predictions_constant_data" if held_out else "constant_data"
+    dimension = "test_round" if held_out else "round"
+    recorded = round_of(of_person(data, group, person), dimension, round)
+    action = recorded["observed_action"].values
+    steps = int((action >= 0).sum())
+    probability = switching(data, person, held_out=held_out).values[round, :steps]
+
+    figure = Figure(figsize=(10, 8), layout="constrained")
+    *lanes, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
+    sight = sight_probability(data, person)
+    for lane, ax in enumerate(lanes):
+        _draw_lane(ax, lane, recorded, sight, steps)
+    bar = figure.colorbar(ScalarMappable(Normalize(0, 1), DARK_TO_LIGHT), ax=lanes, aspect=30)
+    bar.set_label("posterior probability that the person sees a car there")
+    bar.set_ticks([0, 0.5, 1], labels=["0: unseen", ".5", "1: seen"])
+    _draw_actions(below, action[:steps], probability)
+    # Cars of either lane look alike, and one label of each kind is enough.
+    entries = {}
+    for ax in (*lanes, below):
+        entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=4, frameon=False)
+    kind = "held-out round" if held_out else "round"
+    figure.suptitle(f"{person}, {kind} {round}", fontsize=13, fontweight="bold", parse_math=False)
+    return figure
+
+
+def switching(data: az.InferenceData, person: str, *, held_out: bool = False) -> xr.DataArray:
+    """Posterior predictive probability of switching lanes, ``[B, T]``.
+
+    Args:
+        data: with ``posterior_predictive``, or ``predictions``.
+        person: id of the person.
+        held_out: of the held-out rounds, not of those that were learned from.
+
+    Raises:
+        UnknownNameError: there is nobody of that id.
+    """
+    if held_out:
+        predicted = of_person(data, "predictions", person)["action_probability"]
+        return predicted.isel(action_name=SWITCH).mean(SAMPLE)
+    return (of_person(data, "posterior_predictive", person)["action"] == SWITCH).mean(SAMPLE)
+
+
+def lane_changes(data: az.InferenceData, group: str) -> xr.DataArray:
+    """Lane changes of each recorded round; NaN in rounds that are padding.
+
+    Args:
+        data: with that group and ``observed_data``.
+        group: ``"observed_data"``, ``"posterior_predictive"`` or ``"prior_predictive"``.
+
+    Returns:
+        Dimensions ``person`` and ``round``, and ``chain`` and ``draw`` of predictions.
+    """
+    real = data["observed_data"]["action"] >= 0
+    changes = ((data[group]["action"] == SWITCH) & real).sum("step")
+    return changes.where(real.any("step"))
+
+
+def plot_predictive_check(data: az.InferenceData) -> Figure:
+    """Draw how often people change lanes beside how often the model says that they do.
+
+    Left, for each person: lane changes a round, on average over the rounds that were learned from;
+    90% intervals and medians of what the prior and the posterior predict. Right: how many rounds of
+    all people have no, one, two ... lane changes.
+
+    Args:
+        data: with ``observed_data``, ``posterior_predictive`` and ``prior_predictive``.
+    """
+    everybody = people(data)
+    figure = Figure(figsize=(11, max(3.4, 0.3 * len(everybody) + 1.6)), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    observed = lane_changes(data, "observed_data")
+    predicted = {
+        "prior predictive": (lane_changes(data, "prior_predictive"), PRIOR, -0.18),
+        "posterior predictive": (lane_changes(data, "posterior_predictive"), POSTERIOR, 0.18),
+    }
+    place = np.arange(len(everybody))
+    for label, (changes, colour, shift) in predicted.items():
+        low, median, high = changes.mean("round").quantile(LEVELS, SAMPLE).values
+        left.hlines(place + shift, low, high, color=colour, lw=5, alpha=0.55, label=label)
+        left.plot(median, place + shift, "|", color=colour, ms=9, mew=2.5)
+    left.plot(observed.mean("round"), place, "o", color=OBSERVED, ms=6, label="observed")
+    left.set_yticks(place, everybody, parse_math=False)
+    left.invert_yaxis()
+    left.set_xlabel("lane changes a round, averaged over a person's rounds")
+
+    most = int(observed.max()) + 2
+    counts = np.arange(most + 1)
+    for label, (changes, colour, shift) in predicted.items():
+        shares = np.stack([_share(draw, counts) for draw in draws(changes)])
+        low, median, high = np.quantile(shares, LEVELS, 0)
+        right.bar(counts + shift, median, 0.34, color=colour, alpha=0.55, label=label)
+        right.vlines(counts + shift, low, high, color=colour, lw=2)
+    right.plot(counts, _share(observed.values, counts), "o", color=OBSERVED, ms=6, label="observed")
+    right.set_xticks(counts)
+    right.set_xlabel("lane changes in a round")
+    right.set_ylabel("share of all rounds")
+    for ax in (left, right):
+        ax.spines[["top", "right"]].set_visible(False)
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False
+    )
+    return figure
+
+
+def _share(changes: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Share of the recorded rounds that have each number of lane changes."""
+    known = changes[~np.isnan(changes)]
+    return (known[:, None] == counts).mean(0)
+
+
+def _draw_lane(ax: Axes, lane: int, recorded: xr.Dataset, sight: xr.DataArray, steps: int) -> None:
+    """One lane over time: what is seen of it, the cars, and the person while they are in it."""
+    own = recorded["ego"].values[: steps + 1, 0].astype(int) == lane
+    shade = np.where(own[:, None], sight.sel(lane="own").values, sight.sel(lane="other").values)
+    end = ROAD_END + 0.5
+    ax.imshow(
+        shade.T,
+        cmap=DARK_TO_LIGHT,
+        vmin=0,
+        vmax=1,
+        origin="lower",
+        extent=(-0.5, steps + 0.5, DISTANCES[0] - 0.5, DISTANCES[-1] + 0.5),
+        aspect="auto",
+    )
+    times = np.arange(steps + 1)
+    ahead = recorded["visual"].sel(visual_feature="distance_ahead").values[: steps + 1]
+    for car, car_lane in enumerate(CAR_LANES):
+        if car_lane != lane:
+            continue
+        where = np.where(np.abs(ahead[:, car]) < ROAD_END, ahead[:, car], np.nan)
+        ax.plot(times, where, color=PURPLE, lw=1, alpha=0.8)
+        ax.plot(times, where, "s", color=PURPLE, ms=8, mec="white", label="other cars")
+    ax.plot(
+        times[own], np.zeros(own.sum()), "s", color=BLUE, ms=11, mec="white", label="the person"
+    )
+    ax.set_ylim(-end, end)
+    ax.set_yticks(range(-ROAD_END, ROAD_END + 1, 4))
+    ax.set_ylabel(f"{LANE_NAMES[lane]}\ncells ahead")
+
+
+def _draw_actions(ax: Axes, action: np.ndarray, probability: np.ndarray) -> None:
+    """Probability of switching at each step, and whether the person did."""
+    times = np.arange(len(action))
+    ax.bar(
+        times,
+        probability,
+        0.8,
+        color=POSTERIOR,
+        alpha=0.6,
+        label="posterior predictive probability",
+    )
+    did = action == SWITCH
+    ax.plot(times, did.astype(float), "o", color=OBSERVED, ms=7, label="what they did")
+    ax.set_ylim(-0.12, 1.12)
+    ax.set_yticks([0, 0.5, 1], ["0: stay", ".5", "1: switch"])
+    ax.set_ylabel("probability\nof switching")
+    ax.set_xlabel("step")
+    ax.set_xticks(np.arange(len(action) + 1))
+    ax.spines[["top", "right"]].set_visible(False)

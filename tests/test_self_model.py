@@ -1,0 +1,438 @@
+"""The self-model: its bound, its experience, its training, and the weights that ship."""
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from pyro import poutine
+from pyro.infer import Trace_ELBO
+from safetensors.torch import save_file
+from torch.distributions import Normal
+
+from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.driving import ROAD_END, Driving, DrivingState
+from mirror_ppl.errors import AssetError, CheckpointError
+from mirror_ppl.evaluation.self_model import (
+    fixed_views,
+    planner_actions,
+    returns,
+    self_model_quality,
+)
+from mirror_ppl.inference.experience import drive, experience, map_state
+from mirror_ppl.inference.self_model_training import (
+    SelfModelOptions,
+    self_model_loss,
+    train_self_model,
+)
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.views import draw_views
+from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
+
+DRIVING = get_domain("driving")
+STEPS = DRIVING.horizon
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return load_self_model(shipped_weights("driving"), "driving")
+
+
+@pytest.fixture
+def lived(generator):
+    """Experience of 40 rounds, each seen in a way of its own."""
+    start = DRIVING.initial(40, generator)
+    actions = torch.randint(2, (40, STEPS), generator=generator)
+    return experience(DRIVING, start, actions, draw_views(DRIVING, 40, STEPS, generator))
+
+
+# --- the bound --------------------------------------------------------------------------------
+
+
+def test_elbo_equals_that_of_pyro_and_so_does_its_gradient(lived):
+    model, rounds = SelfModel(DRIVING), lived.rounds
+    torch.manual_seed(1)
+    ours, _ = model.elbo(rounds)
+    ours.backward()
+    gradients = [part.grad.clone() for part in model.encoder.parameters()]
+    model.zero_grad()
+    torch.manual_seed(1)
+    theirs = Trace_ELBO().differentiable_loss(model.model, model.guide, rounds)
+    theirs.backward()
+    torch.testing.assert_close(ours, -theirs, rtol=1e-5, atol=0.0)
+    for gradient, part in zip(gradients, model.encoder.parameters(), strict=True):
+        torch.testing.assert_close(gradient, -part.grad, rtol=1e-3, atol=1e-2)
+
+
+def test_elbo_is_the_sum_of_log_densities(lived):
+    # In the released MIRROR code the divergence was averaged over latent dimensions while the
+    # reconstruction was summed, and the first state had no prior.
+    model, rounds = SelfModel(DRIVING), lived.rounds
+    bound, z = model.elbo(rounds)
+    actions = rounds.actions
+    total = Normal(0.0, 1.0).log_prob(z[:, 0]).sum()
+    total += Normal(*model.transition(z[:, :-1], actions)).log_prob(z[:, 1:]).sum()
+    scales = {"visual": (12.0, 1.0), "verbal": (12.0, 1.0, 1.0)}
+    for name, scale in scales.items():
+        target = rounds.observation[name] / torch.tensor(scale)
+        total += Normal(*model.decoders[name](z)).log_prob(target).sum()
+    lane = rounds.observation["ego"][..., None, :]
+    total += Normal(*model.decoders["ego"](z)).log_prob(lane).sum()
+    total += Normal(*model.reward(z[:, :-1], actions)).log_prob(rounds.rewards).sum()
+    evidence = model.evidence(rounds.observation, rounds.visible, actions)
+    nothing = torch.zeros(len(actions), model.latent)
+    total -= Normal(*model.encoder(nothing, evidence[:, 0])).log_prob(z[:, 0]).sum()
+    total -= Normal(*model.encoder(z[:, :-1], evidence[:, 1:])).log_prob(z[:, 1:]).sum()
+    assert bound.item() == pytest.approx(total.item(), rel=1e-5)
+
+
+def test_targets_are_unmasked(lived):
+    model = SelfModel(DRIVING)
+    hidden = {name: torch.zeros_like(mask) for name, mask in lived.rounds.visible.items()}
+    nodes = poutine.trace(model.model).get_trace(replace(lived.rounds, visible=hidden)).nodes
+    observation = lived.rounds.observation
+    for name, scale in {"visual": (12.0, 1.0), "verbal": (12.0, 1.0, 1.0)}.items():
+        assert nodes[f"x_{name}"]["is_observed"]
+        assert torch.equal(nodes[f"x_{name}"]["value"], observation[name] / torch.tensor(scale))
+    assert torch.equal(nodes["x_ego"]["value"][..., 0, :], observation["ego"])
+
+
+@pytest.mark.parametrize("on_means", [False, True])
+def test_every_parameter_learns_from_the_loss(lived, on_means):
+    model, target = SelfModel(DRIVING), SelfModel(DRIVING).q_network
+    self_model_loss(model, target, lived, SelfModelOptions(), on_means).total.backward()
+    for name, part in model.named_parameters():
+        assert part.grad is not None, name
+        assert part.grad.abs().max() > 0, name
+    assert all(part.grad is None for part in target.parameters())
+
+
+# --- experience, by hand ----------------------------------------------------------------------
+
+
+def two_cars_near():
+    """The ego in the left lane; a slow car 3 cells ahead of it, and one 2 cells behind at right."""
+    return DrivingState(
+        lane=torch.tensor([0]),
+        position=torch.tensor([[3, 11, -11, -2]]),
+        speed=torch.tensor([[-1, 1, -1, -1]]),
+    )
+
+
+STAY4 = torch.zeros(1, 4, dtype=torch.long)
+
+
+def test_outcomes_of_both_actions_in_full_view():
+    plan = fixed_views(DRIVING, 1, torch.Generator(), speech=True)
+    lived = experience(DRIVING, two_cars_near(), STAY4, plan)
+    rounds, (stay, switch) = lived.rounds, lived.outcomes
+    # Car ahead at 2, 1, 0, -1 cells: -2 each time, and -5 in the same cell.
+    assert stay.reward.tolist() == [[-2.0, -2.0, -7.0, -2.0]]
+    assert torch.equal(rounds.rewards, stay.reward)
+    # At right the car behind is 3, 4, 5, 6 cells away: only the switch costs.
+    assert switch.reward.tolist() == [[-1.0, -1.0, -1.0, -1.0]]
+    assert stay.observation["visual"][0, :, 0, 0].tolist() == [2, 1, 0, -1]
+    assert switch.observation["visual"][0, :, 0, 0].tolist() == [2, 1, 0, -1]
+    assert rounds.observation["visual"][0, :, 3, 0].tolist() == [-2, -3, -4, -5, -6]
+    assert stay.observation["ego"].flatten().tolist() == [0, 0, 0, 0]
+    assert switch.observation["ego"].flatten().tolist() == [1, 1, 1, 1]
+    # Seen from the other lane, offsets turn round.
+    assert stay.observation["visual"][0, 0, :, 1].tolist() == [0, 1, 0, 1]
+    assert switch.observation["visual"][0, 0, :, 1].tolist() == [-1, 0, -1, 0]
+    assert all(mask.all() for mask in rounds.visible.values())
+    assert all(mask.all() for outcome in lived.outcomes for mask in outcome.visible.values())
+
+
+@pytest.mark.parametrize("credulous", [True, False])
+def test_world_of_somebody_who_sees_one_cell_ahead(credulous):
+    plan = fixed_views(DRIVING, 1, torch.Generator(), (1.0, 0.0, 0.0, 0.0))
+    plan = replace(plan, credulous=torch.tensor([credulous]))
+    lived = experience(DRIVING, two_cars_near(), STAY4, plan)
+    rounds, (stay, switch) = lived.rounds, lived.outcomes
+    ahead, seen = rounds.observation["visual"][0, :, 0, 0], rounds.visible["visual"][0, :, 0]
+    if credulous:
+        # Never seen at 3 and 2 cells: not there. Once seen it stays in the world, seen or not.
+        assert ahead.tolist() == [ROAD_END, ROAD_END, 1, 0, -1]
+        assert seen.tolist() == [True, True, True, True, False]
+        assert rounds.observation["verbal"][0, :2, 0, 2].tolist() == [0, 0]  # nor does it move
+        # The car at 1 cell surprised them: to the best knowledge before, there was none.
+        assert rounds.rewards.tolist() == [[0.0, 0.0, -7.0, -2.0]]
+        assert stay.observation["visual"][0, :, 0, 0].tolist() == [ROAD_END, ROAD_END, 0, -1]
+        assert stay.visible["visual"][0, :, 0].tolist() == [True, True, True, False]
+        # The other cars are never seen.
+        assert (rounds.observation["visual"][0, :, 1:, 0] == ROAD_END).all()
+        assert rounds.visible["visual"][0, :, 1:].all()
+    else:
+        assert ahead.tolist() == [3, 2, 1, 0, -1]
+        assert seen.tolist() == [False, False, True, True, False]
+        assert rounds.rewards.tolist() == [[-2.0, -2.0, -7.0, -2.0]]
+        assert not rounds.visible["visual"][0, :, 1:].any()
+    assert torch.equal(stay.reward, rounds.rewards)
+    assert switch.reward.tolist() == [[-1.0, -1.0, -1.0, -1.0]]
+    assert not any(mask.any() for name, mask in rounds.visible.items() if name == "verbal")
+
+
+def test_whoever_is_told_knows(generator):
+    plan = fixed_views(DRIVING, 1, generator, (0.0, 0.0, 0.0, 0.0))
+    told = {"visual": torch.zeros(1), "verbal": torch.ones(1)}
+    rounds = experience(DRIVING, two_cars_near(), STAY4, replace(plan, told=told)).rounds
+    assert rounds.observation["visual"][0, :, 0, 0].tolist() == [3, 2, 1, 0, -1]
+    assert rounds.visible["verbal"][0, :, 0].all()
+    # Spoken of, not seen; it is seen only where it is abreast.
+    assert rounds.visible["visual"][0, :, 0].tolist() == [False, False, False, True, False]
+
+
+def test_the_robot_drives_by_the_beliefs_that_it_learns_from(shipped, generator):
+    model, _ = shipped
+    start, plan = DRIVING.initial(300, generator), draw_views(DRIVING, 300, STEPS, generator)
+    with torch.no_grad():
+        actions = drive(model, start, plan, STEPS, generator)
+        rounds = experience(DRIVING, start, actions, plan).rounds
+        belief = model.believe(model.evidence(rounds.observation, rounds.visible, actions))
+        values = model.action_values(belief[:, :-1])
+    chosen = values.gather(-1, actions[..., None]).squeeze(-1)
+    assert (chosen >= values.amax(-1) - 1e-3).all()  # but for rounding
+    assert 0.02 < actions.float().mean() < 0.98
+
+
+def test_learning_looks_ahead_from_belief_to_belief(lived):
+    """The value of the action that was taken is that of the belief that follows."""
+    model, options = SelfModel(DRIVING), SelfModelOptions()
+    asked = []
+
+    def target(belief):
+        asked.append(belief)
+        return model.q_network(belief)
+
+    rounds = lived.rounds
+    loss = self_model_loss(model, target, lived, options, on_means=True)
+    belief = model.believe(model.evidence(rounds.observation, rounds.visible, rounds.actions))
+    taken = rounds.actions[..., None, None].expand(-1, -1, 1, model.latent)
+    following = torch.stack(asked, 2).gather(2, taken).squeeze(2)
+    # Where nothing came into view that was taken to be absent.
+    known = torch.stack([outcome.observation["visual"] for outcome in lived.outcomes], 2)
+    expected = [known[..., action, :, :] for action in range(2)]
+    same = (expected[0][..., 0] == rounds.observation["visual"][:, 1:, :, 0]).all(-1)
+    assert same.float().mean() > 0.5
+    torch.testing.assert_close(following[same], belief[:, 1:][same], rtol=1e-4, atol=1e-5)
+    # By hand: nothing follows the last action.
+    values = model.q_network(torch.stack(asked, 2)).amax(-1)
+    values[:, -1] = 0.0
+    rewards = torch.stack([outcome.reward for outcome in lived.outcomes], -1)
+    error = model.q_network(belief[:, :-1]) - (rewards + options.discount * values)
+    torch.testing.assert_close(loss.bellman, error.square().mean(), rtol=1e-4, atol=1e-5)
+
+
+# --- training ---------------------------------------------------------------------------------
+
+
+class ShortDriving(Driving):
+    """Rounds of three steps that all begin alike."""
+
+    horizon = 3
+
+    def initial(self, batch, generator, scenario=None):
+        return map_state(lambda part: part.expand(batch, *part.shape[1:]), two_cars_near())
+
+
+def optimal_values(state, steps, discount=0.9):
+    """Values of both actions with that many steps to go, by trying everything."""
+    if steps == 0:
+        return [0.0]
+    values = []
+    for action in (torch.tensor([0]), torch.tensor([1])):
+        following = DRIVING.transition(state, action)
+        reward = sum(DRIVING.rewards(state, action, following).values()).item()
+        values.append(reward + discount * max(optimal_values(following, steps - 1)))
+    return values
+
+
+def test_values_move_to_the_optimum():
+    domain = ShortDriving()
+    best = torch.tensor([optimal_values(two_cars_near(), 3)])
+    # Stay: -2 and switch next, -1, then the other lane for nothing. Switch: -1 and stay there.
+    assert best.tolist() == [pytest.approx([-2.0 - 0.9, -1.0])]
+    options = SelfModelOptions(
+        phases=1, rounds=64, steps=150, batch=16, learning_rate=3e-3, target_rate=0.1, beta=0.0
+    )
+
+    def error(model):
+        plan = fixed_views(domain, 1, torch.Generator(), speech=True)
+        rounds = experience(domain, two_cars_near(), STAY4[:, :3], plan).rounds
+        evidence = model.evidence(rounds.observation, rounds.visible, rounds.actions)
+        with torch.no_grad():
+            values = model.action_values(model.believe(evidence[:, :1])[:, 0])
+        return (values - best).abs().max().item()
+
+    before = error(SelfModel(domain))
+    after = error(train_self_model(domain, options, torch.Generator().manual_seed(1)))
+    assert before > 2.0
+    # With errors of less than half of what is at stake, 1.9, the better action is chosen.
+    assert after < 0.95
+
+
+TINY = SelfModelOptions(phases=3, rounds=32, steps=2, batch=8)
+
+
+def train(seed=0, options=TINY, report=lambda done, message: None, checkpoint=None):
+    generator = torch.Generator().manual_seed(seed)
+    return train_self_model(DRIVING, options, generator, report, checkpoint).state_dict()
+
+
+def stop_after(phase):
+    def report(done, message):
+        if done == phase:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_training_depends_on_the_seed_alone():
+    torch.manual_seed(1)
+    one = train()
+    torch.manual_seed(2)
+    before = torch.random.get_rng_state()
+    assert_same(one, train())
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert not torch.equal(train(seed=1)["reward.head.linear.bias"], one["reward.head.linear.bias"])
+
+
+def test_training_goes_on_from_its_checkpoint_as_if_never_stopped(tmp_path):
+    path, phases = tmp_path / "run.checkpoint", []
+    with pytest.raises(KeyboardInterrupt):
+        train(report=stop_after(2), checkpoint=path)
+    resumed = train(report=lambda done, message: phases.append(done), checkpoint=path)
+    assert phases == [3]
+    assert_same(resumed, train())
+
+
+def test_checkpoint_of_another_run_is_refused(tmp_path):
+    path = tmp_path / "run.checkpoint"
+    with pytest.raises(KeyboardInterrupt):
+        train(report=stop_after(1), checkpoint=path)
+    content = path.read_bytes()
+    with pytest.raises(CheckpointError, match="other options"):
+        train(options=replace(TINY, batch=9), checkpoint=path)
+    with pytest.raises(CheckpointError, match="other options"):
+        train(seed=1, checkpoint=path)
+    assert path.read_bytes() == content
+    for damaged in (content[: len(content) // 2], b"", b"nonsense"):
+        path.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match=re.escape(str(path))):
+            train(checkpoint=path)
+    torch.save([1, 2], path)
+    with pytest.raises(CheckpointError, match=re.escape(str(path))):
+        train(checkpoint=path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("phases", 0, "phases must be at least 1, not 0"),
+        ("batch", -1, "batch must be at least 1, not -1"),
+        ("epsilon", 1.5, r"epsilon must lie in \[0, 1\], not 1.5"),
+        ("discount", -0.1, r"discount must lie in \[0, 1\], not -0.1"),
+    ],
+)
+def test_impossible_options_are_refused(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        SelfModelOptions(**{name: value})
+
+
+# --- weights ----------------------------------------------------------------------------------
+
+
+CARD = {"command": "test", "quality": {"share": 0.98}}
+
+
+def test_weights_survive_a_round_trip(tmp_path):
+    path, model = tmp_path / "a.safetensors", SelfModel(DRIVING)
+    save_self_model(model, path, CARD)
+    state = torch.random.get_rng_state()
+    loaded, card = load_self_model(path, "driving")
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert_same(loaded.state_dict(), model.state_dict())
+    assert card == CARD
+    assert not loaded.training
+    assert loaded.domain is DRIVING
+    assert [part.name for part in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_damaged_weights_are_refused(tmp_path):
+    path = tmp_path / "a.safetensors"
+    with pytest.raises(AssetError, match=r"a\.safetensors: cannot be read"):
+        load_self_model(path)
+    save_self_model(SelfModel(DRIVING), path, CARD)
+    content = path.read_bytes()
+    for damaged in (content[:-1], content[:100], b"", b"nonsense" * 20):
+        path.write_bytes(damaged)
+        with pytest.raises(AssetError, match=r"a\.safetensors: cannot be read"):
+            load_self_model(path)
+
+
+def test_weights_of_something_else_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    save_file({"x": torch.zeros(2)}, path)
+    with pytest.raises(AssetError, match="not a self-model"):
+        load_self_model(path)
+    save_self_model(SelfModel(DRIVING, latent=8), path, CARD)
+    with pytest.raises(AssetError, match="does not fit this program"):
+        load_self_model(path)
+    save_self_model(SelfModel(DRIVING), path, CARD)
+    with pytest.raises(AssetError, match='is for the domain "driving", not "bomb"'):
+        load_self_model(path, "bomb")
+    monkeypatch.setattr(Driving, "version", "2")
+    with pytest.raises(AssetError, match="is for version 1 of driving, this is version 2"):
+        load_self_model(path)
+    monkeypatch.undo()
+    monkeypatch.setattr(Driving, "name", "flying")
+    save_self_model(SelfModel(DRIVING), path, CARD)
+    monkeypatch.undo()
+    with pytest.raises(AssetError, match='unknown domain "flying"'):
+        load_self_model(path)
+
+
+def test_no_weights_ship_for_an_unknown_domain():
+    with pytest.raises(AssetError, match=r'no file "bomb_self_model\.safetensors" ships'):
+        shipped_weights("bomb")
+
+
+# --- how good the shipped weights are ---------------------------------------------------------
+
+
+def test_shipped_weights_drive_well_in_clear_view(shipped):
+    model, rounds = shipped[0], 4000
+    generator = torch.Generator().manual_seed(77)
+    start = DRIVING.initial(rounds, generator)
+    anything = torch.randint(2, (rounds, STEPS), generator=generator)
+    best = returns(DRIVING, start, planner_actions(DRIVING, start, STEPS, 1.0))
+    own = drive(model, start, fixed_views(DRIVING, rounds, generator), STEPS, generator)
+    reached = returns(DRIVING, start, own)
+    assert (reached <= best + 1e-4).all()  # the yardstick is the optimum of every round
+    gap = (best - returns(DRIVING, start, anything)).mean()
+    regret = (best - reached) / gap
+    share = 1 - regret.mean().item()
+    # One in 20,000 runs of a model of exactly 98% would end below this.
+    assert share >= 0.98 - 4 * regret.std().item() / math.sqrt(rounds)
+
+
+def test_shipped_weights_are_as_good_as_their_card_says(shipped):
+    model, card = shipped
+    number, of_card = 800, 4000
+    assert card["quality"]["share_clear"] >= 0.98
+    assert json.loads(json.dumps(card)) == card
+    measured = self_model_quality(model, number, seed=78)
+    agreements = [name for name in card["quality"] if "agreement" in name]
+    assert len(agreements) == 8
+    for name in agreements:
+        stated = card["quality"][name]
+        # Decisions of one round go together: the error is at most that of whole rounds.
+        error = math.sqrt(stated * (1 - stated) * (1 / number + 1 / of_card))
+        assert measured[name] >= stated - 4 * error, name
