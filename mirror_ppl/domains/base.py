@@ -84,6 +84,7 @@ class Domain(Protocol):
     scenarios: tuple[str, ...]
     reward_terms: tuple[str, ...]
     directions: tuple[str, ...]
+    direction_groups: tuple[tuple[int, ...], ...]
     reach_bins: tuple[float, ...]
 
     def initial(

@@ -128,6 +128,8 @@ class Driving:
     scenarios: tuple[str, ...] = tuple(SCENARIO_SPEEDS)
     reward_terms: tuple[str, ...] = ("proximity", "collision", "off_road", "lane_change")
     directions: tuple[str, ...] = ("front_own", "front_other", "back_own", "back_other")
+    direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
+    """Directions in which most people see equally far: both lanes ahead, both behind."""
     reach_bins: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, float(ROAD_END))
     """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
     cells away and none at the next edge. The last bin is the whole road."""

@@ -20,21 +20,30 @@ from mirror_ppl.models.view_table import ViewTable
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
     """Values ``[M]`` of the discrete sites of a table, one for each combination."""
+    if not table.sites:
+        return {}
     supports = discrete_sites(human)
     axes = torch.meshgrid(*(supports[site] for site in table.sites), indexing="ij")
     return {site: axis.flatten() for site, axis in zip(table.sites, axes, strict=True)}
 
 
 @torch.no_grad()
-def log_prior(human: HumanModel, table: ViewTable) -> Tensor:
-    """Log prior probability ``[P, M]`` of each combination of the table's discrete sites."""
+def log_prior(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor]) -> Tensor:
+    """Log prior probability ``[P, M]`` of each combination of the table's discrete sites.
+
+    Args:
+        human: the model of people.
+        table: the recorded rounds.
+        policy: values of all other sites, ``[P, 1, ...]`` or ``[1, 1, ...]``, on which the prior
+            of the discrete ones may depend.
+    """
     values = {
         site: value[:, None, None] for site, value in combination_values(human, table).items()
     }
     with (
         torch.random.fork_rng(devices=[]),
         poutine.trace() as trace,
-        poutine.condition(data=values),
+        poutine.condition(data={**policy, **values}),
         pyro.plate("person", table.people, dim=-2),
     ):
         human.prior()
@@ -61,7 +70,7 @@ def log_joint(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor])
         pyro.plate("person", table.people, dim=-2),
     ):
         log_probabilities = human.act(human.prior(), table.belief, table.values)
-    return log_prior(human, table) + combination_scores(table, log_probabilities)
+    return log_prior(human, table, policy) + combination_scores(table, log_probabilities)
 
 
 def marginals(table: ViewTable, log_weights: Tensor) -> dict[str, Tensor]:

@@ -6,6 +6,9 @@ distance), ``posterior_predictive``, ``prior_predictive``, ``observed_data`` and
 held-out rounds), ``constant_data`` and ``predictions_constant_data`` (what there was to see, and
 the truth where it is known). Attributes say which domain, setting, model and version.
 
+Predictive draws are of each action given what happened before it, as recorded: averages of them
+compare with what people did, the spread within a round does not.
+
 Draws of variational inference are independent, so effective sample sizes and r-hat, which describe
 chains, mean nothing for them.
 """

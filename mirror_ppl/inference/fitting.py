@@ -72,7 +72,7 @@ def split_rounds(
     Raises:
         DemonstrationsError: there are fewer rounds than asked for.
     """
-    rounds = demonstrations.shape[1]
+    rounds = int(demonstrations.round_counts.max())
     paper = rounds >= TEST_ROUNDS.stop
     if train_rounds is None:
         train_rounds = TRAIN_ROUNDS if paper else max(1, -(-3 * rounds // 4))

@@ -27,7 +27,7 @@ from mirror_ppl.files import write_whole
 from mirror_ppl.inference.exact import draw_combinations, log_joint
 from mirror_ppl.inference.views import combination_scores, discrete_sites, restricted
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.sites import discrete_names, latent_sites, latent_values
+from mirror_ppl.models.sites import discrete_names, latent_sites
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 Report = Callable[[str, int, int, str], None]
@@ -160,7 +160,7 @@ def _optimize(
     checkpoint: tuple[Path, str] | None,
 ) -> tuple[ViewTable, list[float]]:
     """Optimize the guide; returns the table without what was given up, and the losses."""
-    elbo = TraceEnum_ELBO(max_plate_nesting=PLATES)(
+    elbo = TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)(
         config_enumerate(human.model, "parallel"), guide
     )
     optimizer = torch.optim.Adam(guide.parameters(), options.learning_rate)
@@ -283,8 +283,7 @@ def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) 
         first_available_dim=-1 - PLATES,
     )
     trace = poutine.trace(sampled).get_trace(table)
-    values = {**continuous, **latent_values(trace)}
-    return {name: value[None] for name, value in values.items()}
+    return {name: value[None] for name, value in {**continuous, **_whole_values(trace)}.items()}
 
 
 @torch.no_grad()
@@ -299,9 +298,14 @@ def draw_prior(human: HumanModel, table: ViewTable, number: int, seed: int) -> D
         torch.manual_seed(seed)
         # A single view is enough for the sites that act() may add.
         human.act(human.prior(), table.belief[:, :1], table.values[:, :1])
+    return _whole_values(trace.trace)
+
+
+def _whole_values(trace: poutine.Trace) -> Draws:
+    """Values of the sites that were sampled, with dimensions of size one where Pyro spares them."""
     return {
         name: site["value"].expand(site["fn"].batch_shape + site["fn"].event_shape)
-        for name, site in latent_sites(trace.trace).items()
+        for name, site in latent_sites(trace).items()
     }
 
 

@@ -331,9 +331,10 @@ def _bits(view: View, real: Tensor) -> Tensor:
 
 def _prefixes(bits: Tensor) -> Tensor:
     """A number ``[M, T]`` for each beginning of each view, the same for the same beginnings."""
-    keys = _keys(bits.shape[1] * bits.shape[2], bits.device).unflatten(0, bits.shape[1:])
-    steps = torch.arange(bits.shape[1], device=bits.device) * _keys(1, bits.device)
-    return (bits * keys).sum(-1).cumsum(-1) + steps
+    # A key of its own tells steps apart: seeing nothing now differs from having seen nothing.
+    step_key, keys = _keys(1 + bits[0].numel(), bits.device).split([1, bits[0].numel()])
+    steps = torch.arange(bits.shape[1], device=bits.device) * step_key
+    return (bits * keys.reshape(bits.shape[1:])).sum(-1).cumsum(-1) + steps
 
 
 def _keys(number: int, device: torch.device) -> Tensor:

@@ -28,28 +28,35 @@ def sight_sites(domain: Domain) -> tuple[str, ...]:
     return tuple(SIGHT + direction for direction in domain.directions)
 
 
-def perceptual_implants(domain: Domain, like: Tensor) -> dict[str, Tensor]:
+def perceptual_implants(
+    domain: Domain, like: Tensor, clear_probability: float = 0.5
+) -> dict[str, Tensor]:
     """Sample what a person sees, as indices that can be enumerated.
 
     ``sight_<direction>`` is an index into the domain's ``reach_bins``, uniform: a threshold matters
     only where it crosses a distance that can occur, so those crossings are all there is to infer.
     ``assumes_clear`` is 1 for a person to whom what they never saw is not there, and 0 for one to
-    whom it is unknown, as it is to the robot.
+    whom it is unknown, as it is to the robot; its prior probability can be given.
     """
     bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
     implants = {
         site: pyro.sample(site, dist.Categorical(bins / bins.sum())) for site in sight_sites(domain)
     }
-    half = torch.full((2,), 0.5, dtype=like.dtype, device=like.device)
-    implants[ASSUMES_CLEAR] = pyro.sample(ASSUMES_CLEAR, dist.Categorical(half))
+    clear = torch.tensor(
+        [1 - clear_probability, clear_probability], dtype=like.dtype, device=like.device
+    )
+    implants[ASSUMES_CLEAR] = pyro.sample(ASSUMES_CLEAR, dist.Categorical(clear))
     return implants
 
 
-def policy_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tensor]:
+def policy_implants(
+    domain: Domain, latent: int, like: Tensor, lapse: float = 1 / 31
+) -> dict[str, Tensor]:
     """Sample how a person decides.
 
     - ``consistency``: inverse temperature of the choice between action values, per unit of reward;
-    - ``lapse``: probability that an action has nothing to do with the belief;
+    - ``lapse``: probability that an action has nothing to do with the belief; its prior mean can
+      be given;
     - ``residual_in`` ``[..., Z + 1, R]`` and ``residual_out`` ``[..., R + 1, A]``: weights (the
       last row is the bias) of the network of the residual ``delta(zH_t)``. The prior keeps its
       output small (about 0.3 on logits), because a large residual can imitate blindness.
@@ -66,7 +73,7 @@ def policy_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tens
         "consistency": pyro.sample(
             "consistency", dist.LogNormal(number(math.log(3.0)), number(0.5))
         ),
-        "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(30.0))),
+        "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(1 / lapse - 1))),
         "residual_in": pyro.sample(
             "residual_in", weights(latent + 1, RESIDUAL_HIDDEN, latent**-0.5)
         ),

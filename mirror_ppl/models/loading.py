@@ -14,6 +14,7 @@ from pyro import poutine
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sites import latent_sites
 
 
 def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
@@ -88,6 +89,7 @@ def check_contract(human: HumanModel) -> None:
         with (
             torch.random.fork_rng(devices=[]),
             poutine.block(),
+            poutine.trace() as trace,
             pyro.plate("person", people, dim=-2),
         ):
             torch.manual_seed(0)
@@ -113,16 +115,41 @@ def check_contract(human: HumanModel) -> None:
             total = log_probabilities.exp().sum(-1)
             if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
                 raise HumanModelError("act has to return log-probabilities: they do not sum to 1")
+        _check_sites(trace.trace, people)
     except MirrorError:
         raise
     except Exception as error:
-        name = type(human).__name__
-        raise HumanModelError(f"{name}.{method} fails: {_where(error)}") from error
+        file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
+        where = _where(error, None if file is None else Path(file))
+        raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
+
+
+def _check_sites(trace: poutine.Trace, people: int) -> None:
+    """Refuse what could be sampled, but not inferred."""
+    for name, site in trace.nodes.items():
+        if site["type"] == "param":
+            raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
+    for name, site in latent_sites(trace).items():
+        fn = site["fn"]
+        if fn.support.is_discrete and not fn.has_enumerate_support:
+            raise HumanModelError(
+                f'"{name}" is discrete without finite support; it can be neither enumerated nor '
+                "approximated"
+            )
+        if tuple(fn.batch_shape) != (people, 1):
+            raise HumanModelError(
+                f'"{name}" has batch shape {tuple(fn.batch_shape)}, expected ({people}, 1) for '
+                f"{people} people; use .to_event() for several numbers a person"
+            )
 
 
 def _where(error: Exception, path: Path | None = None) -> str:
     """The exception in one line, with the last line of the user's own file that it passed."""
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if path is not None and Path(frame.filename) == path.resolve()]
+    own = [
+        frame
+        for frame in frames
+        if path is not None and Path(frame.filename).resolve() == path.resolve()
+    ]
     line = (own or frames)[-1]
     return f"{type(error).__name__}: {error} ({Path(line.filename).name}, line {line.lineno})"

@@ -112,7 +112,7 @@ class Encoder(nn.Module):
 
     def previous_actions(self, actions: Tensor) -> Tensor:
         """Contribution ``[..., T + 1, H]`` of the action before each observation."""
-        none = torch.full_like(actions[..., :1], self.actions)
+        none = actions.new_full((*actions.shape[:-1], 1), self.actions)
         return self.action(torch.cat([none, actions], -1))
 
     def forward(self, previous: Tensor, evidence: Tensor) -> Gaussian:

@@ -22,9 +22,11 @@ from torch import Tensor
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 
 KINDS = ("full", "dropout", "sight")
-KIND_PROBABILITIES = (0.15, 0.15, 0.70)
+KIND_PROBABILITIES = (0.1, 0.1, 0.8)
 CREDULOUS_PROBABILITY = 0.6
 TOLD_PROBABILITY = 0.4
+ALIKE_PROBABILITY = 0.5
+"""Share of sight views with the same reach in all directions of a group: most people's eyes."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +80,13 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     )
     full, dropout, sight = (kind == index for index in range(len(KINDS)))
     bins = torch.tensor(domain.reach_bins, device=device)
-    reach = bins[
-        torch.randint(
-            len(bins), (batch, len(domain.directions)), generator=generator, device=device
-        )
-    ]
+    drawn = torch.randint(
+        len(bins), (batch, len(domain.directions)), generator=generator, device=device
+    )
+    alike = uniform(batch) < ALIKE_PROBABILITY
+    for group in domain.direction_groups:
+        for direction in group[1:]:
+            drawn[:, direction] = torch.where(alike, drawn[:, group[0]], drawn[:, direction])
     keep, told, noise = {}, {}, {}
     spoken_to = uniform(batch) < TOLD_PROBABILITY
     for modality in domain.modalities:
@@ -92,7 +96,7 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
         told[modality.name] = torch.where(sight & spoken_to, 0.5 * uniform(batch), 0.0)
         noise[modality.name] = uniform(batch, steps + 1, len(modality.items), 2)
     return ViewPlan(
-        reach=torch.where(sight[:, None], reach, bins[-1]),
+        reach=torch.where(sight[:, None], bins[drawn], bins[-1]),
         keep=keep,
         told=told,
         credulous=sight & (uniform(batch) < CREDULOUS_PROBABILITY),

@@ -129,7 +129,10 @@ def sight_picture(data: az.InferenceData) -> Figure:
     # A road is about seven times as wide as it is high, with its title.
     columns = 1 if len(shown) < 4 else max(2, round(math.sqrt(len(shown) / 3)))  # noqa: PLR2004
     rows = -(-len(shown) // columns)
-    figure = Figure(figsize=(6.2 * columns + 0.4, 0.95 * rows + 1.9), layout="constrained")
+    # The explanation below them needs some width too.
+    width, height = (6.2, 0.95) if columns > 1 else (10, 1.3)
+    size = (width * columns + 0.4, height * rows + 1.9)
+    figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for ax, person in zip(grid.flat, shown, strict=False):
         plot_sight(data, person, ax)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from scipy.stats import beta
 
 from mirror_ppl.domains.driving import CAR_LANES, ROAD_END, SWITCH
 from mirror_ppl.errors import DemonstrationsError
@@ -21,7 +23,6 @@ from mirror_ppl.plots.reading import (
     PRIOR,
     PURPLE,
     SAMPLE,
-    draws,
     of_person,
     people,
     round_of,
@@ -30,6 +31,8 @@ from mirror_ppl.plots.reading import (
 if TYPE_CHECKING:
     import arviz as az
 
+RANGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
+"""Ends of the ranges of probabilities that are taken together."""
 LANE_NAMES = ("left lane", "right lane")
 LEVELS = (0.05, 0.5, 0.95)
 """Quantiles of which intervals are drawn: the median and the ends of 90%."""
@@ -114,57 +117,76 @@ def lane_changes(data: az.InferenceData, group: str) -> xr.DataArray:
     return changes.where(real.any("step"))
 
 
+def calibration(data: az.InferenceData, group: str) -> pd.DataFrame:
+    """How often people switch lanes, by how probable that was said to be.
+
+    Args:
+        data: with that group and ``observed_data``.
+        group: ``"posterior_predictive"`` or ``"prior_predictive"``.
+
+    Returns:
+        One row for each of the ranges of ``RANGES`` that occurs: ``steps``, how many there are;
+        ``predicted``, their mean probability; ``observed``, the share that are switches; ``low``
+        and ``high``, its 90% interval (Jeffreys).
+    """
+    action = data["observed_data"]["action"].values
+    predicted = (data[group]["action"] == SWITCH).mean(SAMPLE).values[action >= 0]
+    did = action[action >= 0] == SWITCH
+    rows = []
+    which = np.digitize(predicted, RANGES[1:-1])
+    for index in np.unique(which):
+        inside = which == index
+        steps, switches = int(inside.sum()), int(did[inside].sum())
+        low, high = beta(switches + 0.5, steps - switches + 0.5).ppf([LEVELS[0], LEVELS[-1]])
+        rows.append((steps, predicted[inside].mean(), switches / steps, low, high))
+    return pd.DataFrame(rows, columns=["steps", "predicted", "observed", "low", "high"])
+
+
 def plot_predictive_check(data: az.InferenceData) -> Figure:
     """Draw how often people change lanes beside how often the model says that they do.
 
     Left, for each person: lane changes a round, on average over the rounds that were learned from;
-    90% intervals and medians of what the prior and the posterior predict. Right: how many rounds of
-    all people have no, one, two ... lane changes.
+    90% intervals and medians of what the prior and the posterior predict. Right: how often people
+    switch, of the steps at which a switch has about the same predicted probability.
+
+    Each action is predicted from what happened before it, as recorded. So averages and
+    probabilities can be compared with what people did, while spreads within a round cannot:
+    somebody who changes lanes once, sooner or later, does not do it again, but a prediction starts
+    anew at each step.
 
     Args:
         data: with ``observed_data``, ``posterior_predictive`` and ``prior_predictive``.
     """
     everybody = people(data)
-    figure = Figure(figsize=(11, max(3.4, 0.3 * len(everybody) + 1.6)), layout="constrained")
+    figure = Figure(figsize=(11, max(3.6, 0.3 * len(everybody) + 1.6)), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    observed = lane_changes(data, "observed_data")
-    predicted = {
-        "prior predictive": (lane_changes(data, "prior_predictive"), PRIOR, -0.18),
-        "posterior predictive": (lane_changes(data, "posterior_predictive"), POSTERIOR, 0.18),
-    }
     place = np.arange(len(everybody))
-    for label, (changes, colour, shift) in predicted.items():
-        low, median, high = changes.mean("round").quantile(LEVELS, SAMPLE).values
+    for label, group, colour, shift in (
+        ("prior predictive", "prior_predictive", PRIOR, -0.18),
+        ("posterior predictive", "posterior_predictive", POSTERIOR, 0.18),
+    ):
+        averages = lane_changes(data, group).mean("round")
+        low, median, high = averages.quantile(LEVELS, SAMPLE).values
         left.hlines(place + shift, low, high, color=colour, lw=5, alpha=0.55, label=label)
         left.plot(median, place + shift, "|", color=colour, ms=9, mew=2.5)
-    left.plot(observed.mean("round"), place, "o", color=OBSERVED, ms=6, label="observed")
+        rates = calibration(data, group)
+        right.vlines(rates["predicted"], rates["low"], rates["high"], color=colour, lw=2)
+        right.plot(rates["predicted"], rates["observed"], "o-", color=colour, ms=6, lw=0.8)
+    observed = lane_changes(data, "observed_data").mean("round")
+    left.plot(observed, place, "o", color=OBSERVED, ms=6, label="observed")
     left.set_yticks(place, everybody, parse_math=False)
     left.invert_yaxis()
     left.set_xlabel("lane changes a round, averaged over a person's rounds")
-
-    most = int(observed.max()) + 2
-    counts = np.arange(most + 1)
-    for label, (changes, colour, shift) in predicted.items():
-        shares = np.stack([_share(draw, counts) for draw in draws(changes)])
-        low, median, high = np.quantile(shares, LEVELS, 0)
-        right.bar(counts + shift, median, 0.34, color=colour, alpha=0.55, label=label)
-        right.vlines(counts + shift, low, high, color=colour, lw=2)
-    right.plot(counts, _share(observed.values, counts), "o", color=OBSERVED, ms=6, label="observed")
-    right.set_xticks(counts)
-    right.set_xlabel("lane changes in a round")
-    right.set_ylabel("share of all rounds")
+    right.plot([0, 1], [0, 1], color=OBSERVED, lw=1, ls=":", zorder=0)
+    right.set_aspect("equal")
+    right.set_xlabel("predicted probability of switching")
+    right.set_ylabel("share of steps with a switch")
     for ax in (left, right):
         ax.spines[["top", "right"]].set_visible(False)
     figure.legend(
         *left.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False
     )
     return figure
-
-
-def _share(changes: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Share of the recorded rounds that have each number of lane changes."""
-    known = changes[~np.isnan(changes)]
-    return (known[:, None] == counts).mean(0)
 
 
 def _draw_lane(ax: Axes, lane: int, recorded: xr.Dataset, sight: xr.DataArray, steps: int) -> None:

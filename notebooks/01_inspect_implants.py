@@ -1,0 +1,265 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # What can this person see, and how do they decide?
+#
+# A robot knows how to drive on a road with two lanes. It has watched ten people drive there in
+# fog: what there was to see, and what they did. Nobody recorded what they *saw*. This notebook
+# infers it for each person, together with how they decide, and asks whether to believe the
+# answer.
+#
+# The people are simulated, so the truth is known and stands beside what was inferred. With your
+# own recordings everything works the same, without the truth; `docs/demonstrations.md` shows how
+# to write them.
+#
+# The model in one sentence: a person is the robot's own model of the world, with **implants**
+# that limit what they see and change how they choose.
+#
+# | Implant | Question |
+# |---|---|
+# | `sight_front_own`, `sight_front_other` | How far ahead do they see in their own lane and in the other, in cells? |
+# | `sight_back_own`, `sight_back_other` | How far behind? |
+# | `assumes_clear` | Is a car that they never saw absent to them (1), or may it be there (0)? |
+# | `consistency` | How strictly do they choose the better action? |
+# | `lapse` | How often do they act without regard to what they believe? |
+# | `residual_...` | What else sets their choices apart? (Weights of a small network.) |
+
+# %%
+import os
+
+import pandas as pd
+
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.inference.fitting import fit_people
+from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+# The project's tests run this notebook with few people, rounds and steps.
+quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
+
+# %% [markdown]
+# ## Recordings
+#
+# Ten people, each with their own reach of sight. (In `driving_fog_paper.nc` all of them see two
+# cells ahead and nothing behind.) Everybody drove 40 rounds of 15 steps: rounds 1 to 20 are
+# learned from, rounds 31 to 36 are held out.
+
+# %%
+recordings = load_demonstrations(asset_path("driving_fog_diverse.nc"))
+if quick:
+    recordings = recordings.select_people(["person-08", "person-09"])
+recordings
+
+# %% [markdown]
+# ## Fit
+#
+# The robot's model of the world ships with the package. `HumanModel` is a Pyro program around it;
+# to study another kind of person, derive a class from it and override `prior`, `perceive`,
+# `believe` or `act`. Fitting takes about a minute on two cores. On the command line, the same is
+# `python -m mirror_ppl.fit --setting fog --population diverse`.
+
+# %%
+self_model, card = load_self_model(shipped_weights("driving"))
+human = HumanModel(self_model)
+options = FitOptions(steps=5, draws=20) if quick else FitOptions()
+
+fit = fit_people(human, recordings, options, seed=0, train_rounds=4 if quick else None)
+data = fit.data
+
+# %% [markdown]
+# `data` is an ArviZ `InferenceData`: draws from the prior and the posterior, what either
+# predicts, and what was recorded. Saved as netCDF (`data.to_netcdf(...)`), it opens in any ArviZ
+# tool without this package.
+
+# %%
+for group in data.groups():
+    names = [str(name) for name in data[group].data_vars if not str(name).startswith("truth_")]
+    print(f"{group}: {', '.join(names)}")
+
+# %% [markdown]
+# ## The road as each person sees it
+#
+# The road from above. A cell is light where the model is sure that the person sees a car, dark
+# where it is sure that they do not, and in between where the recordings do not tell. The orange
+# line surrounds what the person really sees.
+
+# %%
+from mirror_ppl.plots.driving import plot_sight, sight_picture
+
+sight_picture(data)
+
+# %% [markdown]
+# Sight ahead in the own lane is known best, above all where it is short: when a person drives up
+# to a car, the moment at which they leave the lane gives away when they saw it. Beyond three or
+# four cells the shades turn grey, since there is no hurry yet: who sees a car that far off, and
+# who does not, act alike. Cars in the other lane matter only to those who think about changing
+# lanes, so there, too, less is known.
+#
+# ## One person
+#
+# Each implant before (grey) and after (blue) seeing this person act. Where blue looks like grey,
+# nothing was learned.
+
+# %%
+from mirror_ppl.plots.implants import plot_implants, scalar_implants
+
+person = "person-09"
+plot_implants(data, person)
+
+# %%
+plot_sight(data, person).figure
+
+# %% [markdown]
+# The same in numbers: mean, standard deviation and 90% interval. `kind="stats"` leaves out what
+# ArviZ says of Markov chains (effective sample size, r-hat): these draws are no chain, and such
+# numbers would mean nothing here.
+
+# %%
+import arviz as az
+
+numbers = az.summary(
+    data.posterior.sel(person=person),
+    var_names=scalar_implants(data),
+    kind="stats",
+    hdi_prob=0.9,
+)
+found = {one["id"]: one for one in fit.summary["people"]}
+numbers["truth"] = [found[person]["implants"][name]["truth"] for name in numbers.index]
+numbers
+
+# %% [markdown]
+# ## What they did, and what was predicted
+#
+# The round in which this person changed lanes most often. Each lane is drawn over time, with
+# distance from the person upwards: a car that falls behind moves down. The shades are those of
+# the road above, so a car that leaves the dark comes into sight. The lowest panel shows how
+# probable a change of lanes was, by the posterior, at each step, and what the person did.
+
+# %%
+from mirror_ppl.plots.rounds import lane_changes, plot_predictive_check, plot_round
+
+changes = lane_changes(data, "observed_data")
+plot_round(data, person, int(changes.sel(person=person).argmax()))
+
+# %% [markdown]
+# A round that was not learned from:
+
+# %%
+plot_round(data, person, 2, held_out=True)
+
+# %% [markdown]
+# ## Does the model fit these people?
+#
+# **Before and after learning.** Left: how often each person changes lanes, and how often the
+# model says that they do. The prior leaves much room, and the posterior narrows it down around
+# what was observed. Right: a prediction is *calibrated* if, of all steps for which it says "they
+# switch with probability 0.3", 30% are switches; then the dots lie on the dotted line. Bars are
+# 90% intervals.
+
+# %%
+plot_predictive_check(data)
+
+# %% [markdown]
+# The same check with ArviZ's own tools. Each line is what ten people might have done, by one draw
+# of the prior (left) or the posterior (right): the share of people with at most so many lane
+# changes a round. The black line is what they did.
+#
+# Each action is predicted from what had happened until then, as recorded. Averages over rounds
+# can therefore be compared with what people did. The spread between rounds cannot: who has
+# changed lanes just now need not do it again, but a prediction does not know what the one before
+# it was.
+
+# %%
+import matplotlib.pyplot as plt
+
+groups = ("observed_data", "prior_predictive", "posterior_predictive")
+averages = {
+    group: lane_changes(data, group).mean("round").to_dataset(name="lane changes a round")
+    for group in groups
+}
+checks = az.InferenceData(**averages)
+figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), sharex=True, layout="constrained")
+shared = {"kind": "cumulative", "num_pp_samples": 20 if quick else 100, "textsize": 11}
+az.plot_ppc(checks, group="prior", observed=True, ax=left, random_seed=0, **shared)
+az.plot_ppc(checks, group="posterior", ax=right, random_seed=0, **shared)
+plt.show()
+
+# %% [markdown]
+# A Bayesian p-value of the average over all people: the share of posterior predictive draws below
+# the observed average (the dot). Values near 0 or 1 would be a warning.
+
+# %%
+figure, ax = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
+az.plot_bpv(checks, kind="t_stat", t_stat="mean", ax=ax, textsize=11)
+plt.show()
+
+# %% [markdown]
+# ## How well are held-out actions predicted?
+#
+# `held-out` is the negative log-likelihood of the actions in rounds that were not learned from,
+# in nats an action: lower is better, and guessing costs 0.69. `floor` is the entropy of the
+# simulated person's own choices, below which no prediction can stay for long. (Over six rounds a
+# person can be lucky, so single entries may lie below it.)
+#
+# `leave-one-out` estimates the same from the training rounds alone, by ArviZ's PSIS-LOO with a
+# round as the unit. It reweights the draws as if one round had not been seen, and says itself for
+# how many rounds this is doubtful: those for which few of the draws carry most of the weight
+# (`doubtful`). Where there are many, trust the held-out rounds.
+
+# %%
+import warnings
+
+rows = []
+steps = (data.observed_data["action"] >= 0).sum(["round", "step"])
+for name in recordings.people:
+    one = az.InferenceData(
+        posterior=data.posterior.sel(person=name),
+        log_likelihood=data.log_likelihood.sel(person=name),
+    )
+    with warnings.catch_warnings():
+        # It warns of doubtful rounds, which are counted here.
+        warnings.simplefilter("ignore", UserWarning)
+        loo = az.loo(one, pointwise=True)
+    test = found[name]["test"]
+    rows.append(
+        {
+            "person": name,
+            "held-out": test["nll"],
+            "floor": test["floor"],
+            "accuracy": test["accuracy"],
+            "leave-one-out": -loo.elpd_loo / int(steps.sel(person=name)),
+            "doubtful": f"{int((loo.pareto_k > loo.good_k).sum())} of {loo.n_data_points}",
+        }
+    )
+scores = pd.DataFrame(rows).set_index("person")
+scores.round(3)
+
+# %%
+print(
+    f"held-out {scores['held-out'].mean():.3f}, floor {scores['floor'].mean():.3f} nats an action"
+)
+
+# %% [markdown]
+# ## What to keep in mind
+#
+# - What is not known looks grey. Do not read a reach off the picture where its edge is blurred;
+#   read the interval.
+# - Blindness and habit can look alike. Somebody who ignores cars that they see acts like somebody
+#   who does not see them. The prior of the residual keeps such habits small, and `assumes_clear`
+#   says what people make of what they do not see; a wrong assumption there makes the model sure
+#   of a wrong reach.
+# - These people are simulated, and simpler than real ones: they see perfectly up to their reach,
+#   forget nothing, and react at once.

@@ -1,0 +1,499 @@
+"""Inference of implants: exact posteriors, variational ones, their draws and predictions."""
+
+import math
+import re
+from dataclasses import replace
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from pyro.infer import TraceEnum_ELBO, config_enumerate
+from scipy.stats import chi2
+from test_views import Few, Sure, log_likelihoods_by_hand, policies, ragged
+
+from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
+from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import CheckpointError
+from mirror_ppl.inference.exact import draw_combinations, log_joint, log_prior, marginals
+from mirror_ppl.inference.fitting import fit_people
+from mirror_ppl.inference.svi import (
+    FitOptions,
+    _draw_by_enumeration,
+    _draw_by_table,
+    _prune,
+    continuous_guide,
+    draw_implants,
+    draw_prior,
+    fit_implants,
+    predict_actions,
+)
+from mirror_ppl.inference.views import build_view_table, combination_scores
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.view_table import NO_VIEW
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+DRIVING = get_domain("driving")
+STEPS = DRIVING.horizon
+LENGTHS = [[15, 15, 6], [], [15, 9]]
+SITES = ("sight_front_own", "assumes_clear")
+COMBINATIONS = dict(zip(SITES, torch.unravel_index(torch.arange(14), (7, 2)), strict=True))
+PRIOR = torch.outer(torch.arange(1.0, 8) / 28, torch.tensor([0.3, 0.7])).flatten()
+
+
+class Moody(Few):
+    """Few, with a discrete site that perception does not depend on, and one inside of act."""
+
+    def prior(self):
+        mood = pyro.sample("mood", dist.Categorical(torch.tensor([0.2, 0.5, 0.3])))
+        return super().prior() | {"mood": mood}
+
+    def act(self, implants, belief, values):
+        bold = pyro.sample("bold", dist.Bernoulli(0.4))
+        factor = 1 + bold + implants["mood"]
+        return super().act(
+            {**implants, "consistency": implants["consistency"] * factor}, belief, values
+        )
+
+
+class Nested(Few):
+    """Few, but how likely each assumption is depends on a continuous site."""
+
+    def prior(self):
+        trust = pyro.sample("trust", dist.Beta(2.0, 2.0))
+        own = super().prior()
+        chances = torch.stack([1 - trust, trust], -1)
+        own["assumes_clear"] = pyro.sample("assumes_clear_too", dist.Categorical(chances))
+        return own | {"assumes_clear_too": own["assumes_clear"], "trust": trust}
+
+    def perceive(self, implants, observation, told):
+        own = {site: implants[site] for site in ("sight_front_own", "assumes_clear_too")}
+        return super().perceive(
+            {**own, "assumes_clear": own["assumes_clear_too"]}, observation, told
+        )
+
+
+@pytest.fixture(scope="module")
+def self_model():
+    return load_self_model(shipped_weights("driving"))[0]
+
+
+@pytest.fixture(scope="module")
+def few(self_model):
+    return Few(self_model)
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return load_demonstrations(asset_path("driving_fog_paper.nc"))
+
+
+@pytest.fixture(scope="module")
+def rounds(recordings):
+    return ragged(recordings, LENGTHS)
+
+
+@pytest.fixture(scope="module")
+def table(few, rounds):
+    return build_view_table(few, rounds)
+
+
+def some_policy(human, people=1):
+    return {name: value[0] for name, value in policies(human, 1, people).items()}
+
+
+def assert_follows(draws, probabilities, tests=1):
+    """Draws ``[S]`` of indices follow these probabilities, by a chi-square test.
+
+    Wrong once in 10,000 for all of the ``tests`` together. Cells that expect fewer than 5 are
+    taken together.
+    """
+    expected = probabilities.double() / probabilities.double().sum() * len(draws)
+    counts = torch.bincount(draws.flatten(), minlength=len(expected)).double()
+    rare = expected < 5
+    parts = [expected[~rare], expected[rare].sum()[None]], [counts[~rare], counts[rare].sum()[None]]
+    expected, counts = (torch.cat(part) for part in parts)
+    assert counts[-1] <= 0 or expected[-1] > 1e-3 * counts[-1]
+    statistic = ((counts - expected) ** 2 / expected.clamp(min=1.0)).sum().item()
+    assert statistic < chi2.isf(1e-4 / tests, len(expected))
+
+
+# --- exact ------------------------------------------------------------------------------------
+
+
+def log_prior_by_hand(policy):
+    """Log prior density of the policy's implants, summed over people."""
+    priors = {
+        "consistency": dist.LogNormal(math.log(3.0), 0.5),
+        "lapse": dist.Beta(1.0, 30.0),
+        "residual_in": dist.Normal(0.0, 48**-0.5),
+        "residual_out": dist.Normal(0.0, 0.1),
+    }
+    return sum(priors[name].log_prob(value).sum() for name, value in policy.items())
+
+
+def bound_at(human, table, values):
+    """The evidence lower bound with a guide that is certain of the continuous sites."""
+
+    def guide(table):
+        with pyro.plate("person", table.people, dim=-2):
+            for name, value in values.items():
+                pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 2))
+
+    model = config_enumerate(human.model, "parallel")
+    return -TraceEnum_ELBO(max_plate_nesting=2).loss(model, guide, table)
+
+
+def test_bound_at_a_point_is_the_exact_evidence(few, table):
+    policy = some_policy(few, table.people)
+    evidence = torch.logsumexp(log_joint(few, table, policy), -1)
+    expected = log_prior_by_hand(policy) + evidence.sum()
+    assert bound_at(few, table, policy) == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_bound_at_a_point_is_the_exact_evidence_of_the_own_model(self_model, rounds):
+    human = HumanModel(self_model)
+    one = rounds.select_people([0]).select_rounds([0])
+    table = build_view_table(human, one, [torch.arange(0, 4802, 7)])
+    policy = some_policy(human)
+    joint = log_joint(human, table, policy)
+    assert (joint > -1e5).sum() == 4802 / 7
+    expected = log_prior_by_hand(policy) + torch.logsumexp(joint, -1).sum()
+    assert bound_at(human, table, policy) == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_prior_of_combinations_by_hand(few, table):
+    prior = log_prior(few, table, some_policy(few))
+    torch.testing.assert_close(prior, PRIOR.log().expand(3, -1))
+
+
+def test_prior_of_combinations_may_depend_on_other_sites(self_model, rounds):
+    human = Nested(self_model)
+    table = build_view_table(human, rounds)
+    assert table.sites == ("sight_front_own", "assumes_clear_too")
+    policy = some_policy(human, 3) | {"trust": torch.tensor([[0.1], [0.5], [0.8]])}
+    trust = policy["trust"]
+    chances = torch.stack([1 - trust, trust], -1)  # [P, 1, 2]
+    expected = (torch.arange(1.0, 8)[:, None] / 28 * chances).log().flatten(1)
+    torch.testing.assert_close(log_prior(human, table, policy), expected)
+
+
+def test_marginals_equal_brute_force(few, table, rounds):
+    policy = some_policy(few)
+    found = marginals(table, log_joint(few, table, policy))
+    for person, lengths in enumerate(LENGTHS):
+        joint = PRIOR.log().clone()
+        for number in range(len(lengths)):
+            joint += log_likelihoods_by_hand(few, rounds, person, number, COMBINATIONS, policy)
+        weights = joint.exp() / joint.exp().sum()
+        for site in SITES:
+            by_value = torch.zeros(table.sizes[SITES.index(site)])
+            for weight, value in zip(weights, COMBINATIONS[site], strict=True):
+                by_value[value] += weight
+            torch.testing.assert_close(found[site][person], by_value, rtol=1e-3, atol=1e-5)
+    # Of somebody without rounds nothing is learned.
+    torch.testing.assert_close(found["sight_front_own"][1], torch.arange(1.0, 8) / 28)
+
+
+def simulated(human, implants, policy, number, generator):
+    """Rounds ``[P, B]`` of people with implants ``[P]`` by name, simulated by the model itself."""
+    people = len(next(iter(implants.values())))
+    every = {site: value.repeat_interleave(number) for site, value in implants.items()}
+    own = {name: value.repeat_interleave(number, 0) for name, value in policy.items()}
+    state = DRIVING.initial(people * number, generator)
+    observed, actions = [DRIVING.observe(state)], []
+    for step in range(STEPS):
+        seen = {name: torch.stack([now[name] for now in observed], 1) for name in observed[0]}
+        told = {name: torch.zeros(seen[name].shape[:3]).bool() for name in ("visual", "verbal")}
+        done = torch.stack([*actions, torch.zeros(people * number).long()], 1)
+        belief = human.believe(human.perceive(every, seen, told), seen, done)[:, None, -1:]
+        chances = human.act(own, belief, human.self_model.action_values(belief))[:, 0, 0].exp()
+        actions.append(torch.multinomial(chances, 1, generator=generator)[:, 0])
+        state = DRIVING.transition(state, actions[step])
+        observed.append(DRIVING.observe(state))
+    values = {name: torch.stack([now[name] for now in observed], 1) for name in observed[0]}
+    variables = {"action": torch.stack(actions, 1), **values}
+    variables = {name: value.unflatten(0, (people, number)) for name, value in variables.items()}
+    ids = [str(person) for person in range(people)]
+    return Demonstrations.from_variables("driving", "fog", ids, variables)
+
+
+def fixed_policy(people, consistency):
+    return {
+        "consistency": consistency * torch.ones(people, 1),
+        "lapse": torch.full((people, 1), 0.02),
+        "residual_in": torch.zeros(people, 1, 49, 8),
+        "residual_out": torch.zeros(people, 1, 9, 2),
+    }
+
+
+@torch.no_grad()
+def test_people_of_the_model_are_recognized(few, generator):
+    people, policy = 60, fixed_policy(60, 3.0)
+    truth = torch.multinomial(PRIOR, people, replacement=True, generator=generator)
+    implants = {site: value[truth] for site, value in COMBINATIONS.items()}
+    table = build_view_table(few, simulated(few, implants, policy, 4, generator))
+    found = marginals(table, log_joint(few, table, policy))
+    for site in SITES:
+        p = found[site].double()
+        right = p.gather(-1, implants[site][:, None]).squeeze(-1)
+        # Truth and data are drawn together, so the truth is a draw from the posterior: its
+        # probability has the mean sum p^2, and the variance sum p^3 - (sum p^2)^2.
+        mean, variance = p.square().sum(-1), p.pow(3).sum(-1) - p.square().sum(-1).square()
+        assert (right - mean).sum().abs() < 4.5 * variance.sum().sqrt()
+        # It has more than half of the mass as often as the posterior itself says, which is for
+        # most people.
+        expected = torch.where(p.amax(-1) > 0.5, p.amax(-1), 0.0)
+        error = 4.5 * (expected * (1 - expected)).sum().sqrt()
+        assert ((right > 0.5).sum() - expected.sum()).abs() < error
+        assert expected.mean() > 0.5
+
+
+# --- draws ------------------------------------------------------------------------------------
+
+
+def test_draws_of_combinations_follow_their_weights(few, table):
+    joint = log_joint(few, table, some_policy(few))
+    draws = draw_combinations(few, table, joint, 4000)
+    assert draws["assumes_clear"].shape == (4000, 3, 1)
+    combination = table.combination(draws)[..., 0]
+    for person in range(3):
+        assert_follows(combination[:, person], joint[person].softmax(-1), tests=3)
+
+
+@pytest.mark.parametrize(("method", "calls"), [(_draw_by_table, 200), (_draw_by_enumeration, 250)])
+def test_both_ways_of_drawing_follow_the_exact_posterior(few, rounds, method, calls):
+    table = build_view_table(few, rounds.select_people([0, 1]))
+    policy = some_policy(few, 2)
+    chunks = [method(few, table, lambda table: policy) for _ in range(calls)]
+    draws = {name: torch.cat([chunk[name] for chunk in chunks]) for name in chunks[0]}
+    assert set(draws) == {*SITES, *policy}
+    for name, value in policy.items():
+        assert torch.equal(draws[name], value.expand(len(draws[name]), *value.shape))
+    combination = table.combination(draws)[..., 0]
+    joint = log_joint(few, table, policy)
+    for person in range(2):
+        assert_follows(combination[:, person], joint[person].softmax(-1), tests=4)
+
+
+def test_sites_beyond_perception_are_drawn_with_it(self_model, rounds):
+    human = Moody(self_model)
+    table = build_view_table(human, rounds.select_people([0]))
+    assert table.sites == SITES
+    policy = some_policy(human)
+    chunks = [_draw_by_enumeration(human, table, lambda table: policy) for _ in range(300)]
+    draws = {name: torch.cat([chunk[name] for chunk in chunks])[..., 0, 0] for name in chunks[0]}
+    weights = torch.zeros(14, 3, 2)
+    for mood, chance in enumerate((0.2, 0.5, 0.3)):
+        for bold, other in enumerate((0.6, 0.4)):
+            given = {"mood": torch.full((1, 1), mood), "bold": torch.full((1, 1), float(bold))}
+            joint = log_joint(human, table, policy | given)[0]
+            weights[:, mood, bold] = joint.exp() * chance * other
+    index = (table.combination(draws) * 3 + draws["mood"]) * 2 + draws["bold"].long()
+    assert_follows(index, weights.flatten())
+
+
+def test_draws_are_as_many_as_asked_for(few, table):
+    with pyro.settings.context(module_local_params=True):
+        guide = continuous_guide(few, table)
+        draws = draw_implants(few, table, guide, 10)
+    assert {name: value.shape[:3] for name, value in draws.items()} == dict.fromkeys(
+        [*SITES, "consistency", "lapse", "residual_in", "residual_out"], (10, 3, 1)
+    )
+    # Of four draws each, the continuous sites are the same.
+    numbers = draws["consistency"][:, 0, 0]
+    assert (numbers[:4] == numbers[0]).all()
+    assert numbers[4] != numbers[0]
+
+
+def test_prior_draws_are_those_of_the_program(self_model, rounds):
+    human = Moody(self_model)
+    table = build_view_table(human, rounds)
+    torch.manual_seed(1)
+    draws = draw_prior(human, table, 2000, seed=4)
+    torch.manual_seed(2)
+    again = draw_prior(human, table, 2000, seed=4)
+    assert all(torch.equal(value, again[name]) for name, value in draws.items())
+    assert list(draws)[:3] == ["mood", *SITES]
+    assert draws["residual_out"].shape == (2000, 3, 1, 9, 2)
+    assert_follows(table.combination(draws)[:, 0, 0], PRIOR, tests=3)
+    assert_follows(draws["mood"][:, 1, 0], torch.tensor([0.2, 0.5, 0.3]), tests=3)
+    assert_follows(draws["bold"][:, 2, 0].long(), torch.tensor([0.6, 0.4]), tests=3)
+    # The logarithm of consistency is normal about log 3 with 0.5.
+    logs = draws["consistency"].log()
+    assert logs.mean().item() == pytest.approx(math.log(3), abs=4.5 * 0.5 / math.sqrt(6000))
+    assert logs.std().item() == pytest.approx(0.5, abs=4.5 * 0.5 / math.sqrt(12_000))
+
+
+def test_predictions_agree_with_perceive_believe_act(few, rounds):
+    table = build_view_table(few, rounds)
+    combinations = torch.randint(14, (5, 3, 1))
+    draws = {site: value[combinations] for site, value in COMBINATIONS.items()}
+    draws |= policies(few, 5, 3)
+    found = predict_actions(few, table, draws)
+    assert found.shape == (5, 3, 3, STEPS, 2)
+    torch.testing.assert_close(found.exp().sum(-1), torch.ones(5, 3, 3, STEPS))
+    chosen = found.gather(-1, table.recorded[..., None].expand(5, -1, -1, -1, -1)).squeeze(-1)
+    chosen = torch.where(table.steps, chosen, 0.0).sum(-1)
+    for draw in range(5):
+        for person, lengths in enumerate(LENGTHS):
+            values = {site: draws[site][draw, person] for site in SITES}
+            policy = {
+                name: value[draw, person][None]
+                for name, value in draws.items()
+                if name not in SITES
+            }
+            for number in range(len(lengths)):
+                expected = log_likelihoods_by_hand(few, rounds, person, number, values, policy)
+                torch.testing.assert_close(
+                    chosen[draw, person, number], expected[0], rtol=1e-4, atol=1e-4
+                )
+
+
+# --- variational ------------------------------------------------------------------------------
+
+
+TINY = FitOptions(steps=6, draws=9, checkpoint_every=2, prune_every=3)
+
+
+def assert_same(one, other):
+    assert one.losses == other.losses
+    assert list(one.draws) == list(other.draws)
+    for name, value in one.draws.items():
+        assert torch.equal(value, other.draws[name]), name
+
+
+def stop_at(step):
+    def report(name, done, total, message):
+        if (name, done) == ("fit", step):
+            raise KeyboardInterrupt
+
+    return report
+
+
+@pytest.fixture(scope="module")
+def tiny_fit(few, table):
+    return fit_implants(few, table, TINY, seed=3)
+
+
+def test_guide_starts_as_wide_as_the_prior(few, table):
+    with pyro.settings.context(module_local_params=True):
+        guide = continuous_guide(few, table)
+    # On the unconstrained scale; the logit of Beta(1, 30) has sqrt(trigamma(1) + trigamma(30)).
+    expected = {"consistency": 0.5, "lapse": 1.296, "residual_in": 48**-0.5, "residual_out": 0.1}
+    for name, scale in expected.items():
+        found = getattr(guide.scales, name)
+        assert found.shape[:2] == (3, 1)
+        # Estimated from 100 draws of three people: 4 standard errors are a quarter of it or less.
+        assert found.mean().item() == pytest.approx(scale, rel=0.25)
+    centre = guide.median()
+    assert (centre["consistency"] - 3.0).abs().max() < 1.0  # the median of 15 draws
+    assert centre["lapse"].max() < 0.1
+
+
+def test_fit_depends_on_its_seed_alone(few, table, tiny_fit):
+    torch.manual_seed(5)
+    state = torch.random.get_rng_state()
+    assert_same(fit_implants(few, table, TINY, seed=3), tiny_fit)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    other = fit_implants(few, table, TINY, seed=4)
+    assert other.losses != tiny_fit.losses
+    assert len(other.losses) == 6
+    assert not list(pyro.get_param_store().keys())
+
+
+@pytest.mark.parametrize("stop", [3, 5, 6])
+def test_fit_goes_on_from_its_checkpoint_as_if_never_stopped(few, table, tiny_fit, tmp_path, stop):
+    checkpoint, steps = (tmp_path / "fit.checkpoint", "this run"), []
+    with pytest.raises(KeyboardInterrupt):
+        fit_implants(few, table, TINY, 3, stop_at(stop), checkpoint)
+
+    def report(name, done, total, message):
+        if name == "fit":
+            steps.append(done)
+
+    resumed = fit_implants(few, table, TINY, 3, report, checkpoint)
+    assert steps == list(range(2 * ((stop - 1) // 2) + 1, 7))
+    assert_same(resumed, tiny_fit)
+    # Killed after the last step, before the results were written: only the draws are made again.
+    steps.clear()
+    assert_same(fit_implants(few, table, TINY, 3, report, checkpoint), tiny_fit)
+    assert steps == []
+
+
+def test_checkpoint_of_another_fit_is_refused(few, recordings, tmp_path):
+    path = tmp_path / "fit.checkpoint"
+    some = recordings.select_people([0]).select_rounds(range(2))
+
+    def fit(human=few, demonstrations=some, options=TINY, seed=0, report=lambda *done: None):
+        fit_people(human, demonstrations, options, seed, 2, report, path)
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(report=stop_at(3))
+    content = path.read_bytes()
+    for other in (
+        {"seed": 1},
+        {"options": replace(TINY, draws=10)},
+        {"human": Sure(few.self_model)},
+        {"demonstrations": recordings.select_people([1]).select_rounds(range(2))},
+    ):
+        with pytest.raises(CheckpointError, match="belongs to a fit with other"):
+            fit(**other)
+        assert path.read_bytes() == content
+    for damaged in (content[: len(content) // 2], b"", b"nonsense"):
+        path.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match=re.escape(str(path))):
+            fit()
+
+
+def test_pruning_gives_up_whoever_is_hopeless(few, table):
+    policy = some_policy(few, 3)
+    score = combination_scores(table, few.act(policy, table.belief, table.values))
+    behind = score.amax(-1, keepdim=True) - score
+    margin = behind[behind > 0].median().item() + 1e-3
+    pruned = _prune(few, table, lambda table: policy, margin)
+    alive = (pruned.index != NO_VIEW).any(1)
+    assert torch.equal(alive, behind <= margin)
+    assert alive[1].all()  # nothing is known of them
+    assert 0 < (~alive).sum() < alive.sum()
+    # Whoever was given up is never drawn.
+    draws = _draw_by_table(few, pruned, lambda table: policy)
+    combination = pruned.combination(draws)[..., 0]
+    assert alive[torch.arange(3).expand(combination.shape), combination].all()
+
+
+def test_fit_tells_who_is_consistent_and_how_far_they_see(few, generator):
+    # One decides nearly at random, the other nearly perfectly; they see 1 cell and everything.
+    implants = {"sight_front_own": torch.tensor([1, 6]), "assumes_clear": torch.tensor([1, 1])}
+    policy = fixed_policy(2, torch.tensor([[0.5], [6.0]]))
+    with torch.no_grad():
+        data = simulated(few, implants, policy, 8, generator)
+    table = build_view_table(few, data)
+    posterior = fit_implants(few, table, FitOptions(steps=60, draws=200), seed=0)
+    low, high = posterior.draws["consistency"][..., 0].unbind(1)
+    assert low.quantile(0.95) < high.quantile(0.05)
+    assert sum(posterior.losses[-10:]) < sum(posterior.losses[:10])
+    assert (posterior.draws["sight_front_own"][:, 1, 0] >= 4).float().mean() > 0.9
+
+
+def test_people_without_discrete_implants_can_be_fitted(self_model, recordings):
+    human = Sure(self_model)
+    some = recordings.select_people([0, 1]).select_rounds(range(3))
+    fit = fit_people(human, some, TINY, seed=0, train_rounds=2)
+    assert set(fit.posterior.draws) == {"consistency", "lapse", "residual_in", "residual_out"}
+    assert [list(person["implants"]) for person in fit.summary["people"]] == [
+        ["consistency", "lapse"]
+    ] * 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("steps", 0, "steps must be at least 1, not 0"),
+        ("prune_every", -3, "prune_every must be at least 1, not -3"),
+        ("learning_rate", 0.0, "learning_rate must be positive, not 0.0"),
+    ],
+)
+def test_impossible_options_are_refused(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        FitOptions(**{name: value})

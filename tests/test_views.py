@@ -1,0 +1,502 @@
+"""Views: those that the self-model is trained under, and tables of what people may have seen."""
+
+import math
+from dataclasses import fields, replace
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
+from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.driving import DrivingState
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.experience import roll_out
+from mirror_ppl.inference.views import (
+    MAX_COMBINATIONS,
+    Screening,
+    _prefixes,
+    build_view_table,
+    combination_scores,
+    restricted,
+)
+from mirror_ppl.models import HumanModel, View
+from mirror_ppl.models.implants import policy_implants, sight_sites
+from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewedActions
+from mirror_ppl.models.views import (
+    CREDULOUS_PROBABILITY,
+    KIND_PROBABILITIES,
+    TOLD_PROBABILITY,
+    draw_views,
+)
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+DRIVING = get_domain("driving")
+STEPS = DRIVING.horizon
+SIGHTS = sight_sites(DRIVING)
+
+
+class Few(HumanModel):
+    """Somebody of whom it is open how far they see ahead in their lane, and what they assume."""
+
+    KNOWN = {"sight_front_other": 2, "sight_back_own": 0, "sight_back_other": 0}
+
+    def prior(self):
+        bins = torch.arange(1.0, len(self.domain.reach_bins) + 1)
+        own = {
+            "sight_front_own": pyro.sample("sight_front_own", dist.Categorical(bins / bins.sum())),
+            "assumes_clear": pyro.sample(
+                "assumes_clear", dist.Categorical(torch.tensor([0.3, 0.7]))
+            ),
+        }
+        like = next(self.self_model.parameters())
+        return own | policy_implants(self.domain, self.self_model.latent, like)
+
+    def perceive(self, implants, observation, told):
+        known = {
+            site: torch.full_like(implants["sight_front_own"], value)
+            for site, value in self.KNOWN.items()
+        }
+        own = {site: implants[site] for site in ("sight_front_own", "assumes_clear")}
+        return super().perceive(known | own, observation, told)
+
+
+class Sure(Few):
+    """Somebody of whom only the policy is open."""
+
+    def prior(self):
+        like = next(self.self_model.parameters())
+        return policy_implants(self.domain, self.self_model.latent, like)
+
+    def perceive(self, implants, observation, told):
+        seen = self.domain.visibility("fog", observation)
+        return View(seen, {name: torch.zeros_like(mask) for name, mask in seen.items()})
+
+
+@pytest.fixture(scope="module")
+def self_model():
+    return load_self_model(shipped_weights("driving"))[0]
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return load_demonstrations(asset_path("driving_fog_diverse.nc"))
+
+
+def ragged(recordings, lengths):
+    """Rounds of these lengths, ``lengths[person][round]``, in which now and then something is told.
+
+    What stands in the padding of the arrays is what was recorded there.
+    """
+    most = max(1, *map(len, lengths))
+    some = recordings.select_people(range(len(lengths))).select_rounds(range(most))
+    variables = some.variables()
+    generator = torch.Generator().manual_seed(2)
+    for name in ("told_visual", "told_verbal"):
+        shape = variables[name].shape
+        variables[name] = torch.rand(shape, generator=generator) < 0.1
+    variables["round_count"] = torch.tensor([len(rounds) for rounds in lengths])
+    padded = [[*rounds, *[0] * (most - len(rounds))] for rounds in lengths]
+    variables["length"] = torch.tensor(padded)
+    return Demonstrations.from_variables(some.domain, some.setting, some.people, variables)
+
+
+LENGTHS = [[15, 4], [], [7, 1]]
+
+
+def policies(human, number, people):
+    """Draws ``[S, P, 1, ...]`` of the policy implants from the prior."""
+    plates = pyro.plate("draw", number, dim=-3), pyro.plate("person", people, dim=-2)
+    with plates[0], plates[1]:
+        return policy_implants(DRIVING, human.self_model.latent, torch.zeros(()))
+
+
+def log_likelihoods_by_hand(human, rounds, person, number, values, policy):
+    """Of one round ``[M]``: perceive, believe and act for each combination by itself.
+
+    Args:
+        values: the discrete implants ``[M]`` by name.
+        policy: the others, ``[1, 1, ...]``.
+    """
+    steps = int(rounds.lengths[person, number])
+    observation = {
+        name: value[person, number, :steps][None] for name, value in rounds.observation().items()
+    }
+    told = {name: value[person, number, :steps][None] for name, value in rounds.told.items()}
+    actions = rounds.actions[person, number, :steps][None]
+    result = []
+    for one in range(len(next(iter(values.values())))):
+        implants = {site: value[one : one + 1] for site, value in values.items()}
+        view = human.perceive(implants, observation, told)
+        belief = human.believe(view, observation, actions)[None]
+        chosen = human.act(policy, belief, human.self_model.action_values(belief))
+        result.append(chosen[0, 0].gather(-1, actions[0, :, None]).sum())
+    return torch.stack(result)
+
+
+def assert_tables_equal(one, other, tolerance=0.0):
+    for field in fields(one):
+        left, right = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(left, torch.Tensor):
+            torch.testing.assert_close(left, right, rtol=0.0, atol=tolerance)
+        else:
+            assert left == right, field.name
+
+
+# --- tables of views --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [HumanModel, Few], ids=["own", "few"])
+def test_table_agrees_with_perceive_believe_act(self_model, recordings, kind):
+    human, rounds = kind(self_model), ragged(recordings, LENGTHS)
+    number = 4802 if kind is HumanModel else 14
+    some = torch.randperm(number)[:14].sort().values
+    table = build_view_table(human, rounds, [some] * 3)
+    assert table.sites == (
+        (*SIGHTS, "assumes_clear") if number > 14 else (SIGHTS[0], "assumes_clear")
+    )
+    assert math.prod(table.sizes) == table.index.shape[-1] == number
+    policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
+    found = combination_scores(table, human.act(policy, table.belief, table.values))
+    axes = torch.unravel_index(some, table.sizes)
+    values = dict(zip(table.sites, axes, strict=True))
+    for person, lengths in enumerate(LENGTHS):
+        expected = torch.zeros(len(some))
+        for index in range(len(lengths)):
+            expected += log_likelihoods_by_hand(human, rounds, person, index, values, policy)
+        torch.testing.assert_close(found[person, some], expected, rtol=1e-4, atol=1e-4)
+    # What is not looked at is out of the question, wherever there is a round to tell.
+    others = torch.ones(number, dtype=torch.bool)
+    others[some] = False
+    assert (found[0, others] == 2 * IMPOSSIBLE).all()
+    assert (found[1] == 0).all()
+
+
+def test_views_are_looked_up_by_combination(self_model, recordings):
+    table = build_view_table(Few(self_model), ragged(recordings, LENGTHS))
+    sights, clear = torch.meshgrid(torch.arange(7), torch.arange(2), indexing="ij")
+    implants = {"sight_front_own": sights.flatten(), "assumes_clear": clear.flatten()}
+    assert torch.equal(table.combination(implants), torch.arange(14))
+    # [E, P, 1] and [P, 1]: a leading dimension of enumeration is kept.
+    enumerated = {name: value[:, None, None] for name, value in implants.items()}
+    assert torch.equal(table.view_of(enumerated), table.index.permute(2, 0, 1))
+    mixed = {"sight_front_own": torch.tensor([[1], [0], [6]]), "assumes_clear": torch.ones(3, 1)}
+    expected = table.index[torch.arange(3), :, torch.tensor([3, 1, 13])]
+    assert torch.equal(table.view_of(mixed), expected)
+
+
+def test_no_view_is_kept_twice_or_for_nothing(self_model, recordings):
+    table = build_view_table(Few(self_model), ragged(recordings, LENGTHS))
+    assert table.view_counts.tolist()[1] == 1  # of padding, to be looked up
+    for person, lengths in enumerate(LENGTHS):
+        used = table.index[person][table.index[person] != NO_VIEW].unique()
+        assert used.tolist() == list(range(int(table.view_counts[person])))
+        assert (table.index[person, len(lengths) or 1 :] == NO_VIEW).all()
+        assert table.real[person].tolist() == [True] * len(lengths) + [False] * (2 - len(lengths))
+        for number in range(len(lengths)):
+            views = table.index[person, number].unique()
+            beliefs = table.belief[person, views][:, : lengths[number]].flatten(1)
+            # Different views lead to different beliefs, so none is there twice.
+            assert len(beliefs.unique(dim=0)) == len(views)
+            # A view belongs to one round: its actions and steps are those of that round.
+            steps = torch.arange(STEPS) < lengths[number]
+            assert torch.equal(table.view_steps[person, views], steps.expand(len(views), -1))
+            real = rounds_actions(recordings, person, number)[steps]
+            assert (table.view_actions[person, views][:, steps] == real).all()
+
+
+def rounds_actions(recordings, person, number):
+    return recordings.actions[person, number]
+
+
+def test_values_of_shared_beginnings_are_those_of_the_belief(self_model, recordings):
+    table = build_view_table(HumanModel(self_model), ragged(recordings, [[15], [9]]))
+    assert table.view_counts.min() > 50
+    with torch.no_grad():
+        expected = self_model.action_values(table.belief)
+    close = (table.values - expected).abs().amax(-1) < 1e-4
+    real = (
+        table.view_steps
+        & (torch.arange(table.belief.shape[1]) < table.view_counts[:, None])[..., None]
+    )
+    assert close[real].all()
+
+
+def test_prefixes_number_beginnings():
+    bits = torch.randint(2, (40, 6, 2))
+    bits[:5] = 0
+    bits[5:10, 3:] = 0
+    numbers = _prefixes(bits)
+    keys = [
+        tuple(bits[row, : step + 1].flatten().tolist()) for row in range(40) for step in range(6)
+    ]
+    distinct = {key: number for key, number in zip(keys, numbers.flatten().tolist(), strict=True)}
+    assert [distinct[key] for key in keys] == numbers.flatten().tolist()
+    assert len(set(distinct.values())) == len(distinct)
+
+
+def test_padding_has_no_influence(self_model, recordings):
+    human, rounds = Few(self_model), ragged(recordings, LENGTHS)
+    policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
+
+    def scores(rounds):
+        table = build_view_table(human, rounds)
+        return combination_scores(table, human.act(policy, table.belief, table.values))
+
+    together = scores(rounds)
+    for person, lengths in enumerate(LENGTHS):
+        alone = torch.zeros(14)
+        for number in range(len(lengths)):
+            one = rounds.select_people([person]).select_rounds([number])
+            assert one.shape == (1, 1, lengths[number])  # no padding
+            alone += scores(one)[0]
+        torch.testing.assert_close(together[person], alone, rtol=1e-4, atol=1e-4)
+
+
+def test_viewed_actions_by_hand():
+    likelihood = torch.tensor([[-1.0, -2.0, -3.0], [-4.0, -5.0, -6.0]]).requires_grad_()
+    view = torch.tensor([[[0, 2], [1, NO_VIEW]], [[1, 1], [NO_VIEW, 0]]])  # [E, P, B]
+    real = torch.tensor([[True, True], [True, False]])
+    actions = ViewedActions(likelihood, view, real)
+    found = actions.log_prob(torch.zeros(2, 2, 15))
+    expected = [[[-1.0, -3.0], [-5.0, 0.0]], [[-2.0, -2.0], [IMPOSSIBLE, 0.0]]]
+    assert found.tolist() == expected
+    assert actions.batch_shape == (2, 2, 2)
+    found.sum().backward()
+    assert likelihood.grad.tolist() == [[1.0, 2.0, 1.0], [0.0, 1.0, 0.0]]
+    # Enumerated likelihoods [E', 1, P, V] broadcast against enumerated views.
+    many = torch.stack([likelihood.detach(), 10 * likelihood.detach()])[:, None]
+    both = ViewedActions(many, view, real).log_prob(torch.zeros(2, 2, 15))
+    assert both.shape == (2, 2, 2, 2)
+    assert both[0].tolist() == expected
+    assert both[1, 0].tolist() == [[-10.0, -30.0], [-50.0, 0.0]]
+
+
+# --- giving combinations up -------------------------------------------------------------------
+
+
+def test_infinite_margin_without_merging_changes_nothing(self_model, recordings):
+    rounds = ragged(recordings, LENGTHS)
+    for human in (Few(self_model), Sure(self_model)):
+        screening = Screening(margin=math.inf, resolution=0.0)
+        assert_tables_equal(
+            build_view_table(human, rounds, screening=screening), build_view_table(human, rounds)
+        )
+
+
+@pytest.mark.parametrize("margin", [0.5, 2.0, 15.0])
+def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, recordings, margin):
+    human, screening = Few(self_model), Screening(margin=margin, resolution=0.0)
+    rounds = recordings.select_rounds(range(4))
+    whole = build_view_table(human, rounds)
+    with pyro.plate("way", screening.ways, dim=-3), pyro.plate("person", 1, dim=-2):
+        torch.manual_seed(screening.seed)
+        ways = human.prior()
+    likelihood = whole.log_likelihoods(human.act(ways, whole.belief, whole.values))
+    expected = torch.ones(rounds.num_people, 14, dtype=torch.bool)
+    score = torch.zeros(screening.ways, rounds.num_people, 14)
+    for number in range(4):
+        score += likelihood.gather(-1, whole.index[:, number].expand(screening.ways, -1, -1))
+        best = score.amax(0).masked_fill(~expected, -math.inf)
+        distance = best.amax(-1, keepdim=True) - best
+        # Rounding may decide either way at the very margin; nobody is there here.
+        assert (distance - margin).abs().min() > 1e-3
+        expected &= distance <= margin
+        # The best one so far stays.
+        assert expected.gather(-1, best.argmax(-1, keepdim=True)).all()
+    screened = build_view_table(human, rounds, screening=screening)
+    assert torch.equal((screened.index != NO_VIEW).all(1), expected)
+    assert_tables_equal(screened, restricted(whole, expected), tolerance=1e-4)
+    dropped = 1 - expected.float().mean().item()
+    assert (dropped > 0.05) if margin < 15 else (dropped < 1)
+    # With the margin that is used, the best of all rounds is never among the dropped.
+    best = score.amax(0).argmax(-1, keepdim=True)
+    assert margin < 15 or expected.gather(-1, best).all()
+
+
+def test_merging_moves_values_by_at_most_the_resolution(self_model, recordings):
+    human, rounds = HumanModel(self_model), ragged(recordings, [[15]])
+    whole = build_view_table(human, rounds)
+    merged = build_view_table(human, rounds, screening=Screening(margin=math.inf, resolution=0.1))
+    assert merged.view_counts[0] < 0.8 * whole.view_counts[0]
+    assert (merged.index != NO_VIEW).all()
+
+    def grid(table):
+        values = table.values[0, table.index[0, 0]]
+        return torch.asinh(values - values.mean(-1, keepdim=True))
+
+    assert (grid(merged) - grid(whole)).abs().max() <= 0.1 + 1e-5
+
+
+def test_restricted_keeps_what_is_alive_and_forgets_the_rest(self_model, recordings):
+    human = Few(self_model)
+    table = build_view_table(human, ragged(recordings, LENGTHS))
+    before = replace(table, index=table.index.clone())
+    alive = torch.rand(3, 14) < 0.4
+    alive[:, 3] = True
+    small = restricted(table, alive)
+    assert_tables_equal(table, before)  # untouched
+    log_probabilities = {}
+    policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
+    for name, part in (("all", table), ("some", small)):
+        log_probabilities[name] = combination_scores(
+            part, human.act(policy, part.belief, part.values)
+        )
+    assert torch.equal(log_probabilities["some"][alive], log_probabilities["all"][alive])
+    assert (log_probabilities["some"][0][~alive[0]] == 2 * IMPOSSIBLE).all()
+    for person in range(3):
+        used = small.index[person][small.index[person] != NO_VIEW].unique()
+        assert used.tolist() == list(range(int(small.view_counts[person])))
+    assert small.belief.shape[1] == small.view_counts.max() < table.belief.shape[1]
+    # Bit by bit is the same as at once.
+    first = alive | (torch.rand(3, 14) < 0.5)
+    assert_tables_equal(restricted(restricted(table, first), alive), small)
+    assert_tables_equal(restricted(small, torch.ones_like(alive)), small)
+
+
+# --- what cannot be tabulated -----------------------------------------------------------------
+
+
+def test_people_without_discrete_implants_have_one_view_a_round(self_model, recordings):
+    table = build_view_table(Sure(self_model), ragged(recordings, LENGTHS))
+    assert (table.sites, table.sizes) == ((), ())
+    assert table.index.tolist() == [[[0], [1]], [[0], [-1]], [[0], [1]]]
+
+
+def test_perceive_may_only_read_what_can_be_enumerated(self_model, recordings):
+    class Dreamer(HumanModel):
+        def perceive(self, implants, observation, told):
+            implants["lapse"]
+            return super().perceive(implants, observation, told)
+
+    message = 'perceive\\(\\) reads "lapse", which is not a discrete site .*sight_front_own'
+    with pytest.raises(HumanModelError, match=message):
+        build_view_table(Dreamer(self_model), recordings)
+
+
+def test_too_many_combinations_are_refused(self_model, recordings):
+    class Many(Few):
+        def prior(self):
+            size = MAX_COMBINATIONS // 14 + 1
+            many = pyro.sample("many", dist.Categorical(torch.ones(size) / size))
+            return super().prior() | {"many": many}
+
+    message = rf"depends on {14 * (MAX_COMBINATIONS // 14 + 1)} combinations .* at most 100000"
+    with pytest.raises(HumanModelError, match=message):
+        build_view_table(Many(self_model), recordings)
+
+
+# --- views of training -----------------------------------------------------------------------
+
+
+def standard_error(share, number):
+    return math.sqrt(share * (1 - share) / number)
+
+
+@pytest.fixture(scope="module")
+def many_views():
+    """20,000 views of one course of a round, with the plan they come from."""
+    generator = torch.Generator().manual_seed(11)
+    plan = draw_views(DRIVING, 20_000, STEPS, generator)
+    # A slow car 3 cells ahead, and one 2 cells behind in the other lane.
+    start = DrivingState(
+        torch.zeros(20_000, dtype=torch.long),
+        torch.tensor([3, 11, -11, -2]).expand(20_000, 4),
+        torch.tensor([-1, 1, -1, -1]).expand(20_000, 4),
+    )
+    states = roll_out(DRIVING, start, torch.zeros(20_000, STEPS, dtype=torch.long))
+    observation = DRIVING.observe(states)
+    return plan, observation, plan.visibility(DRIVING, observation)
+
+
+def kinds(plan):
+    """Which views are full, dropout and sight; told apart by what they keep of either modality."""
+    visual, verbal = plan.keep["visual"], plan.keep["verbal"]
+    return (visual == 1) & (verbal == 1), visual < 1, (visual == 1) & (verbal == 0)
+
+
+def test_kinds_of_views_come_as_often_as_stated(many_views):
+    plan, _, _ = many_views
+    full, dropout, sight = kinds(plan)
+    assert torch.equal(full.long() + dropout.long() + sight.long(), torch.ones(20_000).long())
+    for kind, share in zip((full, dropout, sight), KIND_PROBABILITIES, strict=True):
+        error = standard_error(share, 20_000)
+        assert kind.float().mean().item() == pytest.approx(share, abs=4 * error)
+    number = int(sight.sum())
+    assert not plan.credulous[~sight].any()
+    spoken_to = plan.told["visual"] > 0
+    assert not spoken_to[~sight].any()
+    assert torch.equal(spoken_to, plan.told["verbal"] > 0)
+    for chosen, share in ((plan.credulous, CREDULOUS_PROBABILITY), (spoken_to, TOLD_PROBABILITY)):
+        error = standard_error(share, number)
+        assert chosen[sight].float().mean().item() == pytest.approx(share, abs=4 * error)
+    # Each reach is equally likely in each direction; only sight is limited.
+    assert (plan.reach[~sight] == DRIVING.reach_bins[-1]).all()
+    bins = len(DRIVING.reach_bins)
+    for edge in DRIVING.reach_bins:
+        share = (plan.reach[sight] == edge).float().mean(0)
+        assert (share - 1 / bins).abs().max() < 4.5 * standard_error(1 / bins, number)
+
+
+def test_full_views_show_and_tell_everything(many_views):
+    plan, _, visible = many_views
+    full, _, _ = kinds(plan)
+    assert visible["visual"][full].all()
+    assert visible["verbal"][full].all()
+
+
+def test_dropout_views_keep_each_item_at_the_rate_of_the_round(many_views):
+    plan, _, visible = many_views
+    _, dropout, _ = kinds(plan)
+    for name in ("visual", "verbal"):
+        kept = visible[name][dropout].float()
+        rate = plan.keep[name][dropout]
+        number = kept[0].numel()
+        # Standardized by round; their squares average to one, with a standard error of at most
+        # sqrt(3 / n), as the kurtosis is at most that of the rarest rate tried.
+        middle = (rate > 0.1) & (rate < 0.9)
+        error = (rate * (1 - rate) / number).sqrt()
+        standardized = ((kept.mean((1, 2)) - rate) / error)[middle]
+        count = len(standardized)
+        assert standardized.mean().abs().item() < 4 / math.sqrt(count)
+        assert standardized.square().mean().item() == pytest.approx(
+            1.0, abs=4 * math.sqrt(3 / count)
+        )
+    # Of the two modalities, each has a rate of its own.
+    rates = torch.stack([plan.keep[name][dropout] for name in ("visual", "verbal")])
+    assert torch.corrcoef(rates)[0, 1].abs().item() < 4 / math.sqrt(rates.shape[1])
+
+
+def test_sight_views_show_cars_within_reach_and_what_is_told(many_views):
+    plan, observation, visible = many_views
+    _, _, sight = kinds(plan)
+    direction, distance = DRIVING.distance(observation)
+    near = distance <= plan.reach[torch.arange(20_000)[:, None, None], direction]
+    quiet = sight & (plan.told["visual"] == 0)
+    assert torch.equal(visible["visual"][quiet], near[quiet])
+    assert not visible["verbal"][quiet].any()
+    spoken_to = sight & (plan.told["visual"] > 0)
+    allowed = DRIVING.communicable(observation)
+    assert not (visible["verbal"] & ~allowed["verbal"])[spoken_to].any()
+    assert (visible["visual"] | ~near)[spoken_to].all()
+    extra = (visible["visual"] & ~near)[spoken_to]
+    assert not (extra & ~allowed["visual"][spoken_to]).any()
+    # As often as stated, over all occasions to tell: the rate of a round is at most one half.
+    for name in ("visual", "verbal"):
+        rate = plan.told[name][spoken_to]
+        assert rate.max() <= 0.5
+        occasions = allowed[name] & ~near if name == "visual" else allowed[name]
+        occasions = occasions[spoken_to].flatten(1).sum(1)
+        told = (extra if name == "visual" else visible[name][spoken_to]).flatten(1).sum(1)
+        variance = (occasions * rate * (1 - rate)).sum()
+        assert (told - occasions * rate).sum().abs() < 4 * variance.sqrt()
+
+
+def test_a_plan_says_the_same_of_each_step_by_itself(many_views):
+    plan, observation, visible = many_views
+    for step in (0, 7, STEPS):
+        now = {name: value[:, step : step + 1] for name, value in observation.items()}
+        alone = plan.visibility(DRIVING, now, first=step)
+        for name, mask in visible.items():
+            assert torch.equal(alone[name], mask[:, step : step + 1])
