@@ -40,7 +40,7 @@ class Options:
     """A human model of your own: path/to/file.py:Class (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
-    steps: int = 150
+    steps: int = 300
     """Gradient steps of variational inference."""
     draws: int = 200
     """Posterior draws."""
@@ -71,7 +71,7 @@ def main(options: Options) -> None:
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
-    from mirror_ppl.plots.driving import save_sight_picture
+    from mirror_ppl.plots.driving import has_sight, save_sight_picture
 
     device = usable_device(options.device)
     weights = options.self_model or shipped_weights(demonstrations.domain)
@@ -96,13 +96,15 @@ def main(options: Options) -> None:
     summary = result.summary | {"seconds": round(monotonic() - began, 1)}
     text = json.dumps(summary, indent=1) + "\n"
     save_inference_data(result.data, folder / "posterior.nc")
-    save_sight_picture(result.data, folder / "sight.png")
+    if has_sight(result.data):
+        save_sight_picture(result.data, folder / "sight.png")
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
     checkpoint.unlink(missing_ok=True)
     _show(summary, get_domain(demonstrations.domain).modalities[0].units[0])
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
-    print(f"{folder / 'sight.png'}: the road as each person sees it")
+    if has_sight(result.data):
+        print(f"{folder / 'sight.png'}: the road as each person sees it")
 
 
 def _recordings(options: Options):

@@ -210,7 +210,7 @@ def test_padding_is_ignored_in_prediction(random_clone, generator):
 @pytest.mark.parametrize("batch", [50, 6])
 def test_each_person_is_fitted_as_if_alone(batch, generator):
     few, many = ragged(generator, "few", 4), ragged(generator, "many", 30)
-    options = replace(BRIEF, batch=batch, check_every=2)
+    options = replace(BRIEF, batch=batch, check_every=2, full_decay_rounds=10)
     test = concatenate([few, many])
     clone = fit_behaviour_clone(test, test, options, seed=3)
     for person, part in (("few", few), ("many", many)):
@@ -278,6 +278,7 @@ def test_refuses_people_that_it_does_not_know(random_clone, generator):
         ({"learning_rate": 0.0}, "learning_rate must be positive"),
         ({"weight_decay": -1.0}, "weight_decay must not be negative"),
         ({"weight_decay": float("nan")}, "weight_decay must not be negative"),
+        ({"weight_decay": 20.0, "learning_rate": 0.05}, "below 1 / learning_rate"),
     ],
 )
 def test_options_refuse_impossible_values(wrong, message):

@@ -17,12 +17,12 @@ from pyro.infer import TraceEnum_ELBO, config_enumerate
 
 from mirror_ppl import console
 from mirror_ppl.__main__ import COMMANDS
-from mirror_ppl.data import Demonstrations, load_demonstrations
+from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.experience import map_state
 from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.self_model_training import SelfModelOptions
+from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import PLATES, FitOptions, continuous_guide
 from mirror_ppl.inference.views import Screening, build_view_table
 from mirror_ppl.models import HumanModel, views
@@ -354,45 +354,6 @@ def known(human, people, reach_bin):
     }
 
 
-def play(human, sites, rounds, generator):
-    """Rounds of people whose actions the human model itself draws, step by step."""
-    domain, people = human.domain, len(sites["lapse"])
-    state = map_state(
-        lambda part: part.unflatten(0, (people, rounds)),
-        domain.initial(people * rounds, generator),
-    )
-    observed = [domain.observe(state)]
-    actions = torch.zeros(people, rounds, domain.horizon, dtype=torch.long)
-    told = {
-        modality.name: torch.zeros(people, rounds, domain.horizon, len(modality.items)).bool()
-        for modality in domain.modalities
-    }
-    for step in range(domain.horizon):
-        # What comes later does not matter to this step: the last observation stands in for it.
-        shown = observed + observed[-1:] * (domain.horizon - 1 - step)
-        observation = {name: torch.stack([one[name] for one in shown], 2) for name in shown[0]}
-        with poutine.condition(data=sites), pyro.plate("person", people, dim=-2):
-            implants = human.prior()
-            view = human.perceive(implants, observation, told)
-            belief = human.believe(view, observation, actions)
-            probabilities = human.act(implants, belief, human.self_model.action_values(belief))
-        chosen = torch.rand(people, rounds, generator=generator)
-        actions[..., step] = (chosen < probabilities[..., step, 1].exp()).long()
-        state = domain.transition(state, actions[..., step])
-        observed.append(domain.observe(state))
-    observation = {name: torch.stack([one[name] for one in observed], 2) for name in observed[0]}
-    return Demonstrations(
-        domain=domain.name,
-        setting="clear",
-        people=("late", "prompt"),
-        ego=observation.pop("ego"),
-        observations=observation,
-        actions=actions,
-        round_counts=torch.full((people,), rounds),
-        lengths=torch.full((people, rounds), domain.horizon),
-    )
-
-
 @torch.no_grad()
 def test_a_late_person_is_told_from_a_prompt_one(self_model, generator):
     late_person = type(load_human_model(f"{ROOT}/{EXAMPLE}", self_model))
@@ -409,7 +370,7 @@ def test_a_late_person_is_told_from_a_prompt_one(self_model, generator):
     human = InFullView(self_model)
     sites = known(human, 2, reach_bin=len(human.domain.reach_bins) - 1)
     sites["late"] = torch.tensor([[0.9], [0.05]])
-    recordings = play(human, sites, 20, generator)
+    recordings = play_rounds(human, sites, 20, "clear", generator)
 
     # Exact, given the other implants: one half lies far out in the tails of both posteriors.
     table = build_view_table(human, recordings)

@@ -466,6 +466,11 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
             "return values[..., 0]",
             r"act returned shape \(2, 1, 3\), expected \(2, 1, 3, 2\)",
         ),
+        (
+            "perceive(self, implants, observation, told)",
+            'return implants["lapse"]',
+            r'perceive\(\) reads "lapse", which is not a discrete site of prior\(\); it can read: s',
+        ),
         ("act(self, implants, belief, values)", "return values", "they do not sum to 1"),
         ("act(self, implants, belief, values)", 'return implants["mood"]', "KeyError: 'mood'"),
         (

@@ -12,11 +12,12 @@ from pyro.infer import TraceEnum_ELBO, config_enumerate
 from scipy.stats import chi2
 from test_views import Few, Sure, log_likelihoods_by_hand, policies, ragged
 
-from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
+from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.inference.exact import draw_combinations, log_joint, log_prior, marginals
 from mirror_ppl.inference.fitting import fit_people
+from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import (
     FitOptions,
     _draw_by_enumeration,
@@ -195,29 +196,6 @@ def test_marginals_equal_brute_force(few, table, rounds):
     torch.testing.assert_close(found["sight_front_own"][1], torch.arange(1.0, 8) / 28)
 
 
-def simulated(human, implants, policy, number, generator):
-    """Rounds ``[P, B]`` of people with implants ``[P]`` by name, simulated by the model itself."""
-    people = len(next(iter(implants.values())))
-    every = {site: value.repeat_interleave(number) for site, value in implants.items()}
-    own = {name: value.repeat_interleave(number, 0) for name, value in policy.items()}
-    state = DRIVING.initial(people * number, generator)
-    observed, actions = [DRIVING.observe(state)], []
-    for step in range(STEPS):
-        seen = {name: torch.stack([now[name] for now in observed], 1) for name in observed[0]}
-        told = {name: torch.zeros(seen[name].shape[:3]).bool() for name in ("visual", "verbal")}
-        done = torch.stack([*actions, torch.zeros(people * number).long()], 1)
-        belief = human.believe(human.perceive(every, seen, told), seen, done)[:, None, -1:]
-        chances = human.act(own, belief, human.self_model.action_values(belief))[:, 0, 0].exp()
-        actions.append(torch.multinomial(chances, 1, generator=generator)[:, 0])
-        state = DRIVING.transition(state, actions[step])
-        observed.append(DRIVING.observe(state))
-    values = {name: torch.stack([now[name] for now in observed], 1) for name in observed[0]}
-    variables = {"action": torch.stack(actions, 1), **values}
-    variables = {name: value.unflatten(0, (people, number)) for name, value in variables.items()}
-    ids = [str(person) for person in range(people)]
-    return Demonstrations.from_variables("driving", "fog", ids, variables)
-
-
 def fixed_policy(people, consistency):
     return {
         "consistency": consistency * torch.ones(people, 1),
@@ -227,12 +205,12 @@ def fixed_policy(people, consistency):
     }
 
 
-@torch.no_grad()
 def test_people_of_the_model_are_recognized(few, generator):
-    people, policy = 60, fixed_policy(60, 3.0)
+    people, policy = 40, fixed_policy(40, 3.0)
     truth = torch.multinomial(PRIOR, people, replacement=True, generator=generator)
     implants = {site: value[truth] for site, value in COMBINATIONS.items()}
-    table = build_view_table(few, simulated(few, implants, policy, 4, generator))
+    known = policy | {site: value[:, None] for site, value in implants.items()}
+    table = build_view_table(few, play_rounds(few, known, 10, "fog", generator))
     found = marginals(table, log_joint(few, table, policy))
     for site in SITES:
         p = found[site].double()
@@ -464,11 +442,9 @@ def test_pruning_gives_up_whoever_is_hopeless(few, table):
 
 def test_fit_tells_who_is_consistent_and_how_far_they_see(few, generator):
     # One decides nearly at random, the other nearly perfectly; they see 1 cell and everything.
-    implants = {"sight_front_own": torch.tensor([1, 6]), "assumes_clear": torch.tensor([1, 1])}
-    policy = fixed_policy(2, torch.tensor([[0.5], [6.0]]))
-    with torch.no_grad():
-        data = simulated(few, implants, policy, 8, generator)
-    table = build_view_table(few, data)
+    known = fixed_policy(2, torch.tensor([[0.5], [6.0]]))
+    known |= {"sight_front_own": torch.tensor([[1], [6]]), "assumes_clear": torch.ones(2, 1)}
+    table = build_view_table(few, play_rounds(few, known, 8, "fog", generator))
     posterior = fit_implants(few, table, FitOptions(steps=60, draws=200), seed=0)
     low, high = posterior.draws["consistency"][..., 0].unbind(1)
     assert low.quantile(0.95) < high.quantile(0.05)

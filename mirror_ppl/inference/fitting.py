@@ -111,6 +111,7 @@ def fit_people(
     train_rounds: int | None = None,
     report: Report = silent,
     checkpoint: Path | None = None,
+    screening: Screening | None = Screening(),  # noqa: B008 - frozen
 ) -> Fit:
     """Infer the implants of everybody in recordings, and predict their held-out actions.
 
@@ -122,6 +123,7 @@ def fit_people(
         train_rounds: see :func:`split_rounds`.
         report: told of progress.
         checkpoint: file to continue from; written on the way, removed by nobody.
+        screening: when to give up combinations of discrete implants; ``None`` for never.
 
     Raises:
         DemonstrationsError: too few rounds.
@@ -133,10 +135,10 @@ def fit_people(
     table = build_view_table(
         human,
         train,
-        screening=Screening(),
+        screening=screening,
         report=lambda done: report("views", done, people, "people"),
     )
-    run = _identity(human, train, options, seed)
+    run = _identity(human, train, options, screening, seed)
     posterior = fit_implants(
         human,
         table,
@@ -190,7 +192,13 @@ def fit_people(
     return Fit(posterior, data, summary)
 
 
-def _identity(human: HumanModel, train: Demonstrations, options: FitOptions, seed: int) -> str:
+def _identity(
+    human: HumanModel,
+    train: Demonstrations,
+    options: FitOptions,
+    screening: Screening | None,
+    seed: int,
+) -> str:
     """What a checkpoint belongs to: recordings, model and options, as a hash."""
     digest = hashlib.sha256()
     parts = {**train.variables(), **human.state_dict()}
@@ -201,6 +209,7 @@ def _identity(human: HumanModel, train: Demonstrations, options: FitOptions, see
         source = inspect.getsource(type(human))
     except (OSError, TypeError):  # a class made in a session has no file
         source = type(human).__qualname__
-    description = [source, __version__, seed, asdict(options)]
+    screened = None if screening is None else asdict(screening)
+    description = [source, __version__, seed, asdict(options), screened]
     digest.update(json.dumps(description, sort_keys=True).encode())
     return digest.hexdigest()

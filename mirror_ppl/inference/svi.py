@@ -62,8 +62,8 @@ class FitOptions:
         prune_margin: nats by which the log-likelihood of such a combination has fallen behind.
     """
 
-    steps: int = 150
-    learning_rate: float = 0.05
+    steps: int = 300
+    learning_rate: float = 0.1
     draws: int = 200
     checkpoint_every: int = 25
     prune_every: int = 25

@@ -7,7 +7,7 @@ the later rounds need not be seen through their eyes, and exact marginalization 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import prod
 
@@ -20,7 +20,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, View
-from mirror_ppl.models.sites import discrete_names, latent_sites, latent_values
+from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
 
 MAX_COMBINATIONS = 100_000
@@ -58,29 +58,6 @@ def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
         for name in sites
         if name in discrete_names(trace)
     }
-
-
-class _Reading(Mapping[str, Tensor]):
-    """Implants that note which of them are read, and refuse those that cannot be enumerated."""
-
-    def __init__(self, known: Mapping[str, Tensor]) -> None:
-        self.known = known
-        self.read: set[str] = set()
-
-    def __getitem__(self, name: str) -> Tensor:
-        if name not in self.known:
-            raise HumanModelError(
-                f'perceive() reads "{name}", which is not a discrete site of prior(); '
-                f"it can read: {', '.join(self.known) or 'none'}"
-            )
-        self.read.add(name)
-        return self.known[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.known)
-
-    def __len__(self) -> int:
-        return len(self.known)
 
 
 def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
@@ -187,7 +164,7 @@ def _sites_read(
     human: HumanModel, demonstrations: Demonstrations, supports: Mapping[str, Tensor]
 ) -> set[str]:
     observation, told, _ = _round(demonstrations, demonstrations.observation(), 0, 0)
-    implants = _Reading({name: support[:1] for name, support in supports.items()})
+    implants = Readable({name: support[:1] for name, support in supports.items()})
     human.perceive(implants, observation, told)
     return implants.read
 

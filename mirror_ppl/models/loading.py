@@ -14,7 +14,7 @@ from pyro import poutine
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 
 
 def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
@@ -94,13 +94,14 @@ def check_contract(human: HumanModel) -> None:
         ):
             torch.manual_seed(0)
             implants = human.prior()
+            sampled = latent_values(trace.trace)
             discrete = {
-                name: value.flatten()[:people].expand(people)
-                for name, value in implants.items()
-                if value.dim() <= 2  # noqa: PLR2004 - [P, 1]: one number a person
+                name: sampled[name].flatten()[:people].expand(people)
+                for name in sampled
+                if name in discrete_names(trace.trace)
             }
             method = "perceive"
-            view = human.perceive(discrete, observation, told)
+            view = human.perceive(Readable(discrete), observation, told)
             method = "believe"
             belief = human.believe(view, observation, done)[:, None]
             method = "act"

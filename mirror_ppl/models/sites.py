@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pyro.poutine import Trace
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
+
+from mirror_ppl.errors import HumanModelError
 
 
 def latent_sites(trace: Trace) -> dict[str, Any]:
@@ -26,3 +29,26 @@ def latent_values(trace: Trace) -> dict[str, Tensor]:
 def discrete_names(trace: Trace) -> set[str]:
     """Names of the sampled sites that can be enumerated."""
     return {name for name, site in latent_sites(trace).items() if site["fn"].has_enumerate_support}
+
+
+class Readable(Mapping[str, Tensor]):
+    """Implants for ``perceive``: notes which are read, and refuses those that are not discrete."""
+
+    def __init__(self, known: Mapping[str, Tensor]) -> None:
+        self.known = known
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self.known:
+            raise HumanModelError(
+                f'perceive() reads "{name}", which is not a discrete site of prior(); '
+                f"it can read: {', '.join(self.known) or 'none'}"
+            )
+        self.read.add(name)
+        return self.known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.known)
+
+    def __len__(self) -> int:
+        return len(self.known)

@@ -22,6 +22,7 @@ from matplotlib.patheffects import Normal, Stroke
 from mirror_ppl.domains.driving import ROAD_END
 from mirror_ppl.files import write_whole
 from mirror_ppl.models.implants import SIGHT
+from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLUE, TRUE, draws, of_person, people, truth
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ def plot_sight(data: az.InferenceData, person: str, ax: Axes | None = None) -> A
     probability = sight_probability(data, person)
     real = true_sight(data, person)
     if ax is None:
-        figure = Figure(figsize=(10, 2.5), layout="constrained")
+        figure = Picture(figsize=(10, 2.5), layout="constrained")
         ax = figure.subplots()
         _explain(figure, [ax], truth_known=real is not None)
     extent = (-ROAD_END - 0.5, ROAD_END + 0.5, 0, len(LANES))
@@ -118,7 +119,7 @@ def plot_sight(data: az.InferenceData, person: str, ax: Axes | None = None) -> A
     return ax
 
 
-def sight_picture(data: az.InferenceData) -> Figure:
+def sight_picture(data: az.InferenceData) -> Picture:
     """The roads of all people (the first 40 of more) on one figure, with one explanation.
 
     Args:
@@ -132,7 +133,7 @@ def sight_picture(data: az.InferenceData) -> Figure:
     # The explanation below them needs some width too.
     width, height = (6.2, 0.95) if columns > 1 else (10, 1.3)
     size = (width * columns + 0.4, height * rows + 1.9)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Picture(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for ax, person in zip(grid.flat, shown, strict=False):
         plot_sight(data, person, ax)
@@ -145,9 +146,10 @@ def sight_picture(data: az.InferenceData) -> Figure:
         above.set_xlabel(grid[-1, 0].get_xlabel())
     attributes = data["posterior"].attrs
     place = " in ".join(attributes[key] for key in ("domain", "setting") if key in attributes)
+    place = f": {place}" if place else ""
     some = "" if shown == everybody else f" (the first {len(shown)} of {len(everybody)} people)"
     figure.suptitle(
-        f"What each person sees of the road: {place}{some}",
+        f"What each person sees of the road{place}{some}",
         x=0.01,
         ha="left",
         fontsize=14,

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from mirror_ppl.models.implants import SIGHT
+from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import POSTERIOR, PRIOR, SAMPLE, TRUE, draws, of_person, truth
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def scalar_implants(data: az.InferenceData) -> list[str]:
     ]
 
 
-def plot_implants(data: az.InferenceData, person: str) -> Figure:
+def plot_implants(data: az.InferenceData, person: str) -> Picture:
     """Draw the posterior of each implant that is one number beside its prior.
 
     Implants with few possible values are drawn as bars, others as densities. The truth is marked
@@ -66,7 +66,7 @@ def plot_implants(data: az.InferenceData, person: str) -> Figure:
     names = scalar_implants(data)
     columns = min(4, len(names))
     rows = -(-len(names) // columns)
-    figure = Figure(figsize=(3.1 * columns, 2.5 * rows + 0.7), layout="constrained")
+    figure = Picture(figsize=(3.1 * columns, 2.5 * rows + 0.7), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     handles = {}
     for ax, name in zip(grid.flat, names, strict=False):

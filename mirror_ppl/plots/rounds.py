@@ -10,12 +10,12 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from scipy.stats import beta
 
 from mirror_ppl.domains.driving import CAR_LANES, ROAD_END, SWITCH
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.plots.driving import DARK_TO_LIGHT, DISTANCES, sight_probability
+from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import (
     BLUE,
     OBSERVED,
@@ -40,7 +40,7 @@ LEVELS = (0.05, 0.5, 0.95)
 
 def plot_round(
     data: az.InferenceData, person: str, round: int, *, held_out: bool = False
-) -> Figure:
+) -> Picture:
     """Draw one round over time: the cars, what the person sees of them, and what they did.
 
     Each lane is drawn with distances upwards and time to the right, shaded as
@@ -66,7 +66,7 @@ def plot_round(
     steps = int((action >= 0).sum())
     probability = switching(data, person, held_out=held_out).values[round, :steps]
 
-    figure = Figure(figsize=(10, 8), layout="constrained")
+    figure = Picture(figsize=(10, 8), layout="constrained")
     *lanes, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
     sight = sight_probability(data, person)
     for lane, ax in enumerate(lanes):
@@ -142,7 +142,7 @@ def calibration(data: az.InferenceData, group: str) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["steps", "predicted", "observed", "low", "high"])
 
 
-def plot_predictive_check(data: az.InferenceData) -> Figure:
+def plot_predictive_check(data: az.InferenceData) -> Picture:
     """Draw how often people change lanes beside how often the model says that they do.
 
     Left, for each person: lane changes a round, on average over the rounds that were learned from;
@@ -158,7 +158,7 @@ def plot_predictive_check(data: az.InferenceData) -> Figure:
         data: with ``observed_data``, ``posterior_predictive`` and ``prior_predictive``.
     """
     everybody = people(data)
-    figure = Figure(figsize=(11, max(3.6, 0.3 * len(everybody) + 1.6)), layout="constrained")
+    figure = Picture(figsize=(11, max(3.6, 0.3 * len(everybody) + 1.6)), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     place = np.arange(len(everybody))
     for label, group, colour, shift in (

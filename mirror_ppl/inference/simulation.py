@@ -1,0 +1,92 @@
+"""The human model run forward: rounds as modelled people would play them in the domain's world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains.base import total_reward
+from mirror_ppl.inference.experience import map_state, roll_out
+from mirror_ppl.models.human import HumanModel
+
+
+@torch.no_grad()
+def play_rounds(
+    human: HumanModel,
+    implants: Mapping[str, Tensor],
+    rounds: int,
+    setting: str,
+    generator: torch.Generator,
+) -> Demonstrations:
+    """Let people with given implants play rounds; every action is drawn from the program itself.
+
+    Args:
+        human: the model of people.
+        implants: values of sites ``[P, 1, ...]``; sites that are left out are drawn from the
+            prior, once for all rounds.
+        rounds: number of rounds B of each.
+        setting: name under which the rounds are recorded; what people see is up to their implants.
+        generator: source of how rounds begin and of what people choose.
+    """
+    domain, steps = human.domain, human.domain.horizon
+    people = len(next(iter(implants.values())))
+    device = generator.device
+
+    def by_person(part: Tensor) -> Tensor:
+        return part.unflatten(0, (people, rounds))
+
+    begin = domain.initial(people * rounds, generator)
+    state = map_state(by_person, begin)
+    observed = [domain.observe(state)]
+    actions = torch.zeros(people, rounds, steps, dtype=torch.long, device=device)
+    told = {
+        m.name: torch.zeros(people, rounds, steps, len(m.items), dtype=torch.bool, device=device)
+        for m in domain.modalities
+    }
+    sites = dict(implants)
+    for step in range(steps):
+        # What comes later does not matter to this step: the last observation stands in for it.
+        shown = observed + observed[-1:] * (steps - 1 - step)
+        observation = {name: torch.stack([one[name] for one in shown], 2) for name in shown[0]}
+        with (
+            poutine.trace() as trace,
+            poutine.condition(data=sites),
+            pyro.plate("person", people, dim=-2),
+        ):
+            drawn = human.prior()
+            view = human.perceive(drawn, observation, told)
+            belief = human.believe(view, observation, actions)
+            log_probability = human.act(drawn, belief, human.self_model.action_values(belief))
+        sites = {
+            name: site["value"]
+            for name, site in trace.trace.nodes.items()
+            if site["type"] == "sample" and name != "person"
+        }
+        probability = log_probability[..., step, :].exp().flatten(0, 1)
+        chosen = torch.multinomial(probability, 1, generator=generator)
+        actions[..., step] = chosen.view(people, rounds)
+        state = domain.transition(state, actions[..., step])
+        observed.append(domain.observe(state))
+    observation = {name: torch.stack([one[name] for one in observed], 2) for name in observed[0]}
+    states = roll_out(domain, begin, actions.flatten(0, 1))
+    before, after = (
+        map_state(lambda part, cut=cut: part[:, cut], states)
+        for cut in (slice(None, -1), slice(1, None))
+    )
+    rewards = total_reward(domain.rewards(before, actions.flatten(0, 1), after))
+    return Demonstrations(
+        domain=domain.name,
+        setting=setting,
+        people=tuple(f"person-{number:02d}" for number in range(1, people + 1)),
+        ego=observation.pop("ego"),
+        observations=observation,
+        actions=actions,
+        rewards=by_person(rewards),
+        round_counts=torch.full((people,), rounds),
+        lengths=torch.full((people, rounds), steps),
+    )
