@@ -75,7 +75,7 @@ recordings
 #
 # The robot's model of the world ships with the package. `HumanModel` is a Pyro program around it;
 # to study another kind of person, derive a class from it and override `prior`, `perceive`,
-# `believe` or `act`. Fitting takes about a minute on two cores. On the command line, the same is
+# `believe` or `act`. Fitting takes a minute or two. On the command line, the same is
 # `python -m mirror_ppl.fit --setting fog --population diverse`.
 
 # %%

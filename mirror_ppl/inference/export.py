@@ -9,8 +9,8 @@ the truth where it is known). Attributes say which domain, setting, model and ve
 Predictive draws are of each action given what happened before it, as recorded: averages of them
 compare with what people did, the spread within a round does not.
 
-The draws are not a chain, so effective sample sizes and r-hat mean nothing for them. Each draw of
-the continuous implants comes with several of the discrete ones.
+The draws are independent and not a chain, so effective sample sizes and r-hat mean nothing for
+them.
 """
 
 from __future__ import annotations

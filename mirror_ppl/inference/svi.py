@@ -43,7 +43,6 @@ Draws = dict[str, Tensor]
 
 PRUNING_DRAWS = 4
 PRIOR_DRAWS = 100
-DISCRETE_DRAWS = 4
 PLATES = 2
 """People and their rounds; whatever is drawn or enumerated goes to the left of them."""
 
@@ -249,17 +248,16 @@ def draw_implants(
 ) -> Draws:
     """Joint draws ``[S, P, 1, ...]`` of all sites from the guide and the enumerated posterior.
 
-    Each draw of the continuous sites serves ``DISCRETE_DRAWS`` draws of the discrete ones, whose
-    exact posterior given the continuous ones is at hand.
+    Draws are independent of each other.
     """
     only_views = set(discrete_sites(human)) == set(table.sites) == _enumerated(human, table)
-    draws = _draw_by_table if only_views else _draw_by_enumeration
-    chunks: list[Draws] = []
-    while sum(len(next(iter(chunk.values()))) for chunk in chunks) < number:
-        report("draw", min(number, len(chunks) * DISCRETE_DRAWS), number, "")
-        chunks.append(draws(human, table, guide))
+    draw = _draw_by_table if only_views else _draw_by_enumeration
+    drawn: list[Draws] = []
+    for done in range(number):
+        report("draw", done, number, "")
+        drawn.append(draw(human, table, guide))
     report("draw", number, number, "")
-    return {name: torch.cat([chunk[name] for chunk in chunks])[:number] for name in chunks[0]}
+    return {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
 
 
 def _enumerated(human: HumanModel, table: ViewTable) -> set[str]:
@@ -269,11 +267,8 @@ def _enumerated(human: HumanModel, table: ViewTable) -> set[str]:
 
 def _draw_by_table(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
     continuous = guide(table)
-    discrete = draw_combinations(human, table, log_joint(human, table, continuous), DISCRETE_DRAWS)
-    repeated = {
-        name: value.expand(DISCRETE_DRAWS, *value.shape) for name, value in continuous.items()
-    }
-    return repeated | discrete
+    discrete = draw_combinations(human, table, log_joint(human, table, continuous), 1)
+    return {**continuous, **{name: value[0] for name, value in discrete.items()}}
 
 
 def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
 
 import pyro
@@ -94,6 +95,10 @@ def check_contract(human: HumanModel) -> None:
         ):
             torch.manual_seed(0)
             implants = human.prior()
+            if not isinstance(implants, Mapping):
+                raise HumanModelError(
+                    f"prior returned {type(implants).__name__}, expected a dict of sites by name"
+                )
             sampled = latent_values(trace.trace)
             discrete = {
                 name: sampled[name].flatten()[:people].expand(people)
