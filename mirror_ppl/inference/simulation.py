@@ -13,6 +13,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import total_reward
 from mirror_ppl.inference.experience import map_state, roll_out
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.sites import latent_values
 
 
 @torch.no_grad()
@@ -62,11 +63,8 @@ def play_rounds(
             view = human.perceive(drawn, observation, told)
             belief = human.believe(view, observation, actions)
             log_probability = human.act(drawn, belief, human.self_model.action_values(belief))
-        sites = {
-            name: site["value"]
-            for name, site in trace.trace.nodes.items()
-            if site["type"] == "sample" and name != "person"
-        }
+        # What was drawn at the first step stays for all rounds.
+        sites |= latent_values(trace.trace)
         probability = log_probability[..., step, :].exp().flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)
         actions[..., step] = chosen.view(people, rounds)
