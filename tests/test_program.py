@@ -69,7 +69,7 @@ def test_the_bound_of_the_whole_is_the_sum_of_its_parts(human, table, world):
         people = -elbo.loss(program, guide, table)
         torch.manual_seed(3)
         implants(table)
-        robot = human.self_model.elbo(world)
+        robot, _ = human.self_model.elbo(world)
     assert_close(torch.tensor(whole), people + robot, rtol=1e-4, atol=1e-2)
 
 

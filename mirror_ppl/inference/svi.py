@@ -278,7 +278,7 @@ def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) 
         first_available_dim=-1 - PLATES,
     )
     trace = poutine.trace(sampled).get_trace(table)
-    return {name: value[None] for name, value in {**continuous, **_whole_values(trace)}.items()}
+    return {**continuous, **_whole_values(trace)}
 
 
 @torch.no_grad()
