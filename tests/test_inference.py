@@ -328,7 +328,7 @@ def test_predictions_agree_with_perceive_believe_act(few, rounds):
 # --- variational ------------------------------------------------------------------------------
 
 
-TINY = FitOptions(steps=6, draws=9, checkpoint_every=2, prune_every=3)
+TINY = FitOptions(steps=6, draws=9, checkpoint_every=2, prune_every=2, prune_margin=1.0)
 
 
 def assert_same(one, other):
