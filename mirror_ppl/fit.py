@@ -95,6 +95,8 @@ def main(options: Options) -> None:
         )
     summary = result.summary | {"seconds": round(monotonic() - began, 1)}
     text = json.dumps(summary, indent=1) + "\n"
+    # Without it, results of a run that was killed here cannot be taken for those of an older one.
+    (folder / "summary.json").unlink(missing_ok=True)
     save_inference_data(result.data, folder / "posterior.nc")
     if has_sight(result.data):
         save_sight_picture(result.data, folder / "sight.png")

@@ -46,9 +46,11 @@ def main(options: Options) -> None:
     """
     from mirror_ppl.data import save_demonstrations
     from mirror_ppl.domains import get_domain
+    from mirror_ppl.files import prepare_output_folder
     from mirror_ppl.people import simulate
 
     domain = get_domain(options.domain)
+    prepare_output_folder(options.out.parent)
     with Progress("simulate", domain.horizon) as progress:
         demonstrations = simulate(
             options.domain,

@@ -1,6 +1,7 @@
 """`python -m mirror_ppl.train`: train a domain's self-model."""
 
 from dataclasses import asdict, dataclass, fields
+from math import isfinite
 from pathlib import Path
 
 from mirror_ppl.console import Progress, run, usable_device
@@ -36,6 +37,8 @@ class Options:
         for name in ("phases", "steps"):
             if (number := getattr(self, name)) < 1:
                 raise ValueError(f"--{name} must be at least 1, not {number}")
+        if not (self.learning_rate > 0 and isfinite(self.learning_rate)):
+            raise ValueError(f"--learning-rate must be a positive number, not {self.learning_rate}")
 
 
 def main(options: Options) -> None:

@@ -98,7 +98,7 @@ def to_inference_data(
             "car": list(domain.modalities[0].items),
             "visual_feature": list(domain.modalities[0].features),
         },
-        dims=_dims([*posterior, *prior, *(TRUTH + name for name in train.truth)]),
+        dims=_dims([*posterior, *prior, *(TRUTH + name for name in train.truth)], train.told),
         attrs={key: str(value) for key, value in attributes.items()},
     )
     if test is not None:
@@ -134,13 +134,14 @@ def _constants(rounds: Demonstrations) -> dict[str, Any]:
         "ego": rounds.ego.numpy(),
         "visual": rounds.observations["visual"].numpy(),
     }
+    constants |= {f"told_{name}": mask.numpy().astype("int8") for name, mask in rounds.told.items()}
     constants |= {TRUTH + name: value.numpy() for name, value in rounds.truth.items()}
     if rounds.action_entropy is not None:
         constants["action_entropy"] = rounds.action_entropy.numpy()
     return constants
 
 
-def _dims(one_a_person: Iterable[str]) -> dict[str, list[str]]:
+def _dims(one_a_person: Iterable[str], modalities: Iterable[str]) -> dict[str, list[str]]:
     rounds = ["person", "round", "step"]
     dims = {name: ["person"] for name in one_a_person}
     dims["residual_in"] = ["person", "residual_input", "residual_unit"]
@@ -149,5 +150,7 @@ def _dims(one_a_person: Iterable[str]) -> dict[str, list[str]]:
     dims["action_probability"] = ["person", "test_round", "step", "action_name"]
     dims["observed_action"] = dims["action_entropy"] = rounds
     dims["ego"] = ["person", "round", "time", "ego_feature"]
+    for modality in modalities:
+        dims[f"told_{modality}"] = [*rounds, f"{modality}_item"]
     dims["visual"] = ["person", "round", "time", "car", "visual_feature"]
     return dims

@@ -192,6 +192,14 @@ def fit_people(
     return Fit(posterior, data, summary)
 
 
+def _source(kind: type) -> str:
+    """The whole file of a class, which may lean on anything in it."""
+    try:
+        return Path(inspect.getfile(kind)).read_text()
+    except (OSError, TypeError):  # a class made in a notebook has no file
+        return kind.__qualname__
+
+
 def _identity(
     human: HumanModel,
     train: Demonstrations,
@@ -205,10 +213,7 @@ def _identity(
     for name in sorted(parts):
         digest.update(name.encode())
         digest.update(parts[name].detach().cpu().numpy().tobytes())
-    try:
-        source = inspect.getsource(type(human))
-    except (OSError, TypeError):  # a class made in a session has no file
-        source = type(human).__qualname__
+    source = [_source(kind) for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
     screened = None if screening is None else asdict(screening)
     description = [source, __version__, seed, asdict(options), screened]
     digest.update(json.dumps(description, sort_keys=True).encode())

@@ -42,7 +42,7 @@ Draws = dict[str, Tensor]
 """Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
 
 PRUNING_DRAWS = 4
-PRIOR_DRAWS = 100
+WIDTH_DRAWS = 100
 PLATES = 2
 """People and their rounds; whatever is drawn or enumerated goes to the left of them."""
 
@@ -101,7 +101,7 @@ class PriorScaledNormal(AutoNormal):
         assert self.prototype_trace is not None
         for name, site in self.prototype_trace.iter_stochastic_nodes():
             prior = site["fn"]
-            draws = torch.stack([prior.sample() for _ in range(PRIOR_DRAWS)])
+            draws = torch.stack([prior.sample() for _ in range(WIDTH_DRAWS)])
             width = biject_to(prior.support).inv(draws).std(0)
             width = width.mean(tuple(range(width.dim() - prior.event_dim)))
             _, scale = self._get_loc_and_scale(name)

@@ -45,7 +45,7 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
     sys.modules[module_name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise HumanModelError(f"{path} does not import: {_where(error, path)}") from error
     chosen = getattr(module, name, None)
     if not (isinstance(chosen, type) and issubclass(chosen, HumanModel)):
@@ -149,7 +149,7 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
             )
 
 
-def _where(error: Exception, path: Path | None = None) -> str:
+def _where(error: BaseException, path: Path | None = None) -> str:
     """The exception in one line, with the last line of the user's own file that it passed."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [

@@ -1,0 +1,41 @@
+"""Small things that are refused, or told, before they can do harm."""
+
+import pytest
+import xarray as xr
+
+from mirror_ppl import simulate, train
+from mirror_ppl.errors import HumanModelError, OutputError
+from mirror_ppl.inference.self_model_training import SelfModelOptions
+from mirror_ppl.models.loading import load_human_model
+
+
+@pytest.mark.parametrize("rate", [float("nan"), float("inf"), 0.0, -1.0])
+@pytest.mark.parametrize("options", [SelfModelOptions, train.Options])
+def test_a_learning_rate_is_a_positive_number(options, rate):
+    with pytest.raises(ValueError, match="must be a positive number"):
+        options(learning_rate=rate)
+
+
+def test_a_human_model_that_exits_is_an_error_and_not_an_end(tmp_path):
+    file = tmp_path / "leaving.py"
+    file.write_text("import sys\nsys.exit(7)\n")
+    with pytest.raises(HumanModelError, match="does not import: SystemExit: 7"):
+        load_human_model(f"{file}:Leaving", None)
+
+
+def test_nothing_is_simulated_for_a_file_that_cannot_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("mirror_ppl.people.simulate", None)  # calling it would fail otherwise
+    with pytest.raises(OutputError):
+        simulate.main(simulate.Options(out=tmp_path / "file" / "below.nc"))
+
+
+def test_what_was_told_is_in_the_posterior_file(tmp_path):
+    from mirror_ppl import fit
+
+    options = fit.Options(out=tmp_path, train_rounds=1, steps=2, draws=4)
+    fit.main(options)
+    with xr.open_dataset(tmp_path / "posterior.nc", group="constant_data") as constants:
+        assert constants["told_visual"].dims[:3] == ("person", "round", "step")
+        assert constants["told_verbal"].shape == (10, 1, 15, 4)
+        assert not constants["told_verbal"].any()
