@@ -51,6 +51,17 @@ class UnknownNameError(MirrorError):
         return cls(message)
 
 
+class PosteriorError(MirrorError):
+    """Raised for a posterior file that cannot be used.
+
+    It is missing or damaged, holds no draws, or is of another domain, model or version.
+    """
+
+
+class OptionError(MirrorError):
+    """Raised for an option of a command whose value makes no sense."""
+
+
 class AssetError(MirrorError):
     """Raised for a trained network that ships, or was saved, and cannot be used.
 

@@ -9,6 +9,7 @@ from time import monotonic
 from typing import Any
 
 from mirror_ppl.console import Progress, run, usable_device
+from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.fit"
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
@@ -53,7 +54,7 @@ class Options:
         for name in ("steps", "draws", "train_rounds"):
             number = getattr(self, name)
             if number is not None and number < 1:
-                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, not {number}")
+                raise OptionError(f"--{name.replace('_', '-')} must be at least 1, not {number}")
 
 
 def main(options: Options) -> None:

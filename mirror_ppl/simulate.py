@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from mirror_ppl.console import Progress, run, usable_device
+from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.simulate"
 DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
@@ -34,7 +35,7 @@ class Options:
     def __post_init__(self) -> None:
         for name in ("people", "rounds"):
             if (number := getattr(self, name)) < 1:
-                raise ValueError(f"--{name} must be at least 1, not {number}")
+                raise OptionError(f"--{name} must be at least 1, not {number}")
 
 
 def main(options: Options) -> None:

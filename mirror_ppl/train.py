@@ -5,6 +5,7 @@ from math import isfinite
 from pathlib import Path
 
 from mirror_ppl.console import Progress, run, usable_device
+from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.train"
 DESCRIPTION = """Train the robot's self-model from nothing, measure it against the exact planner,
@@ -36,9 +37,11 @@ class Options:
     def __post_init__(self) -> None:
         for name in ("phases", "steps"):
             if (number := getattr(self, name)) < 1:
-                raise ValueError(f"--{name} must be at least 1, not {number}")
+                raise OptionError(f"--{name} must be at least 1, not {number}")
         if not (self.learning_rate > 0 and isfinite(self.learning_rate)):
-            raise ValueError(f"--learning-rate must be a positive number, not {self.learning_rate}")
+            raise OptionError(
+                f"--learning-rate must be a positive number, not {self.learning_rate}"
+            )
 
 
 def main(options: Options) -> None:

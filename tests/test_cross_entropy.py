@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from mirror_ppl.people.cross_entropy import CrossEntropyOptions, best_sequences
+from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 
 # Without smoothing every sequence is drawn with probability 2**-H each time; at H = 5 the chance
 # that one given sequence is not among 4 * 256 draws is (31/32)**1024 = 8e-15.

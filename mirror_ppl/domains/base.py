@@ -137,6 +137,29 @@ class Domain(Protocol):
         """The state without the things behind the visual items marked in ``gone`` ``[..., K]``."""
         ...
 
+    def state_behind(self, observation: Observation) -> Any:
+        """The state ``[...]`` that gives this observation of everything."""
+        ...
+
+    def nearest(self, observation: Observation) -> Observation:
+        """The possible observation ``[...]`` nearest to one that decoders came up with."""
+        ...
+
+    def relevance(self, observation: Observation) -> dict[str, Visibility]:
+        """Which items ``[..., K]`` are about what matters now, by notion of what that is.
+
+        The first notion is the one of the supplement, section F.
+        """
+        ...
+
+    def describe(self, observation: Observation, modality: str, item: str) -> str:
+        """An item of one observation ``[K, F]`` in words, such as "rear car, closing"."""
+        ...
+
+    def deed(self, observation: Observation, item: str, action: int) -> str:
+        """An action in words, with regard to an item, such as "switch into it"."""
+        ...
+
     def reference_values(self, state: Any, discount: float) -> Tensor:
         """Exact discounted action values ``[..., A]`` of a fully known state."""
         ...

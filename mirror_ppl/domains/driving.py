@@ -278,6 +278,67 @@ class Driving:
         """The state without the cars marked in ``gone`` ``[..., 4]``: they are far off the road."""
         return replace(state, position=torch.where(gone, 10 * ROAD_END, state.position))
 
+    def state_behind(self, observation: Observation) -> DrivingState:
+        """The state ``[...]`` behind an observation; a car off the road stays there.
+
+        Where such a car is and how fast it moves cannot be observed, and no longer matters: none
+        that has left comes back.
+        """
+        position = observation["visual"][..., 0].round().long()
+        away = position.abs() >= ROAD_END
+        speed = observation["verbal"][..., 2].round().long()
+        return DrivingState(
+            lane=observation["ego"][..., 0].round().long(),
+            position=torch.where(away, 10 * position, position),
+            speed=torch.where(away, 0, speed),
+        )
+
+    def nearest(self, observation: Observation) -> Observation:
+        """The observation that can be and is nearest to decoded values.
+
+        Positions are taken from the verbal and visual modality alike, their mean rounded.
+        """
+        lane = observation["ego"][..., 0].round().clamp(0, 1)
+        decoded = (observation["visual"][..., 0] + observation["verbal"][..., 0]) / 2
+        position = decoded.round().clamp(-ROAD_END, ROAD_END).long()
+        # A known car is faster or slower than the ego, never as fast.
+        speed = torch.where(observation["verbal"][..., 2] < 0, -1, 1)
+        return self.observe(DrivingState(lane.long(), position, speed))
+
+    def relevance(self, observation: Observation) -> dict[str, Visibility]:
+        """Cars on a collision course: abreast or closing in, in the ego's lane.
+
+        And cars that are abreast or closing in, in either lane: a change of lanes brings those of
+        the other lane on a collision course.
+        """
+        position, offset, speed = observation["verbal"].unbind(-1)
+        closing = (position * speed < 0) | (position == 0)
+        course = closing & (offset == 0)
+        return {
+            "collision_course": {"visual": course, "verbal": course},
+            "closing": {"visual": closing, "verbal": closing},
+        }
+
+    def describe(self, observation: Observation, modality: str, item: str) -> str:
+        """Such as "rear car in the right lane, 3 cells behind, closing"."""
+        index = CARS.index(item)
+        position, _, speed = observation["verbal"][index].tolist()
+        lane = ("left", "right")[CAR_LANES[index]]
+        if position == 0:
+            return f"car abreast in the {lane} lane"
+        where = "ahead" if position > 0 else "behind"
+        cells = f"{abs(position):.0f} cell{'s' * (abs(position) > 1)}"
+        motion = "closing" if position * speed < 0 else "drawing away"
+        which = "front" if position > 0 else "rear"
+        return f"{which} car in the {lane} lane, {cells} {where}, {motion}"
+
+    def deed(self, observation: Observation, item: str, action: int) -> str:
+        """Whether they would switch into a car's lane, out of it, or stay in one of them."""
+        own = observation["visual"][CARS.index(item), 1] == 0
+        if action == SWITCH:
+            return "switch lanes" if own else "switch into it"
+        return "stay in its way" if own else "stay where they are"
+
     def reference_values(self, state: DrivingState, discount: float) -> Tensor:
         """Exact action values ``[..., 2]`` with everything known, to the end of the encounter."""
         known = torch.ones_like(state.position, dtype=torch.bool)

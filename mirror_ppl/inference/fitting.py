@@ -29,6 +29,7 @@ from mirror_ppl.inference.svi import (
 )
 from mirror_ppl.inference.views import Screening, build_view_table
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.weights import fingerprint
 
 if TYPE_CHECKING:
     import arviz as az
@@ -180,9 +181,10 @@ def fit_people(
         "domain_version": domain.version,
         "setting": train.setting,
         "human_model": type(human).__name__,
+        "self_model": fingerprint(human.self_model),
         "version": __version__,
         "seed": seed,
-    }
+    } | {f"recorded_{name}": value for name, value in train.provenance.items()}
     generator = torch.Generator().manual_seed(seed)
     data = to_inference_data(train, test, drawn, prior, log_probabilities, attributes, generator)
     summary = attributes | {

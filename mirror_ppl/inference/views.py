@@ -17,6 +17,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.distinct import distinct_rows, random_keys
 from mirror_ppl.domains import Observation
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, View
@@ -228,7 +229,7 @@ def _views(
     """Distinct views of one round, and which of them each combination has."""
     view = View(*(_expanded(masks, combinations) for masks in (view.visible, view.absent)))
     bits = _bits(view, real)
-    first, inverse = _first_rows(bits.flatten(1))
+    first, inverse = distinct_rows(bits.flatten(1))
     beliefs = []
     for rows in first.split(CHUNK):
         some = View(
@@ -238,7 +239,7 @@ def _views(
         beliefs.append(human.believe(some, observation, actions))
     belief = torch.cat(beliefs)
     # Views that agree up to a step agree in the belief at that step.
-    node, same = _first_rows(_prefixes(bits[first]).flatten()[:, None])
+    node, same = distinct_rows(_prefixes(bits[first]).flatten()[:, None])
     values = torch.cat(
         [human.self_model.action_values(part) for part in belief.flatten(0, 1)[node].split(CHUNK)]
     )
@@ -259,7 +260,7 @@ def _alike(values: Tensor, real: Tensor, resolution: float) -> tuple[Tensor, Ten
     advantage = values - values.mean(-1, keepdim=True)
     # asinh is the identity near 0 and logarithmic far from it.
     grid = torch.round(torch.asinh(advantage) / resolution) * real[:, None]
-    return _first_rows(grid.flatten(1).long())
+    return distinct_rows(grid.flatten(1).long())
 
 
 class _Screen:
@@ -309,27 +310,9 @@ def _bits(view: View, real: Tensor) -> Tensor:
 def _prefixes(bits: Tensor) -> Tensor:
     """A number ``[M, T]`` for each beginning of each view, the same for the same beginnings."""
     # A key of its own tells steps apart: seeing nothing now differs from having seen nothing.
-    step_key, keys = _keys(1 + bits[0].numel(), bits.device).split([1, bits[0].numel()])
+    step_key, keys = random_keys(1 + bits[0].numel(), bits.device).split([1, bits[0].numel()])
     steps = torch.arange(bits.shape[1], device=bits.device) * step_key
     return (bits * keys.reshape(bits.shape[1:])).sum(-1).cumsum(-1) + steps
-
-
-def _keys(number: int, device: torch.device) -> Tensor:
-    """Random 62-bit keys ``[number]``: sums of different sets of them differ.
-
-    But for a chance of about one in 2**62; and sorting numbers is a hundred times quicker than
-    sorting rows.
-    """
-    keys = torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(0))
-    return keys.to(device)
-
-
-def _first_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """First of each set of equal rows of ``[M, N]``, and the number of each row's set."""
-    values, inverse = torch.unique(rows @ _keys(rows.shape[1], rows.device), return_inverse=True)
-    first = torch.full((len(values),), len(rows), device=rows.device)
-    first.scatter_reduce_(0, inverse, torch.arange(len(rows), device=rows.device), "amin")
-    return first, inverse
 
 
 def _pad(value: Tensor, length: int) -> Tensor:

@@ -28,6 +28,7 @@ from torch import Tensor, nn
 
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.view_table import ViewedActions, ViewTable
 
@@ -55,7 +56,21 @@ class HumanModel(nn.Module):
 
     Batch dimensions of implants are ``[..., P, 1]``: people at -2, and -1 left for their rounds or
     views. Weights and the like follow as event dimensions.
+
+    Attributes:
+        stepwise: whether a step of a round can be worked out from the belief before it and that
+            step alone, so that planning need not go through the whole round again. A class that
+            overrides ``perceive``, ``believe`` or ``act`` counts as one that cannot, unless it says
+            ``stepwise = True``.
     """
+
+    stepwise = True
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        changed = {"perceive", "believe", "act"} & set(vars(cls))
+        if changed and "stepwise" not in vars(cls):
+            cls.stepwise = False
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__()
@@ -104,13 +119,28 @@ class HumanModel(nn.Module):
             observation: everything that could be seen, ``[..., T, K, F]``.
             actions: what was done, ``[..., T]``; the last one is not used.
         """
+        evidence = self.evidence(view, observation)
+        evidence = evidence + self.self_model.encoder.previous_actions(actions[..., :-1])
+        return self.self_model.believe(evidence)
+
+    def evidence(self, view: View, observation: Observation) -> Tensor:
+        """What views ``[..., K]`` of observations tell the encoder at each step, ``[..., H]``."""
         encoder, domain = self.self_model.encoder, self.domain
         real = encoder.embed(domain.symbols(observation))
         empty = encoder.embed(domain.symbols(domain.absent(observation)))
         evidence = encoder.combine(real, view.visible)
-        evidence = encoder.combine({**empty, "ego": evidence}, view.absent)
-        evidence = evidence + encoder.previous_actions(actions[..., :-1])
-        return self.self_model.believe(evidence)
+        return encoder.combine({**empty, "ego": evidence}, view.absent)
+
+    def advance(self, belief: Tensor, evidence: Tensor, action: Tensor) -> Gaussian:
+        """One step of :meth:`believe`: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.
+
+        Args:
+            belief: of the step before ``[..., Z]``; zero before the first.
+            evidence: of this step ``[..., H]``, from :meth:`evidence`.
+            action: what was done in between ``[...]``; the number of actions if nothing was.
+        """
+        encoder = self.self_model.encoder
+        return encoder(belief, evidence + encoder.action(action))
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of actions ``[..., T, A]``.

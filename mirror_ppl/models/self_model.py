@@ -133,6 +133,17 @@ class SelfModel(nn.Module):
             for name, value in values.items()
         }
 
+    def decode(self, latent: Tensor) -> Observation:
+        """Means of the observations of states ``[..., Z]``, in the domain's units."""
+        values = {}
+        for name, decoder in self.decoders.items():
+            mean = decoder(latent).mean
+            values[name] = mean * torch.tensor(
+                self.scales[name], dtype=mean.dtype, device=mean.device
+            )
+        values["ego"] = values["ego"].squeeze(-2)
+        return values
+
     def evidence(self, observation: Observation, visible: Visibility, actions: Tensor) -> Tensor:
         """What each step tells the encoder: ``x_t, v_t, a_{t-1}`` as ``[..., T + 1, H]``."""
         embedded = self.encoder.embed(self.domain.symbols(observation))

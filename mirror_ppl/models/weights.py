@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,6 +28,15 @@ def shipped_weights(domain: str) -> Path:
         AssetError: none ship.
     """
     return asset_path(f"{domain}_self_model.safetensors")
+
+
+def fingerprint(self_model: SelfModel) -> str:
+    """What tells a self-model's weights from others: the beginning of a hash of them."""
+    digest = hashlib.sha256()
+    for name, value in sorted(self_model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) -> None:

@@ -11,13 +11,19 @@ from collections.abc import Callable
 import torch
 
 from mirror_ppl.console import Progress
+from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import require_known
-from mirror_ppl.people.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.people.driving import Drivers, Memory, PlanningDrivers, TaskDrivers, remember
 from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_reward, log_policy
 from mirror_ppl.people.populations import POPULATIONS
-from mirror_ppl.people.recordings import learned_reward, simulate_driving, simulated_drivers
+from mirror_ppl.people.recordings import (
+    Start,
+    draw_starts,
+    learned_reward,
+    simulate_driving,
+    simulated_drivers,
+)
 
 SIMULATORS: dict[str, Callable[..., Demonstrations]] = {"driving": simulate_driving}
 """What records simulated people, by the name of the domain."""
@@ -74,8 +80,10 @@ __all__ = [
     "LearnedReward",
     "Memory",
     "PlanningDrivers",
+    "Start",
     "TaskDrivers",
     "best_sequences",
+    "draw_starts",
     "learn_reward",
     "learned_reward",
     "log_policy",

@@ -29,6 +29,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.domains.driving import (
     CAR_LANES,
@@ -39,7 +40,6 @@ from mirror_ppl.domains.driving import (
     known_car_values,
     lane_rewards,
 )
-from mirror_ppl.people.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.people.maximum_entropy import LearnedReward
 
 HORIZON = 10
@@ -83,6 +83,26 @@ class Memory:
             for field in fields(cls)
         }
         return cls(**parts)
+
+    def canonical(self) -> Memory:
+        """The same knowledge in one form: what means nothing is zero.
+
+        A speed that is not an assumption came from two sights or from speech and is right, so how
+        long ago that was no longer matters.
+        """
+        assumed = self.known & self.assumed
+        return Memory(
+            known=self.known,
+            position=torch.where(self.known, self.position, 0.0),
+            speed=torch.where(self.known, self.speed, 0.0),
+            assumed=assumed,
+            age=torch.where(assumed, self.age, 0.0),
+        )
+
+    def rows(self) -> Tensor:
+        """Everything as whole numbers ``[..., 5 K]``, equal where knowledge is equal."""
+        parts = (self.known, self.position, self.speed, self.assumed, self.age)
+        return torch.cat([part.long() for part in parts], -1)
 
 
 def in_sight(reach: Tensor, position: Tensor, lane: Tensor) -> Tensor:

@@ -1,0 +1,262 @@
+"""`python -m mirror_ppl.assist`: pair communicators with people, and see who helps how much."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mirror_ppl.console import Progress, run
+from mirror_ppl.errors import OptionError, PosteriorError, UnknownNameError
+
+PROGRAM = "python -m mirror_ppl.assist"
+DESCRIPTION = """Let communicators speak to the simulated people of a posterior while they drive,
+and print for each what the people gained, what the messages cost and what they were about. All play
+the same rounds with the same random numbers. With --json or --log, a run that is stopped goes on
+where it was when the same command is given again."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Whom to help, how, and where the results go."""
+
+    posterior: Path = Path("runs/demo/posterior.nc")
+    """A posterior of simulated people, from python -m mirror_ppl.fit (or make demo)."""
+    domain: str = "driving"
+    """The world that the posterior has to be of: driving."""
+    setting: str | None = None
+    """The setting that the posterior has to be of; that of the posterior unless given."""
+    communicator: tuple[str, ...] = ()
+    """One or several of mirror, mirror-self-model, mirror-kl, none, all, random, nearest, oracle;
+    all of them unless given. What each is stands in docs/communicator.md."""
+    rounds: int = 20
+    """Rounds of each person."""
+    people: int | None = None
+    """How many of the people, from the first on; all unless given."""
+    draws: int = 64
+    """Posterior draws that are planned with."""
+    horizon: int = 6
+    """Steps that planners look ahead."""
+    discount: float = 1.0
+    """Worth of a reward one step later, from above 0 to 1."""
+    sure: float = 2.0
+    """How many standard errors of its gain a message has to gain to be sent; 0 is enough for the
+    best on average."""
+    patience: int = 3
+    """Steps over which a message is compared with saying it later; 1 compares with silence only."""
+    branch: float = 0.1
+    """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
+    course a draw."""
+    kl_weight: float = 1.0
+    """Units of reward that mirror-kl gives for a nat."""
+    kl_measure: str = "kl"
+    """What mirror-kl measures: kl, or squared (the distance of means of the released code)."""
+    json: Path | None = None
+    """Write the results as data."""
+    log: Path | None = None
+    """Write every decision with its audit, one JSON object a line."""
+    human_model: str | None = None
+    """The human model that the posterior is of, if it is one of your own: path/to/file.py:Class."""
+    self_model: Path | None = None
+    """Weights of the robot's self-model; those that ship unless given."""
+    population: str | None = None
+    """Who the people are, where the posterior does not say: paper or diverse."""
+    people_seed: int | None = None
+    """The seed that the people were simulated with, where the posterior does not say."""
+    seed: int = 0
+    """Seed of the rounds and of everything random."""
+    jobs: int = 2
+    """Processes that share the work."""
+
+    def __post_init__(self) -> None:
+        for name in ("rounds", "people", "draws", "horizon", "patience", "jobs"):
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                raise OptionError(f"--{name} must be at least 1, not {number}")
+        if not 0 < self.discount <= 1:
+            raise OptionError(f"--discount must be above 0 and at most 1, not {self.discount}")
+        if not 0 <= self.branch <= 1:
+            raise OptionError(f"--branch must be from 0 to 1, not {self.branch}")
+        if not self.sure >= 0:
+            raise OptionError(f"--sure must be at least 0, not {self.sure}")
+        if not self.kl_weight > 0:
+            raise OptionError(f"--kl-weight must be positive, not {self.kl_weight}")
+        if self.kl_measure not in ("kl", "squared"):
+            raise OptionError(f'--kl-measure must be kl or squared, not "{self.kl_measure}"')
+
+
+def main(options: Options) -> None:
+    """Pair, write the results, and print what was found.
+
+    Raises:
+        MirrorError: what was asked for cannot be done; nothing is written then.
+    """
+    from mirror_ppl.evaluation.assistance import COMMUNICATORS, PlannerOptions
+    from mirror_ppl.evaluation.assistance_cells import Pairing, run_cells
+    from mirror_ppl.evaluation.assistance_summary import compare, summarize_assistance
+    from mirror_ppl.files import prepare_output_folder, write_whole
+
+    chosen = options.communicator or COMMUNICATORS
+    for name in chosen:
+        if name not in COMMUNICATORS:
+            raise UnknownNameError.of("communicator", name, COMMUNICATORS)
+    chosen = tuple(name for name in COMMUNICATORS if name in chosen)
+    posterior, source = _people(options)
+    number = len(posterior.people) if options.people is None else options.people
+    if number > len(posterior.people):
+        raise PosteriorError(
+            f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
+        )
+    planner = PlannerOptions(
+        options.horizon,
+        options.discount,
+        options.branch,
+        options.patience,
+        options.sure,
+        options.kl_weight,
+        options.kl_measure,
+    )
+    pairing = Pairing(
+        posterior=options.posterior,
+        human_model=options.human_model,
+        self_model=options.self_model,
+        draws=options.draws,
+        setting=posterior.attributes["setting"],
+        population=source["population"],
+        people_seed=int(source["seed"]),
+        people=len(posterior.people),
+        rounds=options.rounds,
+        planner=planner,
+        seed=options.seed,
+        keep_log=options.log is not None,
+    )
+    pairing.check()
+    for path in (options.json, options.log):
+        if path is not None:
+            prepare_output_folder(path.parent)
+    kept = options.json or options.log
+    parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
+    with Progress("assist", number * len(chosen)) as progress:
+        played = run_cells(pairing, chosen, number, options.jobs, parts, progress.update)
+    horizon = pairing.domain.horizon
+    summary = summarize_assistance(played, horizon, options.seed)
+    results: dict[str, Any] = {
+        "command": PROGRAM,
+        "options": {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in asdict(options).items()
+            if name not in ("json", "log", "jobs")
+        },
+        "posterior": dict(posterior.attributes),
+        "communicators": summary,
+    }
+    if "mirror" in played:
+        results["mirror_above"] = {
+            name: compare(played, "mirror", name, options.seed)
+            for name in played
+            if name != "mirror"
+        }
+    if options.json is not None:
+        text = json.dumps(results, indent=1) + "\n"
+        write_whole(options.json, lambda temporary: temporary.write_text(text))
+    if options.log is not None:
+        lines = [
+            json.dumps({"communicator": name, "person": posterior.people[person]} | entry) + "\n"
+            for name, people in played.items()
+            for person, one in enumerate(people)
+            for entry in one.log
+        ]
+        write_whole(options.log, lambda temporary: temporary.write_text("".join(lines)))
+    if parts is not None:
+        pairing.forget(parts)
+    _show(summary, posterior.attributes, number, options.rounds)
+    for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
+        if path is not None:
+            print(f"{path}: {what}")
+
+
+def _people(options: Options):
+    """The posterior, and what its people were simulated with."""
+    from mirror_ppl.domains import get_domain, require_known
+    from mirror_ppl.inference.posterior_file import load_posterior
+    from mirror_ppl.people import POPULATIONS
+
+    settings = get_domain(options.domain).settings
+    if options.setting is not None:
+        require_known(options.setting, "setting", settings)
+    posterior = load_posterior(options.posterior, options.domain)
+    own = posterior.attributes.get("setting", "unknown")
+    if options.setting not in (None, own):
+        raise PosteriorError(
+            f"{options.posterior}: is of people in the setting {own}, not {options.setting}"
+        )
+    require_known(own, "setting", settings)
+    source: dict[str, Any] = {
+        "population": posterior.attributes.get("recorded_population", options.population),
+        "seed": posterior.attributes.get("recorded_seed", options.people_seed),
+    }
+    if options.population is not None:
+        source["population"] = options.population
+    if options.people_seed is not None:
+        source["seed"] = options.people_seed
+    if None in source.values():
+        raise PosteriorError(
+            f"{options.posterior}: does not say which simulated people it is of; give --population "
+            "and --people-seed (people who were recorded are assisted from Python, see "
+            "docs/communicator.md)"
+        )
+    require_known(source["population"], "population", tuple(POPULATIONS))
+    return posterior, source
+
+
+def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, rounds: int) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        title=f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds "
+        "each",
+        caption="rewards a round; [90% interval], paired; shown, said: items a step; course: share "
+        "of items about cars on a collision course, closing: about cars closing in",
+        title_justify="left",
+        caption_justify="left",
+    )
+    columns = ["task", "cost", "net", "above none", "way to oracle", "collisions"]
+    first = next(iter(summary.values()))
+    columns += [*first["items"], *(name.split("_")[-1] for name in first["relevant"]), "ms"]
+    table.add_column("communicator")
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
+    for name, entry in summary.items():
+        error = "" if entry["net_se"] is None else f" ±{entry['net_se']:.2f}"
+        table.add_row(
+            name,
+            f"{entry['task']:.2f}",
+            f"{entry['cost']:.2f}",
+            f"{entry['net']:.2f}{error}",
+            _interval(entry.get("over_none"), 1, "+.2f"),
+            _interval(entry.get("way_to_oracle"), 100, ".0f", "%"),
+            f"{entry['collisions']:.2f}",
+            *(f"{value:.2f}" for value in entry["items"].values()),
+            *(
+                "-" if share["all"] is None else f"{100 * share['all']:.0f}%"
+                for share in entry["relevant"].values()
+            ),
+            f"{entry['milliseconds']:.1f}",
+        )
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=150)
+    console.print(table)
+
+
+def _interval(value: dict[str, float] | None, scale: float, form: str, unit: str = "") -> str:
+    if value is None:
+        return "-"
+    mean, low, high = (format(scale * value[name], form) for name in ("mean", "low", "high"))
+    return f"{mean}{unit} [{low}, {high}]"
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(Options, main, prog=PROGRAM, description=DESCRIPTION))

@@ -1,0 +1,245 @@
+"""The communicator: what to tell this person now, and why.
+
+It is a function of the round so far and keeps nothing between calls, so any simulator or robot can
+drive it step by step::
+
+    communicator = Communicator(person, ExpectedUtility(SelfModelWorld(human.self_model)))
+    decision = communicator.plan(round_so_far)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.communication.messages import Channels, Message
+from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.objectives import Objective, Valued
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.communication.search import Automatic, Found, Search
+from mirror_ppl.domains.base import Domain, Observation, Visibility
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+INTERVAL = 1.645
+"""Standard errors on either side of a mean that hold it with a probability of 90%."""
+TIE = 1e-6
+"""Gains up to this, in units of reward, count as none."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """By how much a message is better than silence, in units of reward, its cost taken off.
+
+    Attributes:
+        mean: over posterior draws.
+        standard_error: of that mean.
+        probability: share of the draws in which the message is better.
+    """
+
+    mean: float
+    standard_error: float
+    probability: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """90% interval of the mean."""
+        width = INTERVAL * self.standard_error
+        return self.mean - width, self.mean + width
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.mean:+.2f} [{low:+.2f}, {high:+.2f}]"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A message, and why it was chosen.
+
+    Attributes:
+        message: what to communicate now.
+        flags: the same as flags ``[N]``.
+        gain: over silence.
+        domain: the world of the round.
+        observation: what there was to observe, ``[E]`` and ``[K, F]``.
+        found: the candidates that were compared; ``None`` where there was nothing to choose.
+        chosen: which of them this is.
+    """
+
+    message: Message
+    flags: Tensor
+    gain: Gain
+    domain: Domain
+    observation: Observation
+    found: Found | None
+    chosen: int
+
+    @property
+    def told(self) -> Visibility:
+        """The message as masks ``[K]`` by modality."""
+        return Channels(self.domain).split(self.flags)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the message in units of reward."""
+        return float(Channels(self.domain).cost(self.flags))
+
+    @cached_property
+    def alternatives(self) -> pd.DataFrame:
+        """Every candidate with its gain over silence, the best first.
+
+        Columns: ``message`` (for now), ``later`` (items in the steps after, where sequences were
+        searched), ``cost`` (of the message for now), ``gain``, ``low``, ``high`` (90% interval),
+        ``probability`` (share of draws in which it is better than silence), ``chosen``, and
+        ``p(action)``, the predicted probability of each action now.
+        """
+        import pandas as pd
+
+        channels = Channels(self.domain)
+        if self.found is None:
+            candidates, valued = self.flags[None, None], None
+        else:
+            candidates, valued = self.found.candidates, self.found.valued
+        rows: list[dict[str, Any]] = []
+        for index, candidate in enumerate(candidates):
+            gain = Gain(0.0, 0.0, 0.0) if valued is None else gain_over_silence(valued, index)
+            row: dict[str, Any] = {
+                "message": str(channels.message(candidate[0])),
+                "later": int(candidate[1:].sum()),
+                "cost": float(channels.cost(candidate[0])),
+                "gain": gain.mean,
+                "low": gain.interval[0],
+                "high": gain.interval[1],
+                "probability": gain.probability,
+                "chosen": index == self.chosen,
+            }
+            if valued is not None and valued.actions is not None:
+                chances = valued.actions[index, 0].tolist()
+                row |= {
+                    f"p({action})": chance
+                    for action, chance in zip(self.domain.actions, chances, strict=True)
+                }
+            rows.append(row)
+        return pd.DataFrame(rows).sort_values("gain", ascending=False, kind="stable")
+
+    @cached_property
+    def matters(self) -> dict[tuple[str, str], float]:
+        """What each communicated item adds: the gain that is lost when it alone is left out.
+
+        Items of which the message without them was not among the candidates are left out.
+        """
+        if self.found is None or self.chosen == 0:
+            return {}
+        candidates, valued = self.found.candidates, self.found.valued
+        mean = valued.utility.mean(-1)
+        mine = candidates[self.chosen]
+        result = {}
+        for place, pair in enumerate(Channels(self.domain).pairs):
+            if not mine[0, place]:
+                continue
+            without = mine.clone()
+            without[0, place] = False
+            same = (candidates == without).flatten(1).all(1).nonzero()
+            if len(same):
+                result[pair] = float(mean[self.chosen] - mean[same[0, 0]])
+        return result
+
+    @property
+    def turning_point(self) -> tuple[int, int, float, float] | None:
+        """Where the message changes most: step ahead, action, probability without and with it."""
+        if self.found is None or self.chosen == 0 or self.found.valued.actions is None:
+            return None
+        silent, told = self.found.valued.actions[0], self.found.valued.actions[self.chosen]
+        silent, told = (each / each.sum(-1, keepdim=True) for each in (silent, told))
+        # Of the actions that the message makes less probable.
+        place = int((silent - told).argmax())
+        step, action = divmod(place, silent.shape[-1])
+        return step, action, float(silent[step, action]), float(told[step, action])
+
+    def why(self) -> str:
+        """The decision in a sentence that a person understands."""
+        if not self.message:
+            return "silence: nothing that could be told is worth its cost"
+        ranked = sorted(self.message, key=lambda pair: -self.matters.get(pair, 0.0))
+        about = [self.domain.describe(self.observation, *pair) for pair in ranked]
+        text = ", and ".join(dict.fromkeys(about))
+        turn = self.turning_point
+        if turn is None:
+            return f"{text}: brings what they believe closer to what is so"
+        step, action, without, told = turn
+        deed = self.domain.deed(self.observation, ranked[0][1], action)
+        when = "" if step == 0 else f" in {step} step{'s' * (step > 1)}"
+        return f"{text}: they would {deed}{when} with probability {without:.2f}; told, {told:.2f}"
+
+
+@dataclass(frozen=True)
+class Communicator:
+    """Plans messages for one person.
+
+    Attributes:
+        person: posterior draws of the human model.
+        objective: what messages are for.
+        search: how candidates are found.
+        sure: how many standard errors of its gain a message has to gain; 0 takes whatever is
+            best on average.
+        seed: of everything random; the same seed and round give the same decision.
+    """
+
+    person: Person
+    objective: Objective
+    search: Search = Automatic()
+    sure: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.sure < 0:
+            raise ValueError(f"sure must be at least 0, not {self.sure}")
+
+    @torch.no_grad()
+    def plan(self, past: RoundSoFar) -> Decision:
+        """What to communicate now.
+
+        Silence is chosen where no message gains enough, and when the round is over.
+        """
+        domain = self.person.human.domain
+        channels = Channels(domain)
+        now = past.now
+        allowed = channels.join(domain.communicable(now))
+        steps_left = domain.horizon - past.time
+        if steps_left < 1 or not allowed.any():
+            silence = torch.zeros_like(allowed)
+            return Decision(
+                channels.message(silence), silence, Gain(0.0, 0.0, 0.0), domain, now, None, 0
+            )
+        seed = self.seed * (domain.horizon + 1) + past.time
+        value = self.objective.at(self.person, past, steps_left, seed)
+        found = self.search(value, allowed, seed)
+        chosen = choose(found.valued, self.sure)
+        flags = found.candidates[chosen, 0]
+        gain = gain_over_silence(found.valued, chosen)
+        return Decision(channels.message(flags), flags, gain, domain, now, found, chosen)
+
+
+def choose(valued: Valued, sure: float) -> int:
+    """The candidate whose gain over silence is largest after ``sure`` standard errors of it.
+
+    Silence, candidate 0, where none gains anything; of equally good ones the first.
+    """
+    gain = valued.utility - valued.utility[:1]
+    least = gain.mean(-1)
+    if gain.shape[-1] > 1:
+        least = least - sure * gain.std(-1) / gain.shape[-1] ** 0.5
+    best = int(least.argmax())
+    return best if float(least[best]) > TIE else 0
+
+
+def gain_over_silence(valued: Valued, index: int) -> Gain:
+    """The gain of a candidate."""
+    gain = valued.utility[index] - valued.utility[0]
+    spread = float(gain.std()) if len(gain) > 1 else 0.0
+    return Gain(float(gain.mean()), spread / len(gain) ** 0.5, float((gain > TIE).float().mean()))

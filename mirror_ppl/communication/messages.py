@@ -1,0 +1,111 @@
+"""Messages: which items are shown and said in one step, and what that costs.
+
+A message is a set of items of the domain's modalities. Planners handle many at once as *flags*:
+boolean ``[..., N]``, one for each item of each modality in the order of the domain. What the
+letters mean stands in `mirror_ppl.domains.base`; beside them N is the number of all items.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Domain, Visibility, require_known
+
+
+@dataclass(frozen=True)
+class Message:
+    """What is communicated in one step.
+
+    Attributes:
+        items: names of the communicated items by modality; every modality is there.
+    """
+
+    items: Mapping[str, tuple[str, ...]]
+
+    def __iter__(self) -> Iterator[tuple[str, str]]:
+        """Pairs of modality and item."""
+        return ((name, item) for name, items in self.items.items() for item in items)
+
+    def __len__(self) -> int:
+        return sum(map(len, self.items.values()))
+
+    def __bool__(self) -> bool:
+        """Whether anything is communicated."""
+        return len(self) > 0
+
+    def __str__(self) -> str:
+        if not self:
+            return "silence"
+        return "; ".join(
+            f"{name}: {', '.join(items)}" for name, items in self.items.items() if items
+        )
+
+
+class Channels:
+    """The layout of flags, written once: which flag is which item of which modality.
+
+    Args:
+        domain: whose modalities they are.
+    """
+
+    def __init__(self, domain: Domain) -> None:
+        self.modalities = domain.modalities
+        self.sizes = [len(modality.items) for modality in domain.modalities]
+        self.pairs = [(m.name, item) for m in domain.modalities for item in m.items]
+
+    def __len__(self) -> int:
+        """Number of all items N."""
+        return len(self.pairs)
+
+    def split(self, flags: Tensor) -> Visibility:
+        """Masks ``[..., K]`` by modality of flags ``[..., N]``."""
+        parts = flags.split(self.sizes, -1)
+        return {m.name: part for m, part in zip(self.modalities, parts, strict=True)}
+
+    def join(self, masks: Visibility) -> Tensor:
+        """Flags ``[..., N]`` of masks ``[..., K]`` by modality."""
+        return torch.cat([masks[modality.name] for modality in self.modalities], -1)
+
+    def cost(self, flags: Tensor) -> Tensor:
+        """Cost ``[...]`` in units of reward of messages ``[..., N]`` (supplement, Table I)."""
+        masks = self.split(flags)
+        costs = [modality.cost(masks[modality.name].sum(-1)) for modality in self.modalities]
+        return torch.stack(costs).sum(0)
+
+    def message(self, flags: Tensor) -> Message:
+        """The message of flags ``[N]``."""
+        chosen = [pair for pair, flag in zip(self.pairs, flags.tolist(), strict=True) if flag]
+        return Message(
+            {
+                modality.name: tuple(item for name, item in chosen if name == modality.name)
+                for modality in self.modalities
+            }
+        )
+
+    def flags(self, items: Mapping[str, tuple[str, ...] | list[str]]) -> Tensor:
+        """Flags ``[N]`` of named items by modality, as in :attr:`Message.items`.
+
+        Raises:
+            UnknownNameError: there is no such modality or item.
+        """
+        flags = torch.zeros(len(self), dtype=torch.bool)
+        for name, chosen in items.items():
+            require_known(name, "modality", tuple(modality.name for modality in self.modalities))
+            known = tuple(item for modality, item in self.pairs if modality == name)
+            for item in chosen:
+                flags[self.pairs.index((name, require_known(item, f"{name} item", known)))] = True
+        return flags
+
+
+def every_message(allowed: Tensor) -> Tensor:
+    """All messages ``[C, N]`` of the allowed items ``[N]``, silence first."""
+    places = allowed.nonzero().squeeze(-1)
+    numbers = torch.arange(2 ** len(places), device=allowed.device)
+    bits = (numbers[:, None] >> torch.arange(len(places), device=allowed.device)) & 1
+    messages = allowed.new_zeros(len(numbers), len(allowed))
+    messages[:, places] = bits.bool()
+    return messages

@@ -1,0 +1,284 @@
+"""What the person may believe: posterior draws of a human model, carried through a round.
+
+Beliefs depend on perceptual implants alone, and draws of these repeat; so a belief is worked out
+once for each distinct *eye*, the values of the discrete sites, and once for each distinct thing
+that such an eye may have seen. U stands for distinct eyes, n for beliefs that are tracked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Protocol
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.distinct import distinct_rows
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.models.sites import latent_sites
+
+
+class Person:
+    """A human model with posterior draws of one person's implants.
+
+    Args:
+        human: the model of people.
+        draws: values ``[S, 1, 1, ...]`` of all its sites.
+
+    Attributes:
+        eyes: values ``[U]`` of the discrete sites, each combination that occurs in the draws once.
+        eye: which of them each draw has, ``[S]``.
+
+    Raises:
+        HumanModelError: there are no draws, or they are not those of the model's sites.
+    """
+
+    def __init__(self, human: HumanModel, draws: Mapping[str, Tensor]) -> None:
+        self.human = human
+        self.draws = dict(draws)
+        if not draws or min(len(value) for value in draws.values()) == 0:
+            raise HumanModelError("planning needs at least one posterior draw")
+        self.number = len(next(iter(draws.values())))
+        with torch.no_grad(), self._conditioned(), poutine.trace() as trace:
+            self.implants = human.prior()
+        missing = latent_sites(trace.trace)
+        if missing:
+            raise HumanModelError(f"there are no draws of the site {', '.join(missing)}")
+        sites = [
+            name
+            for name, site in trace.trace.nodes.items()
+            if name in draws and site["fn"].has_enumerate_support
+        ]
+        device = next(iter(draws.values())).device
+        rows = torch.stack(
+            [draws[name].reshape(self.number).long() for name in sites]
+            or [torch.zeros(self.number, dtype=torch.long, device=device)],
+            -1,
+        )
+        first, self.eye = distinct_rows(rows)
+        self.eyes = {name: draws[name].reshape(self.number)[first] for name in sites}
+        self.eye_count = len(first)
+
+    def _conditioned(self) -> ExitStack:
+        stack = ExitStack()
+        stack.enter_context(poutine.block())
+        stack.enter_context(poutine.condition(data=self.draws))
+        stack.enter_context(pyro.plate("draw", self.number, dim=-3))
+        stack.enter_context(pyro.plate("person", 1, dim=-2))
+        return stack
+
+    def see(self, eye: Tensor, observation: Observation, told: Visibility) -> View:
+        """What eyes ``[n]`` see of rounds ``[n, T, ...]``."""
+        implants = {name: value[eye] for name, value in self.eyes.items()}
+        view = self.human.perceive(implants, observation, told)
+        shape = observation["ego"].shape[:2]
+        return View(_expanded(view.visible, shape), _expanded(view.absent, shape))
+
+    def act(self, belief: Tensor, values: Tensor) -> Tensor:
+        """Log-probabilities of the last action ``[S, M, A]`` of M beliefs of each draw.
+
+        Args:
+            belief: ``[S, M, T, Z]``.
+            values: the self-model's action values there, ``[S, M, T, A]``.
+        """
+        with self._conditioned():
+            result = self.human.act(self.implants, belief[:, None], values[:, None])
+        return result[:, 0, :, -1]
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What g looks at the world are: whose, at what, after what.
+
+    Attributes:
+        parent: the belief before, ``[g]``, an index into those of the step before.
+        eye: ``[g]``.
+        action: what was done since, ``[g]``; the number of actions at the start of a round.
+        row: which of the observations is looked at, ``[g]``.
+        observation: the observations, ``[rows, ...]``.
+        told: what is communicated, ``[g, K]`` by modality.
+    """
+
+    parent: Tensor
+    eye: Tensor
+    action: Tensor
+    row: Tensor
+    observation: Observation
+    told: Visibility
+
+
+class Beliefs(Protocol):
+    """Beliefs of one step.
+
+    Attributes:
+        courses: beliefs up to this step ``[n, T, Z]``; of stepwise models only the last, T = 1.
+    """
+
+    @property
+    def courses(self) -> Tensor:
+        """See above."""
+        ...
+
+    def after(self, looks: Looks) -> tuple[Beliefs, Tensor]:
+        """Beliefs of the next step, and which of them each look leads to ``[g]``."""
+        ...
+
+
+def beliefs_before(person: Person, past: RoundSoFar) -> tuple[Beliefs, Tensor]:
+    """What may be believed before a look at the present step, and each eye's belief ``[U]``."""
+    if person.human.stepwise:
+        return StepwiseBeliefs.before(person, past)
+    return CourseBeliefs.before(person, past)
+
+
+@dataclass(frozen=True)
+class StepwiseBeliefs:
+    """Beliefs of human models in which each step follows from the one before.
+
+    Attributes:
+        person: whose they are.
+        state: ``q(zH_t | ...)``, parameters ``[n, Z]``; beliefs are the means.
+        unknown: what was never seen or told of, ``[n, K]`` by modality.
+    """
+
+    person: Person
+    state: Gaussian
+    unknown: Visibility
+
+    @property
+    def courses(self) -> Tensor:
+        """The last belief, ``[n, 1, Z]``."""
+        return self.state.mean[:, None]
+
+    @classmethod
+    def before(cls, person: Person, past: RoundSoFar) -> tuple[StepwiseBeliefs, Tensor]:
+        """See :func:`beliefs_before`; eyes that saw the same so far share a belief."""
+        human = person.human
+        if past.time == 0:
+            zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
+            unknown = {
+                m.name: torch.ones(1, len(m.items), dtype=torch.bool, device=zero.device)
+                for m in human.domain.modalities
+            }
+            state = Gaussian(zero, torch.ones_like(zero))
+            return cls(person, state, unknown), torch.zeros_like(person.eye[: person.eye_count])
+        eyes = torch.arange(person.eye_count, device=person.eye.device)
+        observation, told, actions = _history(past, len(eyes))
+        view = person.see(eyes, observation, told)
+        masks = torch.cat([*view.visible.values(), *view.absent.values()], -1)
+        first, which = distinct_rows(masks.flatten(1).long())
+        view = View(_rows(view.visible, first), _rows(view.absent, first))
+        mean = human.believe(view, _rows(observation, first), actions[first])[:, -1]
+        unknown = human.domain.unknown_so_far(view.visible)
+        return cls(
+            person,
+            Gaussian(mean, torch.ones_like(mean)),
+            {name: mask[:, -1] for name, mask in unknown.items()},
+        ), which
+
+    def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
+        """See :class:`Beliefs`; looks that tell the same lead to one belief."""
+        human = self.person.human
+        seen = {name: value[looks.row][:, None] for name, value in looks.observation.items()}
+        told = {name: mask[:, None] for name, mask in looks.told.items()}
+        view = self.person.see(looks.eye, seen, told)
+        unknown = {
+            name: mask[:, 0] & self.unknown[name][looks.parent]
+            for name, mask in human.domain.unknown_so_far(view.visible).items()
+        }
+        visible = {name: mask[:, 0] for name, mask in view.visible.items()}
+        # Of a single step everything unseen counts as unknown so far; the steps before know better.
+        absent = {name: mask[:, 0] & unknown[name] for name, mask in view.absent.items()}
+        masks = torch.cat([*visible.values(), *absent.values()], -1).long()
+        told_by, which = distinct_rows(torch.cat([looks.row[:, None], masks], -1))
+        rows = looks.row[told_by]
+        evidence = human.evidence(
+            View(_rows(visible, told_by), _rows(absent, told_by)), _rows(looks.observation, rows)
+        )
+        known = torch.cat([mask.long() for mask in unknown.values()], -1)
+        first, index = distinct_rows(
+            torch.cat([torch.stack([looks.parent, looks.action, which], -1), known], -1)
+        )
+        state = human.advance(
+            self.state.mean[looks.parent[first]], evidence[which[first]], looks.action[first]
+        )
+        return StepwiseBeliefs(self.person, state, _rows(unknown, first)), index
+
+
+@dataclass(frozen=True)
+class CourseBeliefs:
+    """Beliefs of any human model: every round is gone through again from its beginning.
+
+    Attributes:
+        person: whose they are.
+        observation: rounds up to this step ``[n, T, ...]``; T may be 0.
+        told: ``[n, T, K]``.
+        actions: before each of these steps but the first, ``[n, T - 1]``.
+        courses: ``[n, T, Z]``.
+    """
+
+    person: Person
+    observation: Observation
+    told: Visibility
+    actions: Tensor
+    courses: Tensor
+
+    @classmethod
+    def before(cls, person: Person, past: RoundSoFar) -> tuple[CourseBeliefs, Tensor]:
+        """See :func:`beliefs_before`."""
+        observation, told, actions = _history(past, person.eye_count)
+        nothing = next(person.human.parameters()).new_zeros(person.eye_count, 0, 0)
+        beliefs = cls(person, observation, told, actions[:, : max(past.time - 1, 0)], nothing)
+        return beliefs, torch.arange(person.eye_count, device=person.eye.device)
+
+    def after(self, looks: Looks) -> tuple[CourseBeliefs, Tensor]:
+        """See :class:`Beliefs`; each look leads to a belief of its own."""
+
+        def longer(before: Tensor, last: Tensor) -> Tensor:
+            return torch.cat([before[looks.parent], last[:, None]], 1)
+
+        observation = {
+            name: longer(self.observation[name], value[looks.row])
+            for name, value in looks.observation.items()
+        }
+        told = {name: longer(self.told[name], mask) for name, mask in looks.told.items()}
+        actions = self.actions
+        if observation["ego"].shape[1] > 1:
+            actions = longer(actions, looks.action)
+        else:
+            actions = actions[looks.parent]
+        # What is done at the last step does not matter to the belief there.
+        done = torch.nn.functional.pad(actions, [0, 1])
+        view = self.person.see(looks.eye, observation, told)
+        courses = self.person.human.believe(view, observation, done)
+        index = torch.arange(len(looks.eye), device=looks.eye.device)
+        return CourseBeliefs(self.person, observation, told, actions, courses), index
+
+
+def _history(past: RoundSoFar, number: int) -> tuple[Observation, Visibility, Tensor]:
+    """The steps before the present one, ``[number, t, ...]``."""
+
+    def repeated(value: Tensor) -> Tensor:
+        return value[: past.time].expand(number, *value[: past.time].shape)
+
+    return (
+        {name: repeated(value) for name, value in past.observation.items()},
+        {name: repeated(mask) for name, mask in past.told.items()},
+        repeated(past.actions),
+    )
+
+
+def _rows(masks: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    return {name: mask[rows] for name, mask in masks.items()}
+
+
+def _expanded(masks: Mapping[str, Tensor], shape: torch.Size) -> dict[str, Tensor]:
+    return {name: mask.expand(*shape, mask.shape[-1]) for name, mask in masks.items()}

@@ -1,0 +1,294 @@
+"""What messages are worth: objectives that map candidates to utilities, one for each draw.
+
+A candidate is a sequence of messages ``[L, N]``: the first is for now, the others for the steps
+that follow, and after L steps nothing is said. C candidates are valued at once, under the same
+random numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.communication.messages import Channels
+from mirror_ppl.communication.minds import Beliefs, Looks, Person, beliefs_before
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.communication.worlds import World, robot_belief
+from mirror_ppl.errors import HumanModelError
+
+
+@dataclass(frozen=True)
+class Valued:
+    """What candidates are worth.
+
+    Attributes:
+        utility: of each candidate under each posterior draw, in units of reward, ``[C, S]``.
+        actions: predicted probabilities of actions at each step ahead, ``[C, H, A]``; ``None``
+            where the objective does not look at actions.
+    """
+
+    utility: Tensor
+    actions: Tensor | None
+
+
+Value = Callable[[Tensor], Valued]
+"""Values candidates ``[C, L, N]``; the same candidates always get the same values."""
+
+
+class Objective(Protocol):
+    """What a communicator wants."""
+
+    def at(self, person: Person, past: RoundSoFar, steps_left: int, seed: int) -> Value:
+        """What candidates are worth at this point of a round.
+
+        Args:
+            person: posterior draws of the human model.
+            past: the round so far.
+            steps_left: how many actions are left, at least 1.
+            seed: of the random numbers that all candidates share.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ExpectedUtility:
+    """``U(c) = E[ sum_{h<H} discount^h ( r_{t+h} - cost(c_{t+h}) ) ]``.
+
+    The expectation is over posterior draws, draws of the world, and the person's actions. Of the
+    latter it is a tree in which branches less probable than ``branch`` are kept by chance, with a
+    weight that makes up for it: at 0 the expectation over actions is exact, at 1 each draw follows
+    a single course of actions. In between, what is probable is exact and the improbable cheap, and
+    the expectation is right at every value.
+
+    Attributes:
+        world: what is rolled forward.
+        horizon: steps H that are looked ahead.
+        discount: per step.
+        branch: probability of a course of actions below which it is kept by chance.
+    """
+
+    world: World
+    horizon: int = 6
+    discount: float = 1.0
+    branch: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1:
+            raise ValueError(f"horizon must be at least 1, not {self.horizon}")
+        if not 0 < self.discount <= 1:
+            raise ValueError(f"discount must be above 0 and at most 1, not {self.discount}")
+        if not 0 <= self.branch <= 1:
+            raise ValueError(f"branch must be from 0 to 1, not {self.branch}")
+
+    def at(self, person: Person, past: RoundSoFar, steps_left: int, seed: int) -> Value:
+        """See :class:`Objective`."""
+        horizon = min(self.horizon, steps_left)
+        device = past.actions.device
+        generator = torch.Generator(device).manual_seed(seed)
+        futures = self.world.futures(past, horizon, generator)
+        number = len(person.human.domain.actions)
+        luck = [
+            torch.rand(person.number, number**step, generator=generator, device=device)
+            for step in range(horizon)
+        ]
+        before = beliefs_before(person, past)
+        channels = Channels(person.human.domain)
+        discounts = self.discount ** torch.arange(horizon, device=device)
+
+        @torch.no_grad()
+        def value(candidates: Tensor) -> Valued:
+            tree = _Tree(person, past, candidates, self.world.draws, before)
+            count = len(candidates)
+            utility = torch.zeros(count * person.number, device=device)
+            predicted = torch.zeros(count, horizon, number, device=device)
+            for step in range(horizon):
+                observation = {
+                    name: part.flatten(0, 1) for name, part in futures.observations[step].items()
+                }
+                told = candidates[:, step] if step < candidates.shape[1] else None
+                chances = tree.act(observation, told, channels)
+                gained = futures.rewards[step].unflatten(1, (-1, number))[
+                    tree.draw_of_world(), tree.path
+                ]
+                utility.index_add_(
+                    0,
+                    tree.candidate * person.number + tree.draw,
+                    discounts[step] * (chances * gained).sum(-1),
+                )
+                predicted[:, step].index_add_(0, tree.candidate, chances / person.number)
+                if step < horizon - 1:
+                    tree.branch(chances, luck[step], self.branch)
+            steps = min(candidates.shape[1], horizon)
+            cost = (channels.cost(candidates)[:, :steps] * discounts[:steps]).sum(1)
+            return Valued(utility.view(count, person.number) - cost[:, None], predicted)
+
+        return value
+
+
+class _Tree:
+    """Courses of actions of each candidate and draw, sorted by draw; E courses in all.
+
+    Attributes:
+        candidate, draw, path, weight: of each course ``[E]``.
+        belief: what the person believes on it ``[E]``, an index into ``beliefs``.
+        beliefs: of the last step that was looked at.
+    """
+
+    def __init__(
+        self,
+        person: Person,
+        past: RoundSoFar,
+        candidates: Tensor,
+        worlds: int,
+        before: tuple[Beliefs, Tensor],
+    ) -> None:
+        device = candidates.device
+        self.person = person
+        self.worlds = worlds
+        self.actions = len(person.human.domain.actions)
+        count = len(candidates)
+        self.draw = torch.arange(person.number, device=device).repeat_interleave(count)
+        self.candidate = torch.arange(count, device=device).repeat(person.number)
+        self.path = torch.zeros_like(self.draw)
+        self.weight = torch.ones(len(self.draw), device=device)
+        self.beliefs, belief = before
+        self.belief = belief[person.eye[self.draw]]
+        last = past.actions[-1] if past.time else self.actions
+        self.last = torch.full_like(self.draw, int(last))
+        self.paths = 1
+
+    def draw_of_world(self) -> Tensor:
+        """Which draw of the world each course is in, ``[E]``."""
+        return self.draw % self.worlds
+
+    def act(self, observation, told: Tensor | None, channels: Channels) -> Tensor:
+        """Look at the world and choose: weights ``[E, A]`` of each course and its next action."""
+        row = self.draw_of_world() * self.paths + self.path
+        eye = self.person.eye[self.draw]
+        message = self.candidate if told is not None else torch.zeros_like(self.candidate)
+        key = (self.belief * self.person.eye_count + eye) * (int(row.max()) + 1) + row
+        key = key * (int(self.candidate.max()) + 1) + message
+        _, look = torch.unique(key, return_inverse=True)
+        first = torch.full((int(look.max()) + 1,), len(key), device=key.device)
+        first.scatter_reduce_(0, look, torch.arange(len(key), device=key.device), "amin")
+        if told is None:
+            flags = torch.zeros(len(first), len(channels), dtype=torch.bool, device=key.device)
+        else:
+            flags = told[message[first]]
+        looks = Looks(
+            parent=self.belief[first],
+            eye=eye[first],
+            action=self.last[first],
+            row=row[first],
+            observation=observation,
+            told=channels.split(flags),
+        )
+        self.beliefs, index = self.beliefs.after(looks)
+        self.belief = index[look]
+        courses = self.beliefs.courses
+        values = self.person.human.self_model.action_values(courses)
+        # Courses of a draw share its policy implants: one row a draw, padded to the longest.
+        counts = torch.bincount(self.draw, minlength=self.person.number)
+        begin = counts.cumsum(0) - counts
+        place = torch.arange(len(self.draw), device=key.device) - begin[self.draw]
+        padded = torch.zeros(len(counts), int(counts.max()), dtype=torch.long, device=key.device)
+        padded[self.draw, place] = self.belief
+        log_chances = self.person.act(courses[padded], values[padded])[self.draw, place]
+        return self.weight[:, None] * log_chances.exp()
+
+    def branch(self, chances: Tensor, luck: Tensor, threshold: float) -> None:
+        """Go on to the courses of one action more.
+
+        Args:
+            chances: their weights ``[E, A]``.
+            luck: uniform numbers ``[S, paths]``.
+            threshold: see :class:`ExpectedUtility`.
+        """
+        weight = chances
+        if threshold > 0:
+            small = chances < threshold
+            # Systematic: the improbable siblings share one number, so that exactly as many are
+            # kept as their weights ask for, give or take a fraction.
+            total = torch.where(small, chances, 0.0).cumsum(-1) / threshold
+            shifted = total + luck[self.draw, self.path][:, None]
+            passed = shifted.floor()
+            before = torch.cat([torch.zeros_like(passed[:, :1]), passed[:, :-1]], -1)
+            weight = torch.where(small, threshold * (passed - before), chances)
+        course, action = (weight > 0).nonzero(as_tuple=True)
+        self.weight = weight[course, action]
+        self.path = self.path[course] * self.actions + action
+        self.last = action
+        self.candidate, self.draw = self.candidate[course], self.draw[course]
+        self.belief = self.belief[course]
+        self.paths *= self.actions
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """``U(c) = - weight * KL( q(z^R_t) || q(zH_t | c) ) - cost(c_t)``: MIRROR-KL.
+
+    Brings the person's belief close to the robot's, without a look at rewards. Only the message of
+    the present step counts.
+
+    Attributes:
+        weight: units of reward that a nat of divergence is worth.
+        measure: ``kl``, or ``squared``, the squared distance of the means that the authors'
+            released code has in its place.
+    """
+
+    weight: float = 1.0
+    measure: str = "kl"
+
+    def __post_init__(self) -> None:
+        if self.measure not in ("kl", "squared"):
+            raise ValueError(f'measure must be kl or squared, not "{self.measure}"')
+        if not self.weight > 0:
+            raise ValueError(f"weight must be positive, not {self.weight}")
+
+    def at(self, person: Person, past: RoundSoFar, steps_left: int, seed: int) -> Value:
+        """See :class:`Objective`; steps left and seed do not matter.
+
+        Raises:
+            HumanModelError: the human model is not stepwise, so its belief has no density.
+        """
+        if not person.human.stepwise:
+            raise HumanModelError(
+                f"{type(person.human).__name__} is not stepwise, and its beliefs have no density "
+                "to compare; see HumanModel.stepwise"
+            )
+        channels = Channels(person.human.domain)
+        robot = robot_belief(person.human.self_model, past)
+        before, own = beliefs_before(person, past)
+        now = {name: value[None] for name, value in past.now.items()}
+        last = int(past.actions[-1]) if past.time else len(person.human.domain.actions)
+
+        @torch.no_grad()
+        def value(candidates: Tensor) -> Valued:
+            eyes = person.eye_count
+            told = candidates[:, 0].repeat_interleave(eyes, 0)
+            eye = torch.arange(eyes, device=told.device).repeat(len(candidates))
+            looks = Looks(
+                parent=own[eye],
+                eye=eye,
+                action=torch.full_like(eye, last),
+                row=torch.zeros_like(eye),
+                observation=now,
+                told=channels.split(told),
+            )
+            beliefs, index = before.after(looks)
+            apart = self._apart(robot, beliefs.state)[index]  # pyright: ignore
+            utility = -self.weight * apart.view(len(candidates), eyes)[:, person.eye]
+            return Valued(utility - channels.cost(candidates[:, 0])[:, None], None)
+
+        return value
+
+    def _apart(self, robot, person) -> Tensor:
+        squared = (robot.mean - person.mean).pow(2)
+        if self.measure == "squared":
+            return squared.sum(-1)
+        ratio = (robot.scale / person.scale).pow(2)
+        return 0.5 * (ratio + squared / person.scale.pow(2) - 1 - ratio.log()).sum(-1)

@@ -1,0 +1,171 @@
+"""Finding the message that is worth most: every candidate, or the cross-entropy method.
+
+Search knows nothing of people: it proposes candidates and is told what they are worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.communication.messages import every_message
+from mirror_ppl.communication.objectives import Value, Valued
+from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
+
+MOST_CANDIDATES = 4096
+"""How many candidates are valued one by one; beyond that they are searched."""
+CHUNK = 512
+"""Candidates that are valued at once; bounds memory."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Candidates ``[C, L, N]`` with their values; silence comes first."""
+
+    candidates: Tensor
+    valued: Valued
+
+
+class Search(Protocol):
+    """A way to search."""
+
+    def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
+        """Candidates made of the allowed items ``[N]``, silence first."""
+        ...
+
+
+@dataclass(frozen=True)
+class Exhaustive:
+    """Every message for now, and silence afterwards."""
+
+    def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
+        """See :class:`Search`; the seed is not used."""
+        candidates = every_message(allowed)[:, None]
+        return Found(candidates, in_chunks(value, candidates))
+
+
+@dataclass(frozen=True)
+class Patient:
+    """Every message for now; then, of the best ones, whether they can wait or be split.
+
+    A message that is compared with silence for good is said as soon as it helps. Much of what would
+    help now helps as well a step later, or turns out not to be needed, and items told one by one
+    cost less than together. So the best messages are also valued as plans: the same message 1 to
+    ``steps - 1`` steps later, and each of its items now with the rest in the next step.
+
+    Attributes:
+        steps: length L of the plans.
+        best: how many messages are looked at in this way.
+    """
+
+    steps: int = 4
+    best: int = 6
+
+    def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
+        """See :class:`Search`; the seed is not used."""
+        first = Exhaustive()(value, allowed, seed)
+        mean = first.valued.utility.mean(-1)
+        better = (mean > mean[0]).nonzero().squeeze(-1)
+        if self.steps == 1 or not len(better):
+            return first
+        better = better[mean[better].argsort(descending=True, stable=True)][: self.best]
+        plans = []
+        for message in first.candidates[better, 0]:
+            for delay in range(1, self.steps):
+                plan = allowed.new_zeros(self.steps, len(allowed))
+                plan[delay] = message
+                plans.append(plan)
+            items = message.nonzero().squeeze(-1)
+            for item in items if len(items) > 1 else ():
+                plan = allowed.new_zeros(self.steps, len(allowed))
+                plan[1] = message
+                plan[0, item], plan[1, item] = True, False
+                plans.append(plan)
+        later = torch.stack(plans)
+        valued = in_chunks(value, later)
+        now = torch.nn.functional.pad(first.candidates, [0, 0, 0, self.steps - 1])
+        actions = None
+        if first.valued.actions is not None and valued.actions is not None:
+            actions = torch.cat([first.valued.actions, valued.actions])
+        return Found(
+            torch.cat([now, later]),
+            Valued(torch.cat([first.valued.utility, valued.utility]), actions),
+        )
+
+
+@dataclass(frozen=True)
+class CrossEntropy:
+    """The cross-entropy method over sequences of messages.
+
+    The best sequence found comes with its variations: each of its items left out, and its first
+    message followed by silence.
+
+    Attributes:
+        steps: length L of the sequences.
+        options: how hard to search. A message has few items, so few are tried at the start.
+    """
+
+    steps: int = 1
+    options: CrossEntropyOptions = CrossEntropyOptions(
+        samples=256, elites=32, iterations=6, smoothing=0.5, start_probability=0.15
+    )
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ValueError(f"steps must be at least 1, not {self.steps}")
+
+    def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
+        """See :class:`Search`."""
+        places = allowed.nonzero().squeeze(-1)
+        number = len(places)
+
+        def sequences(bits: Tensor) -> Tensor:
+            candidates = allowed.new_zeros(len(bits), self.steps, len(allowed))
+            candidates[..., places] = bits.view(len(bits), self.steps, number)
+            return candidates
+
+        def mean(bits: Tensor) -> Tensor:
+            distinct, which = torch.unique(bits, dim=0, return_inverse=True)
+            return in_chunks(value, sequences(distinct)).utility.mean(-1)[which]
+
+        generator = torch.Generator(allowed.device).manual_seed(seed)
+        best, _ = best_sequences(mean, (), self.steps * number, generator, self.options)
+        items = best.nonzero().squeeze(-1)
+        without = best.repeat(len(items), 1)
+        without[torch.arange(len(items)), items] = False
+        alone = best.clone()
+        alone[number:] = False
+        bits = torch.cat([torch.zeros_like(best)[None], best[None], alone[None], without])
+        candidates = sequences(bits)
+        return Found(candidates, in_chunks(value, candidates))
+
+
+@dataclass(frozen=True)
+class Automatic:
+    """Every candidate where they are few, else the cross-entropy method.
+
+    Attributes:
+        steps: length L of sequences of messages; 1 plans a message for now alone.
+        most: the largest number of candidates that are valued one by one.
+    """
+
+    steps: int = 1
+    most: int = MOST_CANDIDATES
+
+    def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
+        """See :class:`Search`."""
+        if self.steps == 1 and 2 ** int(allowed.sum()) <= self.most:
+            return Exhaustive()(value, allowed, seed)
+        return CrossEntropy(self.steps)(value, allowed, seed)
+
+
+def in_chunks(value: Value, candidates: Tensor) -> Valued:
+    """Values of many candidates ``[C, L, N]``."""
+    parts = [value(part) for part in candidates.split(CHUNK)]
+    actions = [part.actions for part in parts if part.actions is not None]
+    return Valued(
+        torch.cat([part.utility for part in parts]), torch.cat(actions) if actions else None
+    )

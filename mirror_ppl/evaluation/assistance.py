@@ -1,0 +1,306 @@
+"""Communicators paired with people: who helps how much, at what cost.
+
+Every communicator plays the same rounds with the same random numbers, so that differences between
+them are differences in what they said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mirror_ppl.communication import rules
+from mirror_ppl.communication.communicator import Communicator, Decision
+from mirror_ppl.communication.messages import Channels
+from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.objectives import Divergence, ExpectedUtility
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.communication.search import Patient
+from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld
+from mirror_ppl.domains.base import Domain, total_reward
+from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.evaluation.oracle import Oracle
+from mirror_ppl.inference.experience import map_state
+from mirror_ppl.people.driving import Drivers
+from mirror_ppl.people.populations import derived_generator
+from mirror_ppl.people.recordings import Start
+
+COMMUNICATORS = (
+    "mirror",
+    "mirror-self-model",
+    "mirror-kl",
+    "none",
+    "all",
+    "random",
+    "nearest",
+    "oracle",
+)
+"""Everything that can be paired with people, in the order in which it is shown."""
+RATES_FROM = "mirror"
+"""Whose rate of items ``random`` has."""
+
+
+@dataclass(frozen=True)
+class PlannerOptions:
+    """Settings of the planners.
+
+    Attributes:
+        horizon: steps looked ahead.
+        discount: per step.
+        branch: see :class:`ExpectedUtility`.
+        patience: length of the plans that are compared, see :class:`Patient`.
+        sure: standard errors that a gain must exceed, see :class:`Communicator`.
+        kl_weight: units of reward that mirror-kl gives for a nat.
+        kl_measure: what mirror-kl measures, see :class:`Divergence`.
+    """
+
+    horizon: int = 6
+    discount: float = 1.0
+    branch: float = 0.1
+    patience: int = 3
+    sure: float = 2.0
+    kl_weight: float = 1.0
+    kl_measure: str = "kl"
+
+
+@dataclass(frozen=True)
+class Played:
+    """R rounds of one person with one communicator.
+
+    Attributes:
+        task: reward of the task, ``[R]``.
+        cost: of the messages, ``[R]``.
+        collisions: steps with a collision, ``[R]``.
+        items: communicated items by modality, ``[R]`` each.
+        relevant: those of them that were relevant, by notion of relevance and modality, ``[R]``.
+        chances: items that could have been communicated, by modality, summed over rounds.
+        milliseconds: mean time of a decision.
+        log: what was decided, one entry a decision, if asked for.
+    """
+
+    task: list[float]
+    cost: list[float]
+    collisions: list[int]
+    items: dict[str, list[int]]
+    relevant: dict[str, dict[str, list[int]]]
+    chances: dict[str, int]
+    milliseconds: float
+    log: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def net(self) -> np.ndarray:
+        """Task reward less cost, ``[R]``."""
+        return np.asarray(self.task) - np.asarray(self.cost)
+
+    def rates(self) -> dict[str, float]:
+        """Share of the communicable items that were communicated, by modality."""
+        return {name: sum(items) / max(self.chances[name], 1) for name, items in self.items.items()}
+
+
+Say = Callable[[Sequence[RoundSoFar]], tuple[Tensor, list[Decision] | None]]
+"""What to say in each of R rounds: flags ``[R, N]`` and, of planners, the decisions."""
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Somebody to speak to, and when.
+
+    Attributes:
+        domain: the world.
+        setting: its setting.
+        driver: the person as they are.
+        start: how the rounds ``[1, R]`` begin, and the luck by which the person chooses.
+        person: what was inferred of the person, if anything; planners need it.
+    """
+
+    domain: Domain
+    setting: str
+    driver: Drivers
+    start: Start
+    person: Person | None = None
+
+
+def speaker(
+    name: str,
+    listener: Listener,
+    options: PlannerOptions,
+    seed: int,
+    rates: Mapping[str, float] | None = None,
+) -> Say:
+    """What speaks to one person.
+
+    Args:
+        name: one of ``COMMUNICATORS``.
+        listener: the person, and their rounds.
+        options: settings of the planners.
+        seed: of everything random.
+        rates: for ``random``, how much of what is communicable it communicates.
+
+    Raises:
+        UnknownNameError: there is no such communicator.
+    """
+    domain = listener.domain
+    if name == "oracle":
+        oracle = Oracle(listener.driver, map_state(lambda part: part[0], listener.start.state))
+        return lambda rounds: (oracle.messages(torch.stack([r.actions for r in rounds])), None)
+    if name in ("none", "all", "nearest", "random"):
+        generator = derived_generator(seed, "random messages")
+        rule = {
+            "none": lambda past: rules.nothing(domain, past),
+            "all": lambda past: rules.everything(domain, past),
+            "nearest": lambda past: rules.nearest(domain, past, listener.setting),
+            "random": lambda past: rules.at_random(domain, past, rates or {}, generator),
+        }[name]
+        return lambda rounds: (torch.stack([rule(past) for past in rounds]), None)
+    if name not in COMMUNICATORS:
+        raise UnknownNameError.of("communicator", name, COMMUNICATORS)
+    assert listener.person is not None
+    planner = planner_of(name, listener.person, options, seed)
+
+    def say(rounds: Sequence[RoundSoFar]) -> tuple[Tensor, list[Decision]]:
+        decisions = [planner.plan(past) for past in rounds]
+        return torch.stack([decision.flags for decision in decisions]), decisions
+
+    return say
+
+
+def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
+    """The planner of that name: mirror, mirror-self-model or mirror-kl."""
+    search = Patient(options.patience)
+    if name == "mirror-kl":
+        objective = Divergence(options.kl_weight, options.kl_measure)
+        return Communicator(person, objective, Patient(1), options.sure, seed)
+    world = SimulatorWorld(person.human.domain)
+    if name == "mirror-self-model":
+        world = SelfModelWorld(person.human.self_model)
+    objective = ExpectedUtility(world, options.horizon, options.discount, options.branch)
+    return Communicator(person, objective, search, options.sure, seed)
+
+
+@torch.no_grad()
+def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
+    """Let one person play their rounds while somebody speaks to them.
+
+    Args:
+        listener: the person, and their rounds.
+        say: who speaks.
+        keep_log: whether to keep every decision.
+    """
+    domain, driver, start = listener.domain, listener.driver, listener.start
+    channels = Channels(domain)
+    number = start.luck.shape[1]
+    state, memory = start.state, driver.start(number)
+    rounds: list[RoundSoFar] = []
+    task, cost = torch.zeros(number), torch.zeros(number)
+    collisions = torch.zeros(number, dtype=torch.long)
+    items = {m.name: torch.zeros(number, dtype=torch.long) for m in domain.modalities}
+    relevant: dict[str, dict[str, Tensor]] = {}
+    chances = dict.fromkeys(items, 0)
+    seconds, log = 0.0, []
+    told, action = {}, torch.zeros(number, dtype=torch.long)
+    for step in range(domain.horizon):
+        observation = domain.observe(state)
+        now = [{name: value[0, r] for name, value in observation.items()} for r in range(number)]
+        rounds = (
+            [past.then(_row(told, r), action[r], now[r]) for r, past in enumerate(rounds)]
+            if rounds
+            else [RoundSoFar.begin(domain, one) for one in now]
+        )
+        began = perf_counter()
+        flags, decisions = say(rounds)
+        seconds += perf_counter() - began
+        told = channels.split(flags)
+        probability, memory = driver.step(memory, observation, channels.split(flags[None]))
+        action = (start.luck[0, :, step] < probability[0, :, 1]).long()
+        following = domain.transition(state, action[None])
+        terms = domain.rewards(state, action[None], following)
+        task += total_reward(terms)[0]
+        collisions += (terms["collision"][0] < 0).long()
+        cost += channels.cost(flags)
+        may = domain.communicable(observation)
+        for name, mask in told.items():
+            items[name] += mask.sum(-1)
+            chances[name] += int(may[name].sum())
+        for notion, masks in domain.relevance(observation).items():
+            counts = relevant.setdefault(
+                notion, {name: torch.zeros_like(count) for name, count in items.items()}
+            )
+            for name, mask in told.items():
+                counts[name] += (mask & masks[name][0]).sum(-1)
+        if keep_log:
+            log += [
+                _entry(domain, channels, flags[r], r, step, int(action[r]), probability[0, r])
+                | ({} if decisions is None else audit(decisions[r]))
+                for r in range(number)
+            ]
+        state = following
+    return Played(
+        task.tolist(),
+        cost.tolist(),
+        collisions.tolist(),
+        {name: count.tolist() for name, count in items.items()},
+        {
+            notion: {name: count.tolist() for name, count in counts.items()}
+            for notion, counts in relevant.items()
+        },
+        chances,
+        1000 * seconds / (number * domain.horizon),
+        log,
+    )
+
+
+def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
+    """A planner's decision as data: gain, sentence, the best alternatives, what mattered."""
+    low, high = decision.gain.interval
+    table = decision.alternatives.head(most)
+    turn = decision.turning_point
+    return {
+        "gain": decision.gain.mean,
+        "gain_interval": [low, high],
+        "why": decision.why(),
+        "matters": [[*pair, value] for pair, value in decision.matters.items()],
+        "turning_point": None
+        if turn is None
+        else dict(zip(("steps_ahead", "action", "silent", "told"), turn, strict=True)),
+        "alternatives": [
+            {str(name): value for name, value in row.items()}
+            for row in table[["message", "later", "cost", "gain", "low", "high"]].to_dict("records")
+        ],
+    }
+
+
+def _entry(
+    domain: Domain,
+    channels: Channels,
+    flags: Tensor,
+    number: int,
+    step: int,
+    action: int,
+    probability: Tensor,
+) -> dict[str, Any]:
+    message = channels.message(flags)
+    return {
+        "round": number,
+        "step": step,
+        "message": {name: list(items) for name, items in message.items.items()},
+        "cost": float(channels.cost(flags)),
+        "action": domain.actions[action],
+        "true_probability": dict(zip(domain.actions, probability.tolist(), strict=True)),
+    }
+
+
+def _row(masks: dict[str, Tensor], row: int) -> dict[str, Tensor]:
+    return {name: mask[row] for name, mask in masks.items()}
+
+
+def as_data(played: Played) -> dict[str, Any]:
+    """A person's rounds as plain data, without the log."""
+    data = asdict(played)
+    del data["log"]
+    return data

@@ -1,0 +1,170 @@
+"""The oracle: the best that could be said to a person who is known exactly, in a known world.
+
+Knowing how somebody sees, remembers and decides, and how the world moves, makes the choice of
+messages a Markov decision problem: its state is the world and what the person knows, an action of
+it is a message, and chance is what the person then does. It is solved exactly, by backward
+induction over every state that can be reached under any messages. Nobody can do better on average;
+it is the ceiling for communicators that have to infer the person and to predict.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.communication.messages import Channels, every_message
+from mirror_ppl.distinct import distinct_rows
+from mirror_ppl.domains.base import Observation, total_reward
+from mirror_ppl.domains.driving import Driving, DrivingState
+from mirror_ppl.inference.experience import map_state
+from mirror_ppl.people.driving import Drivers, Memory, remember
+
+CHUNK = 2000
+"""Decisions of the person that are worked out at once; bounds memory."""
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Everything that can happen at one time of R rounds.
+
+    Attributes:
+        state: which of this step's states a choice belongs to ``[N]``; a choice is a state with a
+            message.
+        message: flags ``[N, items]``.
+        outcome: what a choice leads the person to know, ``[N]``, an index into the outcomes.
+        probability: of actions ``[outcomes, A]``.
+        reward: of actions ``[outcomes, A]``.
+        following: state at the next step ``[outcomes, A]``.
+        states: how many states there are.
+    """
+
+    state: Tensor
+    message: Tensor
+    outcome: Tensor
+    probability: Tensor
+    reward: Tensor
+    following: Tensor
+    states: int
+
+
+class Oracle:
+    """The best messages for one driver in given rounds.
+
+    Args:
+        driver: one person, exactly as they are.
+        start: states ``[R]`` in which the rounds begin.
+
+    Attributes:
+        value: expected return of each round, costs of messages taken off, ``[R]``.
+    """
+
+    def __init__(self, driver: Drivers, start: DrivingState) -> None:
+        self._steps = _everything(driver, start)
+        value = torch.zeros(int(self._steps[-1].following.max()) + 1)
+        self._best: list[Tensor] = []
+        channels = Channels(Driving())
+        for step in reversed(self._steps):
+            chance = (step.probability * (step.reward + value[step.following])).sum(-1)
+            worth = chance[step.outcome] - channels.cost(step.message)
+            value = torch.full((step.states,), -torch.inf)
+            value = value.scatter_reduce(0, step.state, worth, "amax")
+            # Choices of a state are in the order of messages, silence first: it wins ties.
+            number = torch.arange(len(worth))
+            good = worth >= value[step.state] - 1e-6
+            first = torch.full((step.states,), len(worth))
+            self._best.append(first.scatter_reduce(0, step.state[good], number[good], "amin"))
+        self._best.reverse()
+        self.value = value
+
+    def messages(self, actions: Tensor) -> Tensor:
+        """Flags ``[R, items]`` of what to say after ``actions`` ``[R, t]``.
+
+        The rounds have to have gone as the oracle wanted them: with its own messages.
+        """
+        state = torch.arange(len(actions))
+        for time, action in enumerate(actions.unbind(1)):
+            step = self._steps[time]
+            outcome = step.outcome[self._best[time][state]]
+            state = step.following[outcome, action]
+        time = actions.shape[1]
+        return self._steps[time].message[self._best[time][state]]
+
+
+def _everything(driver: Drivers, start: DrivingState) -> list[_Step]:
+    domain = Driving()
+    channels = Channels(domain)
+    messages = every_message(torch.ones(len(channels), dtype=torch.bool))
+    reach = driver.reach[0]
+    world, rounds = start, torch.arange(len(start.lane))
+    lane, memory = start.lane, Memory.empty((len(start.lane),))
+    steps = []
+    for _ in range(domain.horizon):
+        here = _at(world, rounds, lane)
+        observation = domain.observe(here)
+        allowed = channels.join(domain.communicable(observation))
+        state, number = (messages <= allowed[:, None]).all(-1).nonzero(as_tuple=True)
+        message = messages[number]
+        seen: Observation = {name: value[state] for name, value in observation.items()}
+        sight = driver.sees({name: value[None] for name, value in observation.items()})["visual"][0]
+        known = remember(
+            _memory(memory, state),
+            seen,
+            sight[state],
+            channels.split(message),
+            reach.expand(len(state), -1),
+        ).canonical()
+        place = torch.stack([rounds[state], lane[state]], -1)
+        first, outcome = distinct_rows(torch.cat([place, known.rows()], -1))
+        known, place = _memory(known, first), place[first]
+        probability = _choices(driver, known, place[:, 1])
+        own = _at(world, *place.T)
+        rewards, lanes = [], []
+        for action in range(len(domain.actions)):
+            done = torch.full_like(place[:, 1], action)
+            following = domain.transition(own, done)
+            rewards.append(total_reward(domain.rewards(own, done, following)))
+            lanes.append(following.lane)
+        lanes = torch.stack(lanes, 1)
+        after = torch.arange(len(first)).repeat_interleave(len(domain.actions))
+        next_place = torch.stack([place[after, 0], lanes.flatten()], -1)
+        kept, following = distinct_rows(torch.cat([next_place, _memory(known, after).rows()], -1))
+        steps.append(
+            _Step(
+                state,
+                message,
+                outcome,
+                probability,
+                torch.stack(rewards, 1),
+                following.view(-1, len(domain.actions)),
+                len(rounds),
+            )
+        )
+        world = _moved(domain, world)
+        rounds, lane = next_place[kept].T
+        memory = _memory(known, after[kept])
+    return steps
+
+
+def _at(world: DrivingState, rounds: Tensor, lane: Tensor) -> DrivingState:
+    """The states of some rounds with the ego in given lanes."""
+    return DrivingState(lane, world.position[rounds], world.speed[rounds])
+
+
+def _moved(domain: Driving, world: DrivingState) -> DrivingState:
+    return domain.transition(world, torch.zeros_like(world.lane))
+
+
+def _memory(memory: Memory, rows: Tensor) -> Memory:
+    return map_state(lambda part: part[rows], memory)
+
+
+def _choices(driver: Drivers, known: Memory, lane: Tensor) -> Tensor:
+    """Probabilities ``[M, A]`` of what the driver does, worked out once for equal knowledge."""
+    first, which = distinct_rows(torch.cat([lane[:, None], known.rows()], -1))
+    parts = [
+        (driver.consistency * driver.values(_memory(known, rows), lane[rows])).softmax(-1)
+        for rows in first.split(CHUNK)
+    ]
+    return torch.cat(parts)[which]

@@ -1,0 +1,134 @@
+"""Posterior files read back: draws of the implants, as the human model samples them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import PosteriorError
+from mirror_ppl.inference.export import az
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.implants import sight_sites
+from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.models.weights import fingerprint
+
+
+@dataclass(frozen=True)
+class PosteriorFile:
+    """What a posterior file holds of P people.
+
+    Attributes:
+        path: where it was read from.
+        attributes: what the file says of itself: domain, setting, human model and so on.
+        people: names.
+        values: draws ``[S, P, ...]`` by name, in the units of the file.
+    """
+
+    path: Path
+    attributes: Mapping[str, str]
+    people: tuple[str, ...]
+    values: Mapping[str, np.ndarray]
+
+    def draws(self, human: HumanModel, number: int | None = None) -> dict[str, Tensor]:
+        """Values ``[S, P, 1, ...]`` of all sites of a human model.
+
+        Args:
+            human: the model that the posterior is of.
+            number: how many draws, spread evenly over those of the file; all unless given.
+
+        Raises:
+            PosteriorError: the posterior is of another human model, self-model or version of the
+                domain, or holds fewer draws than asked for.
+        """
+        self._check(human)
+        held = len(next(iter(self.values.values())))
+        number = held if number is None else number
+        if number > held:
+            raise PosteriorError(f"{self.path}: holds {held} draws, not {number}")
+        chosen = np.linspace(0, held - 1, number).round().astype(int)
+        with (
+            torch.random.fork_rng(devices=[]),
+            pyro.plate("person", len(self.people), dim=-2),
+            poutine.block(),
+            poutine.trace() as trace,
+        ):
+            implants = human.prior()
+            latent = human.self_model.latent
+            like = next(human.parameters())
+            belief = like.new_zeros(len(self.people), 1, 1, latent)
+            human.act(implants, belief, human.self_model.action_values(belief))
+        domain, draws = human.domain, {}
+        bins = np.asarray(domain.reach_bins)
+        for name, site in latent_sites(trace.trace).items():
+            if name not in self.values:
+                raise PosteriorError(f'{self.path}: has no draws of the site "{name}"')
+            value = self.values[name][chosen]
+            if name in sight_sites(domain):
+                value = np.abs(value[..., None] - bins).argmin(-1)
+            fn = site["fn"]
+            shape = (number, len(self.people), 1, *fn.event_shape)
+            if value.shape != shape[:2] + shape[3:]:
+                raise PosteriorError(
+                    f'{self.path}: "{name}" has shape {value.shape}, expected '
+                    f"{shape[:2] + shape[3:]}"
+                )
+            draws[name] = (
+                torch.as_tensor(value.reshape(shape))
+                .to(site["value"].dtype, copy=True)
+                .to(like.device)
+            )
+        return draws
+
+    def _check(self, human: HumanModel) -> None:
+        for name, mine in (
+            ("domain_version", human.domain.version),
+            ("human_model", type(human).__name__),
+            ("self_model", fingerprint(human.self_model)),
+        ):
+            own = self.attributes.get(name)
+            if own != mine:
+                raise PosteriorError(
+                    f"{self.path}: is of {name.replace('_', ' ')} {own}, not {mine}; fit again, or "
+                    "give what it was fitted with"
+                )
+
+
+def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
+    """Read a posterior file.
+
+    Args:
+        path: a file that ``python -m mirror_ppl.fit`` or `save_inference_data` wrote.
+        domain: name of the domain it has to be of; any unless given.
+
+    Raises:
+        PosteriorError: the file is missing or damaged, holds no draws, or is of another domain.
+    """
+    if not path.is_file():
+        raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
+    try:
+        data = az.from_netcdf(str(path))
+        group = data["posterior"]
+        attributes = {str(name): str(value) for name, value in group.attrs.items()}
+        people = tuple(map(str, group["person"].values))
+        stacked = {
+            str(name): value.transpose("chain", "draw", "person", ...).values
+            for name, value in group.data_vars.items()
+        }
+    except Exception as error:
+        raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
+    own = attributes.get("domain", "unknown")
+    if domain is not None and own != domain:
+        raise PosteriorError(f'{path}: is for the domain "{own}", not "{domain}"')
+    get_domain(own)
+    values = {name: value.reshape(-1, *value.shape[2:]) for name, value in stacked.items()}
+    if not values or min(len(value) for value in values.values()) == 0:
+        raise PosteriorError(f"{path}: holds no draws")
+    return PosteriorFile(path, attributes, people, values)
