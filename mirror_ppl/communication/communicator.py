@@ -64,7 +64,7 @@ class Decision:
     Attributes:
         message: what to communicate now.
         flags: the same as flags ``[N]``.
-        gain: over silence.
+        gain: of the plan over saying nothing at all.
         domain: the world of the round.
         observation: what there was to observe, ``[E]`` and ``[K, F]``.
         found: the candidates that were compared; ``None`` where there was nothing to choose.
@@ -83,6 +83,14 @@ class Decision:
     def told(self) -> Visibility:
         """The message as masks ``[K]`` by modality."""
         return Channels(self.domain).split(self.flags)
+
+    @property
+    def plan(self) -> tuple[Message, ...]:
+        """The message for now, and what would be said in the steps after it as things stand."""
+        channels = Channels(self.domain)
+        if self.found is None:
+            return (self.message,)
+        return tuple(channels.message(flags) for flags in self.found.candidates[self.chosen])
 
     @property
     def cost(self) -> float:
@@ -133,7 +141,7 @@ class Decision:
 
         Items of which the message without them was not among the candidates are left out.
         """
-        if self.found is None or self.chosen == 0:
+        if self.found is None:
             return {}
         candidates, valued = self.found.candidates, self.found.valued
         mean = valued.utility.mean(-1)
@@ -156,13 +164,17 @@ class Decision:
             return None
         silent, told = self.found.valued.actions[0], self.found.valued.actions[self.chosen]
         silent, told = (each / each.sum(-1, keepdim=True) for each in (silent, told))
-        # Of the actions that the message makes less probable.
-        place = int((silent - told).argmax())
+        # Of the actions that the message makes less probable: the first that it changes much.
+        less = silent - told
+        place = int((less >= less.max() / 2).flatten().long().argmax())
         step, action = divmod(place, silent.shape[-1])
         return step, action, float(silent[step, action]), float(told[step, action])
 
     def why(self) -> str:
         """The decision in a sentence that a person understands."""
+        if not self.message and any(self.plan):
+            wait = next(step for step, message in enumerate(self.plan) if message)
+            return f"silence: what would help can wait {wait} step{'s' * (wait > 1)}"
         if not self.message:
             return "silence: nothing that could be told is worth its cost"
         ranked = sorted(self.message, key=lambda pair: -self.matters.get(pair, 0.0))

@@ -268,10 +268,9 @@ def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
         "turning_point": None
         if turn is None
         else dict(zip(("steps_ahead", "action", "silent", "told"), turn, strict=True)),
-        "alternatives": [
-            {str(name): value for name, value in row.items()}
-            for row in table[["message", "later", "cost", "gain", "low", "high"]].to_dict("records")
-        ],
+        "alternatives": table[["message", "later", "cost", "gain", "low", "high"]].to_dict(
+            orient="records"
+        ),
     }
 
 
