@@ -258,6 +258,7 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
 def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
     """A planner's decision as data: gain, sentence, the best alternatives, what mattered."""
     low, high = decision.gain.interval
+    columns = ["message", "later", "cost", "gain", "low", "high"]
     table = decision.alternatives.head(most)
     turn = decision.turning_point
     return {
@@ -268,9 +269,9 @@ def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
         "turning_point": None
         if turn is None
         else dict(zip(("steps_ahead", "action", "silent", "told"), turn, strict=True)),
-        "alternatives": table[["message", "later", "cost", "gain", "low", "high"]].to_dict(
-            orient="records"
-        ),
+        "alternatives": [
+            dict(zip(columns, row, strict=True)) for row in table[columns].to_numpy().tolist()
+        ],
     }
 
 
