@@ -15,7 +15,7 @@ import torch
 import xarray as xr
 from example_recordings import fields
 
-from mirror_ppl import __main__, fit, simulate, train
+from mirror_ppl import __main__, assist, fit, simulate, train
 from mirror_ppl.console import run
 from mirror_ppl.data import (
     Demonstrations,
@@ -361,19 +361,40 @@ def test_recordings_that_cannot_be_written_leave_nothing(tmp_path, capsys):
     ("module", "args", "message"),
     [
         (fit, ("--steps", "0"), "--steps must be at least 1, not 0"),
+        (fit, ("--draws", "-3"), "--draws must be at least 1, not -3"),
         (fit, ("--train-rounds", "0"), "--train-rounds must be at least 1, not 0"),
-        (fit, ("--draws", "many"), "many"),
         (train, ("--phases", "0"), "--phases must be at least 1, not 0"),
+        (train, ("--steps", "0"), "--steps must be at least 1, not 0"),
+        (train, ("--learning-rate", "0"), "--learning-rate must be a positive number, not 0.0"),
         (simulate, ("--out", "x.nc", "--people", "0"), "--people must be at least 1, not 0"),
-        (simulate, (), "--out"),
+        (simulate, ("--out", "x.nc", "--rounds", "0"), "--rounds must be at least 1, not 0"),
+        (assist, ("--rounds", "0"), "--rounds must be at least 1, not 0"),
     ],
 )
-def test_impossible_arguments_end_with_status_2(
+def test_impossible_values_are_refused_in_one_line(
+    tmp_path, monkeypatch, capsys, module, args, message
+):
+    monkeypatch.chdir(tmp_path)
+    assert refused(capsys, tmp_path, module, *args) == f"error: {message}\n"
+
+
+@pytest.mark.parametrize(
+    ("module", "args", "message"),
+    [
+        (fit, ("--draws", "many"), "many"),
+        (fit, ("--drawz", "3"), "--draws"),
+        (simulate, (), "--out"),
+        (assist, ("--rounds", "few"), "few"),
+    ],
+)
+def test_arguments_that_cannot_be_parsed_end_with_status_2(
     tmp_path, monkeypatch, capsys, module, args, message
 ):
     monkeypatch.chdir(tmp_path)
     assert command(module, *args) == 2
-    assert message in capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert message in captured.err
     assert content(tmp_path) == {}
 
 
@@ -412,7 +433,7 @@ def test_simulate_writes_recordings_that_can_be_fitted(tmp_path, capsys):
     assert set(content(tmp_path / "out")) == RESULTS
 
 
-@pytest.mark.parametrize("module", [fit, train, simulate])
+@pytest.mark.parametrize("module", [assist, fit, train, simulate])
 def test_help_tells_every_option(module, capsys):
     assert command(module, "--help") == 0
     out = " ".join(capsys.readouterr().out.split())

@@ -15,11 +15,12 @@ import tyro
 from pyro import poutine
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
-from mirror_ppl import console
+from mirror_ppl import assist, console
 from mirror_ppl.__main__ import COMMANDS
 from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.self_model_training import SelfModelOptions
 from mirror_ppl.inference.simulation import play_rounds
@@ -105,8 +106,10 @@ def test_every_command_is_real(where, line):
     assert words[2].removeprefix("mirror_ppl.") in COMMANDS
     options = vars(tyro.cli(module.Options, args=words[3:]))
     assert options.get("domain", "driving") == "driving"
-    assert options.get("setting", "fog") in Driving.settings
-    assert options.get("population", "paper") in POPULATIONS
+    # Whom to assist is told by the posterior, unless it is said.
+    unsaid = (None,) if module is assist else ()
+    assert options.get("setting", "fog") in (*Driving.settings, *unsaid)
+    assert options.get("population", "paper") in (*POPULATIONS, *unsaid)
     for option in ("card", "human_model"):
         path = str(options.get(option) or "").partition(":")[0]
         assert not path or (ROOT / path).is_file()
@@ -158,6 +161,15 @@ def test_every_page_is_listed_in_the_readme():
 def test_tables_of_settings_are_the_defaults(name, heading, options):
     shown = {row[0].strip("`"): float(row[1]) for row in table_of(page(name), heading)}
     assert shown == {key: pytest.approx(value) for key, value in asdict(options).items()}
+
+
+def test_options_and_communicators_of_assist_are_told_as_they_are():
+    text, options = page("docs/communicator.md"), assist.Options()
+    shown = {row[0].strip("`-"): row[1] for row in table_of(text, "Option")}
+    assert shown.pop("communicator") == "all of them" and options.communicator == ()
+    assert shown == {name: str(getattr(options, name)) for name in shown}
+    first = " ".join(row[0] for row in table_of(text, "Communicator"))
+    assert tuple(re.findall(r"`([\w-]+)`", first)) == COMMUNICATORS
 
 
 def test_views_of_training_are_told_with_their_shares():
@@ -252,6 +264,15 @@ def test_python_blocks_run(name, results, monkeypatch):
     assert shown
     monkeypatch.chdir(results)
     exec("\n".join(shown), {"__name__": "page"})
+
+
+def test_python_of_the_communicator_runs(results, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ("--demos", f"{results}/runs/people.nc", "--steps", "3", "--draws", "64")
+    assert run_command("python -m mirror_ppl.fit", *small, "--out", "runs/demo") == 0
+    capsys.readouterr()
+    exec("\n".join(blocks(page("docs/communicator.md"), "python")), {"__name__": "page"})
+    assert "p(switch)" in capsys.readouterr().out
 
 
 def test_the_example_on_the_page_is_the_file():

@@ -4,15 +4,17 @@ import pytest
 import xarray as xr
 
 from mirror_ppl import simulate, train
-from mirror_ppl.errors import HumanModelError, OutputError
+from mirror_ppl.errors import HumanModelError, OptionError, OutputError
 from mirror_ppl.inference.self_model_training import SelfModelOptions
 from mirror_ppl.models.loading import load_human_model
 
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf"), 0.0, -1.0])
-@pytest.mark.parametrize("options", [SelfModelOptions, train.Options])
-def test_a_learning_rate_is_a_positive_number(options, rate):
-    with pytest.raises(ValueError, match="must be a positive number"):
+@pytest.mark.parametrize(
+    ("options", "error"), [(SelfModelOptions, ValueError), (train.Options, OptionError)]
+)
+def test_a_learning_rate_is_a_positive_number(options, error, rate):
+    with pytest.raises(error, match="must be a positive number"):
         options(learning_rate=rate)
 
 

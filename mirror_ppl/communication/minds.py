@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.distinct import distinct_rows
-from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.domains.base import Observation, Visibility, digested
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.networks import Gaussian
@@ -147,11 +147,13 @@ class StepwiseBeliefs:
         person: whose they are.
         state: ``q(zH_t | ...)``, parameters ``[n, Z]``; beliefs are the means.
         unknown: what was never seen or told of, ``[n, K]`` by modality.
+        told: what was told at this step or before and is still known, ``[n, K]`` by modality.
     """
 
     person: Person
     state: Gaussian
     unknown: Visibility
+    told: Visibility
 
     @property
     def courses(self) -> Tensor:
@@ -164,12 +166,15 @@ class StepwiseBeliefs:
         human = person.human
         if past.time == 0:
             zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
-            unknown = {
-                m.name: torch.ones(1, len(m.items), dtype=torch.bool, device=zero.device)
+            nothing = {
+                m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=zero.device)
                 for m in human.domain.modalities
             }
+            unknown = {name: ~mask for name, mask in nothing.items()}
             state = Gaussian(zero, torch.ones_like(zero))
-            return cls(person, state, unknown), torch.zeros_like(person.eye[: person.eye_count])
+            return cls(person, state, unknown, nothing), torch.zeros_like(
+                person.eye[: person.eye_count]
+            )
         eyes = torch.arange(person.eye_count, device=person.eye.device)
         observation, told, actions = _history(past, len(eyes))
         view = person.see(eyes, observation, told)
@@ -182,13 +187,22 @@ class StepwiseBeliefs:
             person,
             Gaussian(mean, torch.ones_like(mean)),
             {name: mask[:, -1] for name, mask in unknown.items()},
+            {name: mask[first, -1] for name, mask in digested(human.domain, told).items()},
         ), which
 
     def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
         """See :class:`Beliefs`; looks that tell the same lead to one belief."""
         human = self.person.human
         seen = {name: value[looks.row][:, None] for name, value in looks.observation.items()}
-        told = {name: mask[:, None] for name, mask in looks.told.items()}
+        # The step before and this one: what was told before and lasts is still known.
+        told = digested(
+            human.domain,
+            {
+                name: torch.stack([self.told[name][looks.parent], mask], 1)
+                for name, mask in looks.told.items()
+            },
+        )
+        told = {name: mask[:, 1:] for name, mask in told.items()}
         view = self.person.see(looks.eye, seen, told)
         unknown = {
             name: mask[:, 0] & self.unknown[name][looks.parent]
@@ -203,14 +217,15 @@ class StepwiseBeliefs:
         evidence = human.evidence(
             View(_rows(visible, told_by), _rows(absent, told_by)), _rows(looks.observation, rows)
         )
-        known = torch.cat([mask.long() for mask in unknown.values()], -1)
+        told = {name: mask[:, 0] for name, mask in told.items()}
+        known = torch.cat([*unknown.values(), *told.values()], -1).long()
         first, index = distinct_rows(
             torch.cat([torch.stack([looks.parent, looks.action, which], -1), known], -1)
         )
         state = human.advance(
             self.state.mean[looks.parent[first]], evidence[which[first]], looks.action[first]
         )
-        return StepwiseBeliefs(self.person, state, _rows(unknown, first)), index
+        return StepwiseBeliefs(self.person, state, _rows(unknown, first), _rows(told, first)), index
 
 
 @dataclass(frozen=True)

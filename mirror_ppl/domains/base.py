@@ -49,6 +49,8 @@ class Modality:
         scales: typical size of each feature, by which decoders normalize.
         cost_coefficient: communicating n items in one step costs ``cost_coefficient * n**2``
             units of reward (supplement, Table I).
+        lasting: whether what was told of an item can be reckoned on, so that whoever never forgets
+            goes on knowing it; else it holds at the step at which it was told.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Modality:
     units: tuple[str, ...]
     scales: tuple[float, ...]
     cost_coefficient: float
+    lasting: bool = False
 
     def __post_init__(self) -> None:
         if not len(self.features) == len(self.units) == len(self.scales):
@@ -167,6 +170,18 @@ class Domain(Protocol):
     def render(self, state: Any) -> Any:
         """A picture of one state, ``uint8 [height, width, 3]``."""
         ...
+
+
+def digested(domain: Domain, told: Visibility) -> Visibility:
+    """What is known at each step from being told at it or before, masks ``[..., T, K]``.
+
+    As the supplement has it (section B), what was communicated is digested and never forgotten.
+    """
+    lasting = {modality.name for modality in domain.modalities if modality.lasting}
+    return {
+        name: mask.long().cummax(-2).values.bool() if name in lasting else mask
+        for name, mask in told.items()
+    }
 
 
 def total_reward(terms: Mapping[str, Tensor]) -> Tensor:

@@ -4,7 +4,7 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
 
     psi_p      ~ prior                                     inside pyro.plate("person", P)
     n_t        = natural visibility of each item           perceptual implants
-    v_t        = n_t or told_t                             what was communicated is overlaid
+    v_t        = n_t or told_<=t                           what was communicated is overlaid
     zH_t       = mean of q(. | zH_{t-1}, v_t * x_t, v_t, a_{t-1})         social projection
     a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
     z_t, x_t, r_t ~ the self-model's transition, observation and reward likelihoods
@@ -26,7 +26,7 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.domains.base import Domain, Observation, Visibility, digested
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import Rounds, SelfModel
@@ -98,8 +98,10 @@ class HumanModel(nn.Module):
         Args:
             implants: the discrete sites of :meth:`prior`, ``[...]``.
             observation: everything that could be seen, ``[..., T, K, F]``.
-            told: what is communicated, ``[..., T, K]``.
+            told: what is communicated, ``[..., T, K]``. What can be reckoned on stays known
+                (:attr:`Modality.lasting`).
         """
+        told = digested(self.domain, told)
         direction, distance = self.domain.distance(observation)
         thresholds = implant_priors.reach(self.domain, implants)[..., None, None, :]
         selected = torch.zeros_like(distance)
