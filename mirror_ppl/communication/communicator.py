@@ -205,7 +205,7 @@ class Communicator:
     person: Person
     objective: Objective
     search: Search = Automatic()
-    sure: float = 1.0
+    sure: float = 2.0
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -61,8 +61,12 @@ class Patient:
         best: how many messages are looked at in this way.
     """
 
-    steps: int = 4
+    steps: int = 3
     best: int = 6
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ValueError(f"steps must be at least 1, not {self.steps}")
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """See :class:`Search`; the seed is not used."""
@@ -145,20 +149,20 @@ class CrossEntropy:
 
 @dataclass(frozen=True)
 class Automatic:
-    """Every candidate where they are few, else the cross-entropy method.
+    """:class:`Patient` where candidates are few, else :class:`CrossEntropy`.
 
     Attributes:
-        steps: length L of sequences of messages; 1 plans a message for now alone.
-        most: the largest number of candidates that are valued one by one.
+        steps: length L of the plans.
+        most: the largest number of messages that are valued one by one.
     """
 
-    steps: int = 1
+    steps: int = 3
     most: int = MOST_CANDIDATES
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """See :class:`Search`."""
-        if self.steps == 1 and 2 ** int(allowed.sum()) <= self.most:
-            return Exhaustive()(value, allowed, seed)
+        if 2 ** int(allowed.sum()) <= self.most:
+            return Patient(self.steps)(value, allowed, seed)
         return CrossEntropy(self.steps)(value, allowed, seed)
 
 

@@ -21,7 +21,7 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.communication.search import Patient
+from mirror_ppl.communication.search import Automatic
 from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld
 from mirror_ppl.domains.base import Domain, total_reward
 from mirror_ppl.errors import UnknownNameError
@@ -54,7 +54,7 @@ class PlannerOptions:
         horizon: steps looked ahead.
         discount: per step.
         branch: see :class:`ExpectedUtility`.
-        patience: length of the plans that are compared, see :class:`Patient`.
+        patience: length of the plans that are compared, see :class:`Automatic`.
         sure: standard errors that a gain must exceed, see :class:`Communicator`.
         kl_weight: units of reward that mirror-kl gives for a nat.
         kl_measure: what mirror-kl measures, see :class:`Divergence`.
@@ -172,15 +172,14 @@ def speaker(
 
 def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
     """The planner of that name: mirror, mirror-self-model or mirror-kl."""
-    search = Patient(options.patience)
     if name == "mirror-kl":
         objective = Divergence(options.kl_weight, options.kl_measure)
-        return Communicator(person, objective, Patient(1), options.sure, seed)
+        return Communicator(person, objective, Automatic(1), options.sure, seed)
     world = SimulatorWorld(person.human.domain)
     if name == "mirror-self-model":
         world = SelfModelWorld(person.human.self_model)
     objective = ExpectedUtility(world, options.horizon, options.discount, options.branch)
-    return Communicator(person, objective, search, options.sure, seed)
+    return Communicator(person, objective, Automatic(options.patience), options.sure, seed)
 
 
 @torch.no_grad()
