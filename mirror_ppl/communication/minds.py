@@ -147,7 +147,7 @@ class StepwiseBeliefs:
         person: whose they are.
         state: ``q(zH_t | ...)``, parameters ``[n, Z]``; beliefs are the means.
         unknown: what was never seen or told of, ``[n, K]`` by modality.
-        told: what was told at this step or before and is still known, ``[n, K]`` by modality.
+        told: what was told at this step or before, ``[n, K]`` by modality.
     """
 
     person: Person
@@ -187,23 +187,17 @@ class StepwiseBeliefs:
             person,
             Gaussian(mean, torch.ones_like(mean)),
             {name: mask[:, -1] for name, mask in unknown.items()},
-            {name: mask[first, -1] for name, mask in digested(human.domain, told).items()},
+            {name: mask[first, -1] for name, mask in digested(told).items()},
         ), which
 
     def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
         """See :class:`Beliefs`; looks that tell the same lead to one belief."""
         human = self.person.human
         seen = {name: value[looks.row][:, None] for name, value in looks.observation.items()}
-        # The step before and this one: what was told before and lasts is still known.
-        told = digested(
-            human.domain,
-            {
-                name: torch.stack([self.told[name][looks.parent], mask], 1)
-                for name, mask in looks.told.items()
-            },
+        told = {name: self.told[name][looks.parent] | mask for name, mask in looks.told.items()}
+        view = self.person.see(
+            looks.eye, seen, {name: mask[:, None] for name, mask in told.items()}
         )
-        told = {name: mask[:, 1:] for name, mask in told.items()}
-        view = self.person.see(looks.eye, seen, told)
         unknown = {
             name: mask[:, 0] & self.unknown[name][looks.parent]
             for name, mask in human.domain.unknown_so_far(view.visible).items()
@@ -217,7 +211,6 @@ class StepwiseBeliefs:
         evidence = human.evidence(
             View(_rows(visible, told_by), _rows(absent, told_by)), _rows(looks.observation, rows)
         )
-        told = {name: mask[:, 0] for name, mask in told.items()}
         known = torch.cat([*unknown.values(), *told.values()], -1).long()
         first, index = distinct_rows(
             torch.cat([torch.stack([looks.parent, looks.action, which], -1), known], -1)

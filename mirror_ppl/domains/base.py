@@ -49,8 +49,6 @@ class Modality:
         scales: typical size of each feature, by which decoders normalize.
         cost_coefficient: communicating n items in one step costs ``cost_coefficient * n**2``
             units of reward (supplement, Table I).
-        lasting: whether what was told of an item can be reckoned on, so that whoever never forgets
-            goes on knowing it; else it holds at the step at which it was told.
     """
 
     name: str
@@ -59,7 +57,6 @@ class Modality:
     units: tuple[str, ...]
     scales: tuple[float, ...]
     cost_coefficient: float
-    lasting: bool = False
 
     def __post_init__(self) -> None:
         if not len(self.features) == len(self.units) == len(self.scales):
@@ -172,16 +169,12 @@ class Domain(Protocol):
         ...
 
 
-def digested(domain: Domain, told: Visibility) -> Visibility:
+def digested(told: Visibility) -> Visibility:
     """What is known at each step from being told at it or before, masks ``[..., T, K]``.
 
     As the supplement has it (section B), what was communicated is digested and never forgotten.
     """
-    lasting = {modality.name for modality in domain.modalities if modality.lasting}
-    return {
-        name: mask.long().cummax(-2).values.bool() if name in lasting else mask
-        for name, mask in told.items()
-    }
+    return {name: mask.long().cummax(-2).values.bool() for name, mask in told.items()}
 
 
 def total_reward(terms: Mapping[str, Tensor]) -> Tensor:

@@ -118,7 +118,6 @@ class Driving:
             ("cells", "lanes", "cells/step"),
             (12.0, 1.0, 1.0),
             0.03,
-            lasting=True,  # with its speed, a car's place can be reckoned on
         ),
     )
     ego_features: tuple[str, ...] = ("lane",)

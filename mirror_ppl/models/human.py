@@ -98,10 +98,9 @@ class HumanModel(nn.Module):
         Args:
             implants: the discrete sites of :meth:`prior`, ``[...]``.
             observation: everything that could be seen, ``[..., T, K, F]``.
-            told: what is communicated, ``[..., T, K]``. What can be reckoned on stays known
-                (:attr:`Modality.lasting`).
+            told: what is communicated, ``[..., T, K]``; from then on it is known.
         """
-        told = digested(self.domain, told)
+        told = digested(told)
         direction, distance = self.domain.distance(observation)
         thresholds = implant_priors.reach(self.domain, implants)[..., None, None, :]
         selected = torch.zeros_like(distance)
