@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mirror_ppl.console import Progress, run
-from mirror_ppl.errors import OptionError, PosteriorError, UnknownNameError
+from mirror_ppl.errors import OptionError, OutputError, PosteriorError, UnknownNameError
 
 PROGRAM = "python -m mirror_ppl.assist"
 DESCRIPTION = """Let communicators speak to the simulated people of a posterior while they drive,
@@ -132,9 +132,16 @@ def main(options: Options) -> None:
         keep_log=options.log is not None,
     )
     pairing.check()
-    for path in (options.json, options.log):
-        if path is not None:
-            prepare_output_folder(path.parent)
+    taken = {options.posterior.resolve(): "--posterior"}
+    for option, path in (("--json", options.json), ("--log", options.log)):
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
+        if path.is_dir():
+            raise OutputError(f"cannot write {path}: it is a folder")
+        taken[path.resolve()] = option
+        prepare_output_folder(path.parent)
     kept = options.json or options.log
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
     with Progress("assist", number * len(chosen)) as progress:
@@ -211,32 +218,49 @@ def _people(options: Options):
 
 
 def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, rounds: int) -> None:
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(
-        title=f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds "
-        "each",
-        caption="rewards a round; [90% interval], paired; shown, said: items a step; course: share "
-        "of items about cars on a collision course, closing: about cars closing in",
-        title_justify="left",
-        caption_justify="left",
-    )
-    columns = ["task", "cost", "net", "above none", "way to oracle", "collisions"]
+    def table(title: str, caption: str, columns: list[str]) -> Table:
+        made = Table(
+            title=title,
+            caption=caption,
+            title_justify="left",
+            caption_justify="left",
+            box=SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+        )
+        made.add_column("communicator")
+        for column in columns:
+            made.add_column(column, justify="right", no_wrap=True)
+        return made
+
     first = next(iter(summary.values()))
-    columns += [*first["items"], *(name.split("_")[-1] for name in first["relevant"]), "ms"]
-    table.add_column("communicator")
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
+    notions = [name.split("_")[-1] for name in first["relevant"]]
+    worth = table(
+        f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
+        "rewards a round; [90% interval], paired",
+        ["task", "cost", "net", "above none", "way to oracle"],
+    )
+    said = table(
+        "What is communicated",
+        f"collisions a round; {', '.join(first['items'])}: items a step; {', '.join(notions)}: "
+        "share of items about cars on a collision course, about cars closing in; ms a decision",
+        ["collisions", *first["items"], *notions, "ms"],
+    )
     for name, entry in summary.items():
         error = "" if entry["net_se"] is None else f" ±{entry['net_se']:.2f}"
-        table.add_row(
+        worth.add_row(
             name,
             f"{entry['task']:.2f}",
             f"{entry['cost']:.2f}",
             f"{entry['net']:.2f}{error}",
             _interval(entry.get("over_none"), 1, "+.2f"),
             _interval(entry.get("way_to_oracle"), 100, ".0f", "%"),
+        )
+        said.add_row(
+            name,
             f"{entry['collisions']:.2f}",
             *(f"{value:.2f}" for value in entry["items"].values()),
             *(
@@ -247,8 +271,9 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
         )
     console = Console()
     if not console.is_terminal:
-        console = Console(width=150)
-    console.print(table)
+        console = Console(width=100)
+    console.print(worth)
+    console.print(said)
 
 
 def _interval(value: dict[str, float] | None, scale: float, form: str, unit: str = "") -> str:
