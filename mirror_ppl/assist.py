@@ -102,6 +102,7 @@ def main(options: Options) -> None:
         if name not in COMMUNICATORS:
             raise UnknownNameError.of("communicator", name, COMMUNICATORS)
     chosen = tuple(name for name in COMMUNICATORS if name in chosen)
+    outputs = _outputs(options)
     posterior, source = _people(options)
     number = len(posterior.people) if options.people is None else options.people
     if number > len(posterior.people):
@@ -132,15 +133,7 @@ def main(options: Options) -> None:
         keep_log=options.log is not None,
     )
     pairing.check()
-    taken = {options.posterior.resolve(): "--posterior"}
-    for option, path in (("--json", options.json), ("--log", options.log)):
-        if path is None:
-            continue
-        if path.resolve() in taken:
-            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
-        if path.is_dir():
-            raise OutputError(f"cannot write {path}: it is a folder")
-        taken[path.resolve()] = option
+    for path in outputs:
         prepare_output_folder(path.parent)
     kept = options.json or options.log
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
@@ -181,6 +174,20 @@ def main(options: Options) -> None:
     for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
         if path is not None:
             print(f"{path}: {what}")
+
+
+def _outputs(options: Options) -> list[Path]:
+    """Files to write, none of which is something else that was named."""
+    taken = {options.posterior.resolve(): "--posterior"}
+    for option, path in (("--json", options.json), ("--log", options.log)):
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
+        if path.is_dir():
+            raise OutputError(f"cannot write {path}: it is a folder")
+        taken[path.resolve()] = option
+    return [path for path in (options.json, options.log) if path is not None]
 
 
 def _people(options: Options):
