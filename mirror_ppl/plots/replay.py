@@ -1,0 +1,302 @@
+"""Rounds of driving replayed: the road as it is, and what the person knows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.lines import Line2D
+from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
+from torch import Tensor
+
+from mirror_ppl.communication.messages import Channels
+from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.domains.base import Domain
+from mirror_ppl.domains.driving import CAR_LANES, CARS, ROAD_END, DrivingState
+from mirror_ppl.people.driving import Memory
+from mirror_ppl.plots.communication import WORDS, in_words
+from mirror_ppl.plots.driving import DARK_TO_LIGHT, DISTANCES, draw_car, draw_road
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import BLACK, BLUE, TRUE
+
+# More of Okabe and Ito's colours.
+VERMILLION, GREEN, YELLOW = "#D55E00", "#009E73", "#F0E442"
+ROAD = "#e4e6e9"
+MIDDLES = (1.5, 0.5)
+"""Height of the middle of each lane: people drive to the right, so the left lane is above."""
+
+
+# --- what a person knows ----------------------------------------------------------------------
+
+
+def share_known(person: Person, past: RoundSoFar) -> Tensor:
+    """Share of posterior draws in which a person has seen or been told of each item so far.
+
+    Args:
+        person: posterior draws of the human model.
+        past: a round of t actions, and of what was told before each.
+
+    Returns:
+        ``[t + 1, K]``; at the last step, before the next action, nothing is told yet.
+    """
+    eyes = torch.arange(person.eye_count, device=past.actions.device)
+    observation = {
+        name: value.expand(len(eyes), *value.shape) for name, value in past.observation.items()
+    }
+    told = {
+        name: torch.nn.functional.pad(mask, [0, 0, 0, 1]).expand(len(eyes), -1, -1)
+        for name, mask in past.told.items()
+    }
+    visible = person.see(eyes, observation, told).visible
+    unknown = person.human.domain.unknown_so_far(visible)["visual"]
+    return (~unknown)[person.eye].float().mean(0)
+
+
+def share_seen(person: Person, lane: int) -> Tensor:
+    """Share of posterior draws in which a person would see a car, by where it is.
+
+    Args:
+        person: posterior draws of the human model, of driving.
+        lane: the lane that the person is in.
+
+    Returns:
+        ``[2, 25]``: lane of the car (left, right) and distance (-12 to 12 cells).
+    """
+    domain = person.human.domain
+    places = len(DISTANCES)
+    eyes = torch.arange(person.eye_count, device=person.eye.device).repeat_interleave(places)
+    # One look for each distance, with all cars there.
+    position = torch.as_tensor(DISTANCES, device=eyes.device).repeat(person.eye_count)
+    position = position[:, None, None].expand(-1, 1, len(CARS))
+    lanes = torch.full_like(position[..., 0], lane)
+    observation = domain.observe(DrivingState(lanes, position, torch.zeros_like(position)))
+    nothing = {m.name: torch.zeros_like(position, dtype=torch.bool) for m in domain.modalities}
+    seen = person.see(eyes, observation, nothing).visible["visual"]
+    share = seen.unflatten(0, (person.eye_count, places))[person.eye].float().mean((0, 2))
+    return share[:, [CAR_LANES.index(side) for side in range(len(MIDDLES))]].T
+
+
+# --- rounds -----------------------------------------------------------------------------------
+
+
+def plot_frames(
+    person: Person,
+    rounds: Mapping[str, RoundSoFar],
+    steps: Sequence[int],
+    knowledge: Mapping[str, Memory] | None = None,
+    cells: int = ROAD_END,
+) -> Picture:
+    """Draw moments of rounds of driving: the road as it is, and below what the person knows.
+
+    What the model says that they know is drawn as shares of posterior draws: of those in which
+    they have seen or been told of a car so far (the number on the car), and of those in which they
+    would see a car in a cell (the shade of the road). The latent belief itself is not drawn: its
+    decoders are off by cells. What a simulated person really thinks is known, and outlined.
+
+    Args:
+        person: posterior draws of the human model.
+        rounds: rounds by title, one column each.
+        steps: the moments, one row each: before the action of that number, counted from 0.
+        knowledge: by title what a simulated person knew at each step, ``[T, K]``.
+        cells: how far the road is drawn, ahead and behind.
+
+    Raises:
+        ValueError: there are no rounds or steps, or a round does not have all of these steps.
+    """
+    if not rounds or not steps:
+        raise ValueError("there has to be a round, and a step, to draw")
+    for title, past in rounds.items():
+        for step in steps:
+            if not 0 <= step <= past.time:
+                raise ValueError(f'there is no step {step} in "{title}", which has {past.time}')
+    size = (0.5 + 4.75 * len(rounds), 1.75 * len(steps) + 1.6)
+    figure = Picture(figsize=size, layout="constrained")
+    grid = figure.subplots(2 * len(steps), len(rounds), squeeze=False, sharex=True)
+    for column, (title, past) in enumerate(rounds.items()):
+        known = share_known(person, past)
+        memory = None if knowledge is None else knowledge.get(title)
+        for row, step in enumerate(steps):
+            road, mind = grid[2 * row : 2 * row + 2, column]
+            _draw_road(road, past, step, cells)
+            road.set_title(_headline(person.human.domain, past, step), loc="left", fontsize=10)
+            _draw_mind(mind, share_seen(person, int(past.observation["ego"][step, 0])))
+            for car, x in _on_road(past, step, cells):
+                _draw_known(mind, x, MIDDLES[CAR_LANES[car]], float(known[step, car]))
+            if memory is not None and step < len(memory.known):
+                _draw_thoughts(mind, memory, step, cells)
+            draw_car(mind, 0, MIDDLES[int(past.observation["ego"][step, 0])])
+            for ax, label in ((road, "the road"), (mind, "what they\nknow")):
+                ax.set_xlim(-cells - 0.5, cells + 0.5)
+                ax.set_yticks([])
+                ax.tick_params(length=0, labelsize=8)
+                ax.set_ylabel(label if column == 0 else "", fontsize=9)
+        grid[0, column].annotate(
+            title,
+            (0, 1),
+            (0, 24),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            fontsize=12,
+            fontweight="bold",
+            parse_math=False,
+        )
+        ticks = range(-cells + cells % 2, cells + 1, 2)
+        grid[-1, column].set_xticks(ticks, [str(abs(x)) for x in ticks])
+        grid[-1, column].set_xlabel(
+            "cells behind   $\\leftarrow$   |   $\\rightarrow$   cells ahead", fontsize=9
+        )
+    _explain(figure, list(grid.flat), knowledge is not None)
+    return figure
+
+
+def _on_road(past: RoundSoFar, step: int, cells: int) -> list[tuple[int, float]]:
+    """The cars that are drawn: number and cells ahead."""
+    places = past.observation["visual"][step, :, 0].tolist()
+    return [(car, x) for car, x in enumerate(places) if abs(x) < ROAD_END and abs(x) <= cells]
+
+
+def _collided(domain: Domain, past: RoundSoFar, step: int) -> bool:
+    """Whether the action before this step led into a car."""
+    if step == 0:
+        return False
+    before, after = (
+        domain.state_behind({name: value[time] for name, value in past.observation.items()})
+        for time in (step - 1, step)
+    )
+    return bool(domain.rewards(before, past.actions[step - 1], after)["collision"] < 0)
+
+
+def _headline(domain: Domain, past: RoundSoFar, step: int) -> str:
+    """What happens at this moment."""
+    parts = ["collision"] if _collided(domain, past, step) else []
+    if step < past.time:
+        channels = Channels(domain)
+        flags = channels.join({name: mask[step] for name, mask in past.told.items()})
+        parts += [in_words(channels.message(flags)), domain.actions[int(past.actions[step])]]
+    return f"step {step}:  " + "  $\\rightarrow$  ".join(parts or ["the end"])
+
+
+def _draw_road(ax: Axes, past: RoundSoFar, step: int, cells: int) -> None:
+    """The road as it is: cars, which way each moves past the person, and what is told of them."""
+    draw_road(ax)
+    ax.add_patch(Rectangle((-ROAD_END - 0.5, 0), 2 * ROAD_END + 1, 2, fc=ROAD, zorder=0))
+    ego = int(past.observation["ego"][step, 0])
+    draw_car(ax, 0, MIDDLES[ego])
+    told = {name: mask[step] for name, mask in past.told.items() if step < past.time}
+    for car, x in _on_road(past, step, cells):
+        y = MIDDLES[CAR_LANES[car]]
+        _block(ax, x, y, fc=VERMILLION, ec="white", lw=0.8, zorder=4)
+        side = float(past.observation["verbal"][step, car, 2])
+        tip = [(x + side * out, y + up) for out, up in ((0.58, -0.2), (0.94, 0), (0.58, 0.2))]
+        ax.add_patch(Polygon(tip, fc=VERMILLION, ec="white", lw=0.8, zorder=4))
+        words = [WORDS.get(name, name) for name, mask in reversed(told.items()) if mask[car]]
+        if words:
+            _block(ax, x, y, 0.1, fc="none", ec=GREEN, lw=2.4, zorder=6, gid="told")
+            outside = 2.12 if y > 1 else -0.12
+            ax.text(
+                x,
+                outside,
+                " + ".join(words),
+                color=GREEN,
+                fontsize=9,
+                fontweight="bold",
+                ha="center",
+                va="bottom" if y > 1 else "top",
+            )
+        if x == 0 and CAR_LANES[car] == ego:
+            ax.plot([x], [y], marker=(9, 1, 0), ms=21, color=YELLOW, mec=BLACK, zorder=7)
+    ax.set_ylim(-0.55, 2.1)
+
+
+def _draw_mind(ax: Axes, seen: Tensor) -> None:
+    """The road, shaded by where a car would be seen, ``[2, 25]``."""
+    draw_road(ax)
+    end = ROAD_END + 0.5
+    ax.imshow(
+        seen.cpu().numpy(),
+        cmap=DARK_TO_LIGHT,
+        vmin=0,
+        vmax=1,
+        extent=(-end, end, 0, 2),
+        aspect="auto",
+        zorder=0,
+    )
+
+
+def _draw_known(ax: Axes, x: float, y: float, share: float) -> None:
+    """A car, as light as it is known, with the share in percent."""
+    _block(ax, x, y, fc=DARK_TO_LIGHT(share), ec="white", lw=0.8, zorder=6)
+    ax.text(
+        x,
+        y,
+        f"{100 * share:.0f}",
+        color="white" if share < 0.6 else BLACK,  # noqa: PLR2004 - where both can be read
+        fontsize=8,
+        ha="center",
+        va="center_baseline",
+        zorder=7,
+    )
+
+
+def _draw_thoughts(ax: Axes, memory: Memory, step: int, cells: int) -> None:
+    """Where a simulated person thinks that the cars are."""
+    known, position = memory.known[step].tolist(), memory.position[step].tolist()
+    for car, (thinks, x) in enumerate(zip(known, position, strict=True)):
+        if thinks and abs(x) <= cells:
+            y = MIDDLES[CAR_LANES[car]]
+            ax.add_patch(
+                Rectangle(
+                    (x - 0.47, y - 0.4),
+                    0.94,
+                    0.8,
+                    fill=False,
+                    ec=TRUE,
+                    lw=2.2,
+                    zorder=8,
+                    gid=CARS[car],
+                )
+            )
+
+
+def _block(ax: Axes, x: float, y: float, wider: float = 0.0, **style) -> None:
+    """A car as a block, its middle at (x, y)."""
+    corner = (x - 0.36 - wider, y - 0.22 - wider)
+    size = (0.72 + 2 * wider, 0.44 + 2 * wider)
+    shape = "round,pad=0.06,rounding_size=0.14"
+    ax.add_patch(FancyBboxPatch(corner, *size, boxstyle=shape, **style))
+
+
+def _explain(figure: Picture, axes: list[Axes], truth_known: bool) -> None:
+    """Colour bar and legend below the frames."""
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(0, 1), DARK_TO_LIGHT),
+        ax=axes,
+        location="bottom",
+        shrink=0.42,
+        anchor=(0.0, 0.0),
+        aspect=30,
+        pad=0.02,
+    )
+    bar.set_label(
+        "share of posterior draws in which a cell is seen,\na car known (numbers: %)", size=9
+    )
+    bar.set_ticks([0, 0.5, 1], labels=["0", ".5", "1"])
+    square = {"ls": "", "ms": 11}
+    handles = [
+        Line2D([], [], marker=">", color=BLUE, **square),
+        Line2D([], [], marker="s", color=VERMILLION, **square),
+        Line2D([], [], marker="s", mfc="none", mec=GREEN, mew=2.4, **square),
+        Line2D([], [], marker="s", mfc="none", mec=TRUE, mew=2.2, **square),
+    ]
+    labels = [
+        "the person, driving to the right",
+        "other cars; arrow: motion relative to the person",
+        "what they are told of",
+        "where the simulated person thinks a car is",
+    ]
+    number = len(handles) if truth_known else len(handles) - 1
+    figure.legend(handles[:number], labels[:number], loc="lower right", frameon=False, fontsize=9)
