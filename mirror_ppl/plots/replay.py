@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from matplotlib.axes import Axes
@@ -28,6 +29,8 @@ VERMILLION, GREEN, YELLOW = "#D55E00", "#009E73", "#F0E442"
 ROAD = "#e4e6e9"
 MIDDLES = (1.5, 0.5)
 """Height of the middle of each lane: people drive to the right, so the left lane is above."""
+HALF = 0.24
+"""How far from the middle of the lane each of two cars in one cell is drawn."""
 
 
 # --- what a person knows ----------------------------------------------------------------------
@@ -113,21 +116,26 @@ def plot_frames(
         for step in steps:
             if not 0 <= step <= past.time:
                 raise ValueError(f'there is no step {step} in "{title}", which has {past.time}')
-    size = (0.5 + 4.75 * len(rounds), 1.75 * len(steps) + 1.6)
+    size = (0.5 + 4.75 * len(rounds), 1.85 * len(steps) + 1.6)
     figure = Picture(figsize=size, layout="constrained")
-    grid = figure.subplots(2 * len(steps), len(rounds), squeeze=False, sharex=True)
+    # Roads are as large as minds; above and below the first there is room for what is said.
+    grid = figure.subplots(
+        2 * len(steps), len(rounds), squeeze=False, sharex=True, height_ratios=[1.6, 1] * len(steps)
+    )
     for column, (title, past) in enumerate(rounds.items()):
         known = share_known(person, past)
         memory = None if knowledge is None else knowledge.get(title)
         for row, step in enumerate(steps):
             road, mind = grid[2 * row : 2 * row + 2, column]
             _draw_road(road, past, step, cells)
-            road.set_title(_headline(person.human.domain, past, step), loc="left", fontsize=10)
+            headline = _headline(person.human.domain, past, step)
+            road.set_title(headline, loc="left", fontsize=10, parse_math=False)
             _draw_mind(mind, share_seen(person, int(past.observation["ego"][step, 0])))
-            for car, x in _on_road(past, step, cells):
-                _draw_known(mind, x, MIDDLES[CAR_LANES[car]], float(known[step, car]))
+            places = _places(past, step, cells)
+            for car, place in places.items():
+                _draw_known(mind, place, float(known[step, car]), cells)
             if memory is not None and step < len(memory.known):
-                _draw_thoughts(mind, memory, step, cells)
+                _draw_thoughts(mind, memory, step, places, cells)
             draw_car(mind, 0, MIDDLES[int(past.observation["ego"][step, 0])])
             for ax, label in ((road, "the road"), (mind, "what they\nknow")):
                 ax.set_xlim(-cells - 0.5, cells + 0.5)
@@ -153,10 +161,31 @@ def plot_frames(
     return figure
 
 
-def _on_road(past: RoundSoFar, step: int, cells: int) -> list[tuple[int, float]]:
-    """The cars that are drawn: number and cells ahead."""
-    places = past.observation["visual"][step, :, 0].tolist()
-    return [(car, x) for car, x in enumerate(places) if abs(x) < ROAD_END and abs(x) <= cells]
+@dataclass(frozen=True)
+class _Place:
+    """Where a car is drawn: the middle of its block, and how high the block is."""
+
+    x: float
+    y: float
+    height: float
+
+
+def _places(past: RoundSoFar, step: int, cells: int) -> dict[int, _Place]:
+    """The cars that are drawn, by number; those of one cell above each other."""
+    ahead = past.observation["visual"][step, :, 0].tolist()
+    shown = [car for car, x in enumerate(ahead) if abs(x) < ROAD_END and abs(x) <= cells]
+    places = {}
+    for car in shown:
+        same = [other for other in shown if (ahead[other], CAR_LANES[other]) == _cell(ahead, car)]
+        # Lanes hold two cars each, so no more than two share a cell.
+        up = 0.0 if len(same) == 1 else HALF if car == same[0] else -HALF
+        y = MIDDLES[CAR_LANES[car]] + up
+        places[car] = _Place(ahead[car], y, 0.44 if len(same) == 1 else 0.26)
+    return places
+
+
+def _cell(ahead: list[float], car: int) -> tuple[float, int]:
+    return ahead[car], CAR_LANES[car]
 
 
 def _collided(domain: Domain, past: RoundSoFar, step: int) -> bool:
@@ -171,13 +200,14 @@ def _collided(domain: Domain, past: RoundSoFar, step: int) -> bool:
 
 
 def _headline(domain: Domain, past: RoundSoFar, step: int) -> str:
-    """What happens at this moment."""
-    parts = ["collision"] if _collided(domain, past, step) else []
-    if step < past.time:
-        channels = Channels(domain)
-        flags = channels.join({name: mask[step] for name, mask in past.told.items()})
-        parts += [in_words(channels.message(flags)), domain.actions[int(past.actions[step])]]
-    return f"step {step}:  " + "  $\\rightarrow$  ".join(parts or ["the end"])
+    """What happens at this moment, such as "step 3:  said rear-left, then they switch"."""
+    when = f"step {step}" + (" (collision)" if _collided(domain, past, step) else "")
+    if step == past.time:
+        return f"{when}:  the end"
+    channels = Channels(domain)
+    flags = channels.join({name: mask[step] for name, mask in past.told.items()})
+    action = domain.actions[int(past.actions[step])]
+    return f"{when}:  {in_words(channels.message(flags))}, then they {action}"
 
 
 def _draw_road(ax: Axes, past: RoundSoFar, step: int, cells: int) -> None:
@@ -187,29 +217,30 @@ def _draw_road(ax: Axes, past: RoundSoFar, step: int, cells: int) -> None:
     ego = int(past.observation["ego"][step, 0])
     draw_car(ax, 0, MIDDLES[ego])
     told = {name: mask[step] for name, mask in past.told.items() if step < past.time}
-    for car, x in _on_road(past, step, cells):
-        y = MIDDLES[CAR_LANES[car]]
-        _block(ax, x, y, fc=VERMILLION, ec="white", lw=0.8, zorder=4)
+    for car, place in _places(past, step, cells).items():
+        x, y = place.x, place.y
+        _block(ax, place, fc=VERMILLION, ec="white", lw=0.8, zorder=4)
         side = float(past.observation["verbal"][step, car, 2])
-        tip = [(x + side * out, y + up) for out, up in ((0.58, -0.2), (0.94, 0), (0.58, 0.2))]
+        wide = place.height / 2.2
+        tip = [(x + side * out, y + up) for out, up in ((0.58, -wide), (0.94, 0), (0.58, wide))]
         ax.add_patch(Polygon(tip, fc=VERMILLION, ec="white", lw=0.8, zorder=4))
         words = [WORDS.get(name, name) for name, mask in reversed(told.items()) if mask[car]]
         if words:
-            _block(ax, x, y, 0.1, fc="none", ec=GREEN, lw=2.4, zorder=6, gid="told")
-            outside = 2.12 if y > 1 else -0.12
+            _block(ax, place, 0.1, fc="none", ec=GREEN, lw=2.4, zorder=6, gid="told")
+            above = CAR_LANES[car] == 0
             ax.text(
                 x,
-                outside,
+                2.12 if above else -0.12,
                 " + ".join(words),
                 color=GREEN,
                 fontsize=9,
                 fontweight="bold",
                 ha="center",
-                va="bottom" if y > 1 else "top",
+                va="bottom" if above else "top",
             )
         if x == 0 and CAR_LANES[car] == ego:
             ax.plot([x], [y], marker=(9, 1, 0), ms=21, color=YELLOW, mec=BLACK, zorder=7)
-    ax.set_ylim(-0.55, 2.1)
+    ax.set_ylim(-0.6, 2.6)  # room for what is said
 
 
 def _draw_mind(ax: Axes, seen: Tensor) -> None:
@@ -227,45 +258,43 @@ def _draw_mind(ax: Axes, seen: Tensor) -> None:
     )
 
 
-def _draw_known(ax: Axes, x: float, y: float, share: float) -> None:
+def _draw_known(ax: Axes, place: _Place, share: float, cells: int) -> None:
     """A car, as light as it is known, with the share in percent."""
-    _block(ax, x, y, fc=DARK_TO_LIGHT(share), ec="white", lw=0.8, zorder=6)
+    _block(ax, place, fc=DARK_TO_LIGHT(share), ec="white", lw=0.8, zorder=6)
     ax.text(
-        x,
-        y,
+        place.x,
+        place.y,
         f"{100 * share:.0f}",
         color="white" if share < 0.6 else BLACK,  # noqa: PLR2004 - where both can be read
-        fontsize=8,
+        fontsize=min(9, 80 / cells),
         ha="center",
         va="center_baseline",
         zorder=7,
     )
 
 
-def _draw_thoughts(ax: Axes, memory: Memory, step: int, cells: int) -> None:
+def _draw_thoughts(
+    ax: Axes, memory: Memory, step: int, places: Mapping[int, _Place], cells: int
+) -> None:
     """Where a simulated person thinks that the cars are."""
     known, position = memory.known[step].tolist(), memory.position[step].tolist()
     for car, (thinks, x) in enumerate(zip(known, position, strict=True)):
-        if thinks and abs(x) <= cells:
-            y = MIDDLES[CAR_LANES[car]]
-            ax.add_patch(
-                Rectangle(
-                    (x - 0.47, y - 0.4),
-                    0.94,
-                    0.8,
-                    fill=False,
-                    ec=TRUE,
-                    lw=2.2,
-                    zorder=8,
-                    gid=CARS[car],
-                )
-            )
+        if not thinks or abs(x) > cells:
+            continue
+        place = _Place(x, MIDDLES[CAR_LANES[car]], 0.44)
+        if car in places and places[car].x == x:
+            place = places[car]
+        high = place.height + 0.36 if place.height > HALF + 0.1 else place.height + 0.2
+        corner = (place.x - 0.47, place.y - high / 2)
+        ax.add_patch(
+            Rectangle(corner, 0.94, high, fill=False, ec=TRUE, lw=2.2, zorder=8, gid=CARS[car])
+        )
 
 
-def _block(ax: Axes, x: float, y: float, wider: float = 0.0, **style) -> None:
-    """A car as a block, its middle at (x, y)."""
-    corner = (x - 0.36 - wider, y - 0.22 - wider)
-    size = (0.72 + 2 * wider, 0.44 + 2 * wider)
+def _block(ax: Axes, place: _Place, wider: float = 0.0, **style) -> None:
+    """A car as a block."""
+    corner = (place.x - 0.36 - wider, place.y - place.height / 2 - wider)
+    size = (0.72 + 2 * wider, place.height + 2 * wider)
     shape = "round,pad=0.06,rounding_size=0.14"
     ax.add_patch(FancyBboxPatch(corner, *size, boxstyle=shape, **style))
 
