@@ -1,0 +1,202 @@
+"""Decisions: the message in all forms, the table of alternatives, what mattered, and why."""
+
+import pytest
+import torch
+from example_person import CHANNELS, DOMAIN, begun, flags, plan
+
+from mirror_ppl.communication import Decision, Gain, Valued
+from mirror_ppl.communication.communicator import gain_over_silence
+from mirror_ppl.communication.search import Found
+
+SHOWN, SAID = flags(visual=["front-left"]), flags(verbal=["front-left"])
+OTHER = flags(verbal=["rear-right"])
+AHEAD = "front car in the left lane, 3 cells ahead, closing"
+BEHIND = "rear car in the right lane, 3 cells behind, closing"
+
+
+def decision(chosen, candidates, utility, actions=None):
+    """With a car ahead in the own lane and one behind in the other; both close in."""
+    now = begun(0, [3, 9, -9, -3], [-1, 1, -1, 1]).now
+    values = Valued(torch.tensor(utility), None if actions is None else torch.tensor(actions))
+    found = Found(torch.stack(candidates), values)
+    flags_ = found.candidates[chosen, 0]
+    gain = gain_over_silence(values, chosen)
+    return Decision(CHANNELS.message(flags_), flags_, gain, DOMAIN, now, found, chosen)
+
+
+def four(chosen=3, actions=None):
+    candidates = [plan(None, None), plan(SHOWN, None), plan(OTHER, None), plan(SHOWN | OTHER, None)]
+    return decision(chosen, candidates, [[0.0, 0], [1, 1], [2.0, 4], [3, 4]], actions)
+
+
+def test_the_message_in_all_forms():
+    one = four()
+    assert str(one.message) == "visual: front-left; verbal: rear-right"
+    assert one.told["visual"].tolist() == [True, False, False, False]
+    assert one.told["verbal"].tolist() == [False, False, False, True]
+    assert one.cost == pytest.approx(0.04)
+    assert [str(message) for message in one.plan] == [str(one.message), "silence"]
+    later = decision(1, [plan(None, None, None), plan(None, SAID, OTHER)], [[0.0], [1.0]])
+    assert [str(message) for message in later.plan] == [
+        "silence",
+        "verbal: front-left",
+        "verbal: rear-right",
+    ]
+    assert later.cost == 0
+
+
+def test_the_table_of_alternatives():
+    actions = [[[0.9, 0.1]], [[0.8, 0.2]], [[0.5, 0.5]], [[0.25, 0.75]]]
+    candidates = [plan(None, None), plan(SHOWN, SAID | OTHER), plan(OTHER, None), plan(SAID, None)]
+    table = decision(2, candidates, [[0.0, 0], [1, -2], [3, 4], [0, 0]], actions).alternatives
+    assert list(table.columns) == [
+        "message",
+        "later",
+        "cost",
+        "gain",
+        "low",
+        "high",
+        "probability",
+        "chosen",
+        "p(stay)",
+        "p(switch)",
+    ]
+    # The best first; of equally good ones the one that was valued first.
+    assert table.index.tolist() == [2, 0, 3, 1]
+    assert table["message"].tolist() == [
+        "verbal: rear-right",
+        "silence",
+        "verbal: front-left",
+        "visual: front-left",
+    ]
+    assert table["later"].tolist() == [0, 0, 0, 2]
+    assert table["cost"].tolist() == pytest.approx([0.03, 0, 0.03, 0.01])
+    assert table["gain"].tolist() == pytest.approx([3.5, 0, 0, -0.5])
+    error = [0.5, 0, 0, 1.5]
+    assert (table["high"] - table["gain"]).tolist() == pytest.approx([1.645 * e for e in error])
+    assert (table["gain"] - table["low"]).tolist() == pytest.approx([1.645 * e for e in error])
+    assert table["probability"].tolist() == [1.0, 0.0, 0.0, 0.5]
+    assert table["chosen"].tolist() == [True, False, False, False]
+    assert table["p(stay)"].tolist() == pytest.approx([0.5, 0.9, 0.25, 0.8])
+    assert table["p(switch)"].tolist() == pytest.approx([0.5, 0.1, 0.75, 0.2])
+
+
+def test_what_each_item_adds():
+    assert four().matters == pytest.approx(
+        {("visual", "front-left"): 0.5, ("verbal", "rear-right"): 2.5}
+    )
+    assert four(1).matters == pytest.approx({("visual", "front-left"): 1.0})
+    assert four(0).matters == {}
+    # Left out where the message without it was not valued; what comes later has to be the same.
+    candidates = [plan(None, None), plan(SHOWN | SAID, OTHER), plan(SHOWN, None), plan(SAID, OTHER)]
+    partly = decision(1, candidates, [[0.0], [3.0], [2.0], [2.5]])
+    assert partly.matters == pytest.approx({("visual", "front-left"): 0.5})
+
+
+def test_a_decision_without_a_choice():
+    """Where nothing could be told, there is silence and nothing more."""
+    now = begun(0, [30, 30, -30, -30], [1, 1, -1, -1]).now
+    none = Gain(0.0, 0.0, 0.0)
+    one = Decision(CHANNELS.message(flags()), flags(), none, DOMAIN, now, None, 0)
+    assert one.plan == (one.message,)
+    assert one.cost == 0
+    assert one.matters == {}
+    assert one.turning_point is None
+    assert one.why() == "silence: nothing that could be told is worth its cost"
+    (row,) = one.alternatives.to_dict("records")
+    assert row == {
+        "message": "silence",
+        "later": 0,
+        "cost": 0.0,
+        "gain": 0.0,
+        "low": 0.0,
+        "high": 0.0,
+        "probability": 0.0,
+        "chosen": True,
+    }
+
+
+# --- the turning point ------------------------------------------------------------------------
+
+
+def turned(silent, told):
+    """A decision to show the car ahead, with chances of staying and switching at each step."""
+    return decision(1, [plan(None), plan(SHOWN)], [[0.0, 0], [1, 1]], [silent, told])
+
+
+@pytest.mark.parametrize(
+    ("silent", "told", "expected"),
+    [
+        # It makes staying less probable at once.
+        ([[0.9, 0.1], [0.9, 0.1]], [[0.2, 0.8], [0.9, 0.1]], (0, 0, 0.9, 0.2)),
+        # It makes switching less probable.
+        ([[0.3, 0.7], [0.9, 0.1]], [[0.8, 0.2], [0.9, 0.1]], (0, 1, 0.7, 0.2)),
+        # A little at first, much afterwards.
+        ([[0.9, 0.1], [0.8, 0.2]], [[0.7, 0.3], [0.2, 0.8]], (1, 0, 0.8, 0.2)),
+        # The first that is at least half of the largest.
+        ([[0.9, 0.1], [0.8, 0.2]], [[0.55, 0.45], [0.2, 0.8]], (0, 0, 0.9, 0.55)),
+        # What is followed of later steps does not add up to one.
+        ([[1.0, 0.0], [0.4, 0.1]], [[1.0, 0.0], [0.1, 0.7]], (1, 0, 0.8, 0.125)),
+    ],
+)
+def test_where_a_message_changes_most(silent, told, expected):
+    assert turned(silent, told).turning_point == pytest.approx(expected)
+
+
+def test_silence_turns_nothing():
+    assert four(0, [[[0.9, 0.1]]] * 4).turning_point is None
+    assert four(3).turning_point is None  # the objective did not look at actions
+
+
+# --- why --------------------------------------------------------------------------------------
+
+
+def test_why_silence():
+    assert four(0).why() == "silence: nothing that could be told is worth its cost"
+
+
+@pytest.mark.parametrize(
+    ("wait", "steps"), [([None, SAID, None], "1 step"), ([None, None, SAID], "2 steps")]
+)
+def test_why_waiting(wait, steps):
+    one = decision(1, [plan(None, None, None), plan(*wait)], [[0.0, 0], [1, 1]], [[[0.5, 0.5]]] * 2)
+    assert one.why() == f"silence: what would help can wait {steps}"
+
+
+@pytest.mark.parametrize(
+    ("silent", "told", "what"),
+    [
+        ([[0.9, 0.1]], [[0.2, 0.8]], "stay in its way with probability 0.90; told, 0.20"),
+        ([[0.25, 0.75]], [[0.5, 0.5]], "switch lanes with probability 0.75; told, 0.50"),
+        (
+            [[0.5, 0.5], [0.9, 0.1]],
+            [[0.5, 0.5], [0.2, 0.8]],
+            "stay in its way in 1 step with probability 0.90; told, 0.20",
+        ),
+        (
+            [[0.5, 0.5], [0.5, 0.5], [0.9, 0.1]],
+            [[0.5, 0.5], [0.5, 0.5], [0.2, 0.8]],
+            "stay in its way in 2 steps with probability 0.90; told, 0.20",
+        ),
+    ],
+)
+def test_why_a_message(silent, told, what):
+    assert turned(silent, told).why() == f"{AHEAD}: they would {what}"
+
+
+def test_what_matters_most_is_told_first_and_what_would_be_done_is_about_it():
+    actions = [[[0.1, 0.9]]] + [[[0.6, 0.4]]] * 3
+    one = four(3, actions)
+    assert one.why() == (
+        f"{BEHIND}, and {AHEAD}: they would switch into it with probability 0.90; told, 0.40"
+    )
+
+
+def test_a_car_is_named_once_though_it_is_shown_and_spoken_of():
+    both = [plan(None), plan(SHOWN | SAID)]
+    one = decision(1, both, [[0.0], [1.0]], [[[0.9, 0.1]], [[0.2, 0.8]]])
+    assert one.why().count(AHEAD) == 1
+
+
+def test_why_where_the_objective_does_not_look_at_actions():
+    assert four(1).why() == f"{AHEAD}: brings what they believe closer to what is so"

@@ -1,0 +1,358 @@
+"""Beliefs in planning: against the human model on whole rounds, step by step and all over again."""
+
+import itertools
+
+import pytest
+import torch
+from example_person import (
+    CHANNELS,
+    DOMAIN,
+    FULL_SIGHT,
+    Averaging,
+    begun,
+    flags,
+    human,
+    implants,
+    person,
+    random_round,
+    self_model,
+    varied_draws,
+)
+
+from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
+from mirror_ppl.communication.minds import (
+    CourseBeliefs,
+    Looks,
+    StepwiseBeliefs,
+    beliefs_before,
+)
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models import HumanModel
+
+ACTIONS = len(DOMAIN.actions)
+KINDS = (StepwiseBeliefs, CourseBeliefs)
+
+
+# --- a person ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [None, 0])
+def test_without_draws_there_is_no_person(number):
+    draws = {} if number is None else implants(number)
+    with pytest.raises(HumanModelError) as error:
+        Person(human(), draws)
+    assert str(error.value) == "planning needs at least one posterior draw"
+
+
+@pytest.mark.parametrize("site", ["sight_back_own", "assumes_clear", "consistency", "residual_out"])
+def test_a_site_without_draws_is_refused(site):
+    draws = implants(3)
+    del draws[site]
+    with pytest.raises(HumanModelError) as error:
+        Person(human(), draws)
+    assert str(error.value) == f"there are no draws of the site {site}"
+
+
+def test_all_sites_without_draws_are_named():
+    draws = implants(3)
+    del draws["sight_front_own"], draws["lapse"]
+    with pytest.raises(HumanModelError, match=r"of the site sight_front_own, lapse$"):
+        Person(human(), draws)
+
+
+def test_draws_with_the_same_perception_share_an_eye():
+    someone = person(
+        6, front_own=[1, 2, 1, 1, 2, 1], assumes_clear=[0, 0, 0, 1, 0, 0], lapse=[0.1] * 5 + [0.2]
+    )
+    assert someone.number == 6
+    assert someone.eye_count == 3
+    groups = [[0, 2, 5], [1, 4], [3]]
+    for group in groups:
+        assert len(set(someone.eye[group].tolist())) == 1
+    assert len(set(someone.eye.tolist())) == 3
+    assert someone.eyes["sight_front_own"][someone.eye].tolist() == [1, 2, 1, 1, 2, 1]
+    assert someone.eyes["assumes_clear"][someone.eye].tolist() == [0, 0, 0, 1, 0, 0]
+    # Sites that are not discrete say nothing of eyes.
+    assert "lapse" not in someone.eyes
+
+
+def test_everybody_sees_for_themselves():
+    past = begun(0, [3, 9, -2, -9], [-1, 1, 1, -1])
+    someone = person(2, front_own=[0, 4], back_own=[2, 0], assumes_clear=[0, 1])
+    observation = {name: value.expand(2, 1, *value.shape) for name, value in past.now.items()}
+    nothing = CHANNELS.split(torch.zeros(2, 1, len(CHANNELS), dtype=torch.bool))
+    view = someone.see(someone.eye, observation, nothing)
+    seen = [[False, False, True, False], [True, False, False, False]]
+    assert view.visible["visual"][:, 0].tolist() == seen
+    assert view.absent["visual"][:, 0].tolist() == [[False] * 4, [False, True, True, True]]
+    assert view.visible["verbal"].shape == (2, 1, 4)
+
+
+def test_each_draw_acts_by_its_own_implants(generator):
+    draws = varied_draws(3, generator)
+    someone = Person(human(), draws)
+    belief = torch.randn(3, 4, 2, self_model().latent, generator=generator)
+    values = torch.randn(3, 4, 2, ACTIONS, generator=generator)
+    together = someone.act(belief, values)
+    assert together.shape == (3, 4, ACTIONS)
+    for s, m in itertools.product(range(3), range(4)):
+        own = {name: value[s] for name, value in draws.items()}
+        alone = human().act(own, belief[s, m][None, None], values[s, m][None, None])
+        torch.testing.assert_close(together[s, m], alone[0, 0, -1])
+
+
+# --- beliefs in step --------------------------------------------------------------------------
+
+
+class Tracks:
+    """Random courses of action and messages of all eyes, from one round so far.
+
+    Each is looked at by :class:`Looks` step by step; ``expected`` goes through its whole round.
+    """
+
+    def __init__(self, someone, past, horizon, number, generator):
+        self.person, self.past = someone, past
+        self.futures = SimulatorWorld(DOMAIN).futures(past, horizon, generator)
+        self.eye = torch.arange(number) % someone.eye_count
+        # Few messages, so that some tracks hear and do the same.
+        kinds = torch.rand(3, horizon, len(CHANNELS), generator=generator) < 0.15
+        kinds[0] = False
+        self.told = kinds[torch.randint(3, (number,), generator=generator)]
+        self.actions = torch.randint(ACTIONS, (number, horizon), generator=generator)
+        self.path = torch.zeros(number, horizon, dtype=torch.long)
+        for step in range(1, horizon):
+            self.path[:, step] = self.path[:, step - 1] * ACTIONS + self.actions[:, step - 1]
+
+    def looks(self, step, parent):
+        if step > 0:
+            action = self.actions[:, step - 1]
+        else:
+            last = self.past.actions[-1] if self.past.time else ACTIONS
+            action = torch.full_like(self.eye, int(last))
+        observation = {name: value[0] for name, value in self.futures.observations[step].items()}
+        return Looks(
+            parent=parent,
+            eye=self.eye,
+            action=action,
+            row=self.path[:, step],
+            observation=observation,
+            told=CHANNELS.split(self.told[:, step]),
+        )
+
+    def expected(self, step):
+        """Beliefs ``[g, t + step + 1, Z]`` by perceive and believe on whole rounds."""
+        number, past = len(self.eye), self.past
+
+        def whole(before, *after):
+            before = before[: past.time].expand(number, *before[: past.time].shape)
+            return torch.cat([before, *(part[:, None] for part in after)], 1)
+
+        observation = {
+            name: whole(value, *(o[name][0, self.path[:, h]] for h, o in self.upto(step)))
+            for name, value in past.observation.items()
+        }
+        told = whole(CHANNELS.join(past.told), *self.told[:, : step + 1].unbind(1))
+        done = whole(past.actions, *self.actions[:, : step + 1].unbind(1))
+        eyes = {name: value[self.eye] for name, value in self.person.eyes.items()}
+        model = self.person.human
+        view = model.perceive(eyes, observation, CHANNELS.split(told))
+        return model.believe(view, observation, done)
+
+    def upto(self, step):
+        return enumerate(self.futures.observations[: step + 1])
+
+
+@pytest.fixture
+def someone(generator):
+    return Person(human(), varied_draws(8, generator))
+
+
+@pytest.mark.parametrize("time", [0, 1, 5])
+@pytest.mark.parametrize("kind", KINDS)
+def test_beliefs_are_those_of_whole_rounds(someone, generator, kind, time):
+    past, _ = random_round(time, generator)
+    tracks = Tracks(someone, past, 5, 120, generator)
+    beliefs, before = kind.before(someone, past)
+    parent = before[tracks.eye]
+    for step in range(5):
+        beliefs, parent = beliefs.after(tracks.looks(step, parent))
+        mine = beliefs.courses[parent]
+        expected = tracks.expected(step)
+        torch.testing.assert_close(mine[:, -1], expected[:, -1], rtol=0, atol=1e-5)
+        if kind is CourseBeliefs:
+            torch.testing.assert_close(mine, expected, rtol=0, atol=1e-5)
+    # Messages, eyes and actions matter: of tracks that differ in one of them alone, some differ.
+    apart = (expected[:, None, -1] - expected[:, -1]).abs().amax(-1)
+    parts = (tracks.told.flatten(1), tracks.eye[:, None], tracks.path[:, -1:])
+    different = torch.stack([(part[:, None] != part).any(-1) for part in parts])
+    for part in different:
+        assert apart[part & (different.sum(0) == 1)].max() > 0.01
+
+
+@pytest.mark.parametrize("time", [0, 4])
+def test_both_kinds_of_beliefs_agree(someone, generator, time):
+    past, _ = random_round(time, generator)
+    tracks = Tracks(someone, past, 6, 200, generator)
+    (quick, own), (slow, same) = (kind.before(someone, past) for kind in KINDS)
+    parent, other = own[tracks.eye], same[tracks.eye]
+    for step in range(6):
+        quick, parent = quick.after(tracks.looks(step, parent))
+        slow, other = slow.after(tracks.looks(step, other))
+        torch.testing.assert_close(
+            quick.courses[parent, -1], slow.courses[other, -1], rtol=0, atol=1e-5
+        )
+        # The quick ones work out fewer, and the slow ones one for each look.
+        assert len(quick.courses) < 200
+        assert len(slow.courses) == 200
+
+
+def test_the_last_action_and_everything_told_so_far_is_in_a_belief(someone, generator):
+    """A change of any of them in the round so far changes the next belief, as it does in rounds."""
+    past, _ = random_round(3, generator)
+
+    def next_belief(past):
+        tracks = Tracks(someone, past, 1, someone.eye_count, torch.Generator().manual_seed(0))
+        beliefs, before = StepwiseBeliefs.before(someone, past)
+        beliefs, index = beliefs.after(tracks.looks(0, before[tracks.eye]))
+        torch.testing.assert_close(
+            beliefs.courses[index, -1], tracks.expected(0)[:, -1], rtol=0, atol=1e-5
+        )
+        return beliefs.courses[index, -1]
+
+    base = next_belief(past)
+    for step in range(3):
+        actions = past.actions.clone()
+        actions[step] = 1 - actions[step]
+        changed = type(past)(past.observation, actions, past.told)
+        assert (next_belief(changed) - base).abs().max() > 1e-3
+        told = {name: mask.clone() for name, mask in past.told.items()}
+        told["verbal"][step] = ~told["verbal"][step]
+        changed = type(past)(past.observation, past.actions, told)
+        assert (next_belief(changed) - base).abs().max() > 1e-3
+
+
+# --- which beliefs are shared -----------------------------------------------------------------
+
+
+def look_around(someone, past, messages, kind=StepwiseBeliefs):
+    """Beliefs after each eye's look with each message ``[M, N]``; which one, ``[M, U]``."""
+    beliefs, own = kind.before(someone, past)
+    eye = torch.arange(someone.eye_count).repeat(len(messages))
+    last = int(past.actions[-1]) if past.time else ACTIONS
+    looks = Looks(
+        parent=own[eye],
+        eye=eye,
+        action=torch.full_like(eye, last),
+        row=torch.zeros_like(eye),
+        observation={name: value[None] for name, value in past.now.items()},
+        told=CHANNELS.split(messages.repeat_interleave(someone.eye_count, 0)),
+    )
+    beliefs, index = beliefs.after(looks)
+    return beliefs, index.view(len(messages), -1)
+
+
+def test_eyes_that_see_the_same_share_a_belief():
+    # Thresholds are 0, 1, 2, 3, 4, 6 and 12 cells; the only car is 4 cells ahead.
+    past = begun(0, [4, 30, -30, -30], [-1, 1, -1, -1])
+    someone = person(5, front_own=[0, 2, 3, 4, 5])
+    assert someone.eye_count == 5
+    beliefs, which = look_around(someone, past, flags()[None])
+    which = which[0, someone.eye]
+    assert len(beliefs.courses) == 2
+    assert (which[:3] == which[0]).all() and (which[3:] == which[3]).all()
+    assert which[0] != which[3]
+
+
+def test_words_that_make_all_eyes_see_the_same_make_their_beliefs_the_same():
+    past = begun(0, [4, 30, -30, -30], [-1, 1, -1, -1])
+    someone = person(2, front_own=[0, FULL_SIGHT])
+    shown = flags(visual=["front-left"])
+    beliefs, which = look_around(someone, past, torch.stack([flags(), shown]))
+    silence, told = beliefs.courses[which][:, :, 0]
+    assert not torch.allclose(silence[0], silence[1])
+    torch.testing.assert_close(told[0], told[1], rtol=0, atol=0)
+
+
+def test_what_eyes_saw_before_keeps_their_beliefs_apart():
+    """At first one sees the car and the other does not; then it is far from both."""
+    past = begun(0, [4, 30, -30, -30], [1, 1, -1, -1])
+    later = begun(0, [11, 30, -30, -30], [1, 1, -1, -1]).now
+    past = past.then(CHANNELS.split(flags()), 0, later)
+    for assumes_clear in (0, 1):
+        someone = person(2, front_own=[3, 4], assumes_clear=assumes_clear)
+        beliefs, which = look_around(someone, past, flags()[None])
+        assert len(set(which[0].tolist())) == 2
+        assert not torch.allclose(*beliefs.courses[which[0]])
+    # Two who both saw nothing share their beliefs from the beginning on.
+    before, own = StepwiseBeliefs.before(person(2, front_own=[2, 3]), past)
+    assert len(before.courses) == 1
+    assert own.tolist() == [0, 0]
+
+
+def test_somebody_who_assumes_a_clear_road_believes_otherwise():
+    past = begun(0, [4, 30, -30, -30], [-1, 1, -1, -1])
+    someone = person(2, assumes_clear=[0, 1])
+    beliefs, which = look_around(someone, past, flags()[None])
+    assert len(set(which[0].tolist())) == 2
+    assert (beliefs.courses[which[0, 0]] - beliefs.courses[which[0, 1]]).abs().max() > 0.01
+
+
+# --- models that look back further ------------------------------------------------------------
+
+
+class Same(HumanModel):
+    """Overrides a method without a change, so nothing is known of it."""
+
+    def believe(self, view, observation, actions):
+        return super().believe(view, observation, actions)
+
+
+class Vouched(Same):
+    stepwise = True
+
+
+def test_models_of_which_nothing_is_known_are_gone_through_again(generator):
+    past, _ = random_round(2, generator)
+    for model, kind in (
+        (HumanModel, StepwiseBeliefs),
+        (Averaging, CourseBeliefs),
+        (Same, CourseBeliefs),
+        (Vouched, StepwiseBeliefs),
+    ):
+        assert model.stepwise is (kind is StepwiseBeliefs)
+        beliefs, own = beliefs_before(person(3, model(self_model())), past)
+        assert isinstance(beliefs, kind), model
+        assert own.shape == (1,)
+
+
+@pytest.mark.parametrize("time", [0, 3])
+def test_a_model_that_looks_back_further_believes_as_in_whole_rounds(generator, time):
+    past, _ = random_round(time, generator)
+    model = Averaging(self_model())
+    someone = Person(model, varied_draws(4, generator, model))
+    tracks = Tracks(someone, past, 4, 40, generator)
+    beliefs, before = beliefs_before(someone, past)
+    parent = before[tracks.eye]
+    for step in range(4):
+        beliefs, parent = beliefs.after(tracks.looks(step, parent))
+    mine = beliefs.courses[parent]
+    torch.testing.assert_close(mine, tracks.expected(3), rtol=0, atol=1e-5)
+    usual = human().believe
+    model.believe = usual  # what it would believe if it did not look back
+    assert (mine - tracks.expected(3)).abs().max() > 0.01
+
+
+def test_decisions_are_the_same_whichever_way_beliefs_are_worked_out(generator):
+    past, _ = random_round(3, generator)
+    draws = varied_draws(6, generator)
+    quick, slow = (
+        Communicator(
+            Person(model(self_model()), draws), ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0)
+        ).plan(past)
+        for model in (HumanModel, Same)
+    )
+    assert torch.equal(quick.flags, slow.flags)
+    assert torch.equal(quick.found.candidates, slow.found.candidates)
+    torch.testing.assert_close(
+        quick.found.valued.utility, slow.found.valued.utility, rtol=0, atol=1e-4
+    )

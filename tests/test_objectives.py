@@ -1,0 +1,399 @@
+"""What messages are worth: against a reference that goes through every course, and by hand."""
+
+import pytest
+import torch
+from example_person import (
+    CHANNELS,
+    DOMAIN,
+    Averaging,
+    begun,
+    flags,
+    human,
+    implants,
+    person,
+    plan,
+    random_round,
+    self_model,
+    varied_draws,
+)
+from torch.distributions import Independent, Normal, kl_divergence
+
+from mirror_ppl.communication import (
+    Divergence,
+    ExpectedUtility,
+    Futures,
+    Person,
+    SelfModelWorld,
+    SimulatorWorld,
+    every_message,
+)
+from mirror_ppl.domains.base import total_reward
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models import HumanModel
+
+ACTIONS = len(DOMAIN.actions)
+
+
+# --- a reference without shortcuts ------------------------------------------------------------
+
+
+class Simulated:
+    """The world as it is, from a state ``[1]``."""
+
+    def __init__(self, past, state):
+        self.start = state
+
+    def step(self, state, action):
+        """The next state, what there is to observe in it, and the reward."""
+        done = torch.tensor([action])
+        following = DOMAIN.transition(state, done)
+        reward = total_reward(DOMAIN.rewards(state, done, following))
+        return following, DOMAIN.observe(following), float(reward)
+
+
+class Learned:
+    """The world as the self-model has learned it; states are means."""
+
+    def __init__(self, past, state):
+        self.start = robot(past).mean[None]
+
+    def step(self, state, action):
+        done = torch.tensor([action])
+        following = self_model().transition(state, done).mean
+        observation = DOMAIN.nearest(self_model().decode(following))
+        return following, observation, float(self_model().reward(state, done).mean)
+
+
+def robot(past):
+    """What the robot believes, which sees everything: one step after the other."""
+    model = self_model()
+    embedded = model.encoder.embed(DOMAIN.symbols(past.observation))
+    everything = embedded["ego"] + embedded["visual"].sum(-2) + embedded["verbal"].sum(-2)
+    belief = torch.zeros(model.latent)
+    for step, evidence in enumerate(everything):
+        last = past.actions[step - 1] if step else torch.tensor(ACTIONS)
+        state = model.encoder(belief, evidence + model.encoder.action(last))
+        belief = state.mean
+    return state
+
+
+def chances(model, draw, past, told):
+    """Probabilities of the next action of one draw, told this now: through the whole round."""
+    now = past.then(CHANNELS.split(told), 0, past.now)  # the last observation is not used
+    steps = past.time + 1
+    observation = {name: value[None, :steps] for name, value in now.observation.items()}
+    masks = {name: mask[None] for name, mask in now.told.items()}
+    eyes = {name: value[0] for name, value in draw.items() if not value.is_floating_point()}
+    belief = model.believe(model.perceive(eyes, observation, masks), observation, now.actions[None])
+    values = self_model().action_values(belief)
+    return model.act(draw, belief[None], values[None])[0, 0, -1].exp().tolist()
+
+
+@torch.no_grad()
+def worth(model, draw, past, world, candidate, horizon, discount):
+    """Utility of one candidate ``[L, N]`` for one draw, and chances of actions by step."""
+    predicted = torch.zeros(horizon, ACTIONS)
+
+    def rest(past, state, step, weight):
+        if step == horizon:
+            return 0.0
+        told = candidate[step] if step < len(candidate) else torch.zeros(8, dtype=torch.bool)
+        shown, said = int(told[:4].sum()), int(told[4:].sum())
+        utility = -(0.01 * shown**2 + 0.03 * said**2)
+        for action, chance in enumerate(chances(model, draw, past, told)):
+            predicted[step, action] += weight * chance
+            following, observation, reward = world.step(state, action)
+            seen = {name: value[0] for name, value in observation.items()}
+            later = past.then(CHANNELS.split(told), action, seen)
+            onwards = rest(later, following, step + 1, weight * chance)
+            utility += chance * (reward + discount * onwards)
+        return utility
+
+    return rest(past, world.start, 0, 1.0), predicted
+
+
+def reference(someone, past, world, candidates, horizon, discount=1.0):
+    """Utilities ``[C, S]`` and chances of actions ``[C, H, A]``."""
+    utility = torch.zeros(len(candidates), someone.number)
+    predicted = torch.zeros(len(candidates), horizon, ACTIONS)
+    for s in range(someone.number):
+        draw = {name: value[s] for name, value in someone.draws.items()}
+        for c, candidate in enumerate(candidates):
+            utility[c, s], mine = worth(
+                someone.human, draw, past, world, candidate, horizon, discount
+            )
+            predicted[c] += mine / someone.number
+    return utility, predicted
+
+
+def candidates_of(past, generator, steps):
+    """Silence, a message now, the same later, one after another, and something at every step."""
+    allowed = CHANNELS.join(DOMAIN.communicable(past.now))
+    some = allowed & (torch.rand(8, generator=generator) < 0.6)
+    other = allowed & ~some
+    noise = torch.rand(steps, 8, generator=generator) < 0.4
+    return torch.stack(
+        [
+            plan(*[None] * steps),
+            plan(allowed, *[None] * (steps - 1)),
+            plan(*[None] * (steps - 1), allowed),
+            plan(some, other, *[None] * (steps - 2)),
+            allowed & noise,
+        ]
+    )
+
+
+class HandSet:
+    """The road as it is, with rewards set by hand: of each step ``[W, A**(h + 1)]``."""
+
+    def __init__(self, rewards):
+        self.rewards, self.draws = rewards, len(rewards[0])
+
+    def futures(self, past, horizon, generator):
+        observations = SimulatorWorld(DOMAIN).futures(past, horizon, generator).observations
+        several = [
+            {name: value.expand(self.draws, *value.shape[1:]) for name, value in one.items()}
+            for one in observations
+        ]
+        return Futures(several, self.rewards)
+
+
+@pytest.mark.parametrize(
+    ("time", "horizon", "steps", "discount", "model", "world"),
+    [
+        (0, 4, 3, 1.0, HumanModel, SimulatorWorld),
+        (3, 3, 2, 0.8, HumanModel, SimulatorWorld),
+        (6, 4, 4, 0.9, HumanModel, SimulatorWorld),
+        (2, 3, 2, 0.9, HumanModel, SelfModelWorld),
+        (2, 3, 3, 1.0, Averaging, SimulatorWorld),
+    ],
+)
+def test_utilities_are_those_of_every_course(
+    generator, time, horizon, steps, discount, model, world
+):
+    past, state = random_round(time, generator)
+    model = model(self_model())
+    someone = Person(model, varied_draws(3, generator, model))
+    candidates = candidates_of(past, generator, steps)
+    if world is SimulatorWorld:
+        real, own = Simulated(past, state), SimulatorWorld(DOMAIN)
+    else:
+        real, own = Learned(past, state), SelfModelWorld(self_model())
+    expected, predicted = reference(someone, past, real, candidates, horizon, discount)
+    value = ExpectedUtility(own, horizon, discount, branch=0).at(someone, past, 15 - time, 0)
+    valued = value(candidates)
+    torch.testing.assert_close(valued.utility, expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(valued.actions, predicted, rtol=0, atol=1e-4)
+    # Where all is still to tell, messages change what is done.
+    assert time > 0 or (predicted - predicted[:1]).abs().max() > 0.01
+    # A candidate's value does not depend on which others are valued along with it.
+    for c, candidate in enumerate(candidates):
+        alone = value(candidate[None])
+        torch.testing.assert_close(alone.utility[0], expected[c], rtol=0, atol=1e-4)
+        torch.testing.assert_close(alone.actions[0], predicted[c], rtol=0, atol=1e-4)
+
+
+def test_silence_after_a_message_is_the_message_alone(generator):
+    past, _ = random_round(2, generator)
+    someone = Person(human(), varied_draws(4, generator))
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4).at(someone, past, 13, 0)
+    told = flags(visual=["front-left"], verbal=["rear-right"])
+    short, long = value(plan(told)[None]), value(plan(told, None, None)[None])
+    torch.testing.assert_close(short.utility, long.utility)
+
+
+# --- improbable courses -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("branch", [0.1, 0.2, 0.4, 1.0])
+def test_keeping_some_courses_by_chance_is_right_on_average(seed, branch):
+    """Draws that are alike differ in their luck alone: their mean is within 4.5 standard errors.
+
+    Of 20 comparisons one fails in about 7,000 seeds.
+    """
+    past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
+    one, number = flags(verbal=["front-left"]), 3000
+    candidates = torch.stack([plan(None), plan(one), plan(one | flags(verbal=["rear-right"]))])
+
+    def value(number, branch, seed):
+        someone = person(number, consistency=0.3, lapse=0.1)
+        return ExpectedUtility(SimulatorWorld(DOMAIN), 4, 0.9, branch).at(someone, past, 15, seed)
+
+    exact, valued = value(1, 0, 0)(candidates), value(number, branch, seed)(candidates)
+    gain, right = valued.utility - valued.utility[:1], exact.utility - exact.utility[:1]
+    for sample, mean in ((valued.utility, exact.utility), (gain[1:], right[1:])):
+        error = sample.std(-1) / number**0.5
+        # Sums of thousands of rewards are rounded, where nothing is left to chance too.
+        assert ((sample.mean(-1) - mean[:, 0]).abs() < 4.5 * error + 1e-4).all()
+        assert (error > 1e-3).any()
+    # A draw's weight on an action is from 0 to about 1: its variance is at most about a quarter.
+    assert (valued.actions - exact.actions).abs().max() < 4.5 * 0.5 / number**0.5
+    # The luck is the same for the same seed, and another for another.
+    assert torch.equal(value(number, branch, seed)(candidates).utility, valued.utility)
+    assert not torch.equal(value(number, branch, seed + 1)(candidates).utility, valued.utility)
+
+
+def test_at_branch_one_each_draw_follows_a_single_course():
+    """Only the third step is rewarded, by which of four courses led to it: a whole number."""
+    rewards = [torch.zeros(1, 2), torch.zeros(1, 4), torch.arange(4.0).repeat_interleave(2)[None]]
+    past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
+    someone = person(200, consistency=0.3)
+    value = ExpectedUtility(HandSet(rewards), 3, branch=1).at(someone, past, 15, 0)
+    followed = value(plan(None)[None]).utility[0]
+    torch.testing.assert_close(followed, followed.round(), rtol=0, atol=1e-5)
+    assert set(followed.round().long().tolist()) == {0, 1, 2, 3}
+
+
+def test_all_candidates_have_the_same_luck():
+    """To somebody who does not listen all messages are worth the same, whatever was left to chance.
+
+    So gains over silence have no spread at all: they are the costs.
+    """
+    past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
+    someone = person(20, consistency=0.0)
+    candidates = every_message(torch.ones(8, dtype=torch.bool))[:, None]
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0.4).at(someone, past, 15, 0)
+    utility = value(candidates).utility
+    assert utility[0].std() > 0.1
+    gain = utility - utility[:1]
+    cost = CHANNELS.cost(candidates[:, 0])
+    torch.testing.assert_close(gain, -cost[:, None].expand_as(gain), rtol=0, atol=1e-4)
+
+
+# --- horizon, discount, costs -----------------------------------------------------------------
+
+
+def test_steps_after_the_end_of_the_round_do_not_count(generator):
+    past, _ = random_round(4, generator)
+    someone = Person(human(), varied_draws(4, generator))
+    candidates = candidates_of(past, generator, 4)
+    world = SimulatorWorld(DOMAIN)
+    cut = ExpectedUtility(world, 6, 0.9, 0).at(someone, past, 2, 0)(candidates)
+    short = ExpectedUtility(world, 2, 0.9, 0).at(someone, past, 11, 0)(candidates)
+    longer = ExpectedUtility(world, 3, 0.9, 0).at(someone, past, 11, 0)(candidates)
+    assert cut.actions.shape == (5, 2, ACTIONS)
+    torch.testing.assert_close(cut.utility, short.utility)
+    torch.testing.assert_close(cut.actions, short.actions)
+    assert (cut.utility - longer.utility).abs().max() > 0.1
+    # What would be said only then neither helps nor costs.
+    torch.testing.assert_close(cut.utility[2], cut.utility[0])
+
+
+@pytest.mark.parametrize("discount", [1.0, 0.5])
+def test_messages_are_charged_at_the_step_at_which_they_are_sent(discount):
+    past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
+    someone = person(2, consistency=0.0)
+    two = flags(visual=["front-left", "front-right"])
+    three = flags(verbal=["front-left", "rear-left", "rear-right"])
+    silence = plan(None, None, None)
+    candidates = torch.stack([silence, plan(two, None, None), plan(None, two, three)])
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 5, discount).at(someone, past, 15, 0)
+    gain = value(candidates).utility - value(candidates).utility[:1]
+    expected = torch.tensor([0, -0.04, -(0.04 * discount + 0.27 * discount**2)])
+    torch.testing.assert_close(gain, expected[:, None].expand(3, 2), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("discount", "total"), [(1.0, 4.0), (0.5, 1.875)])
+def test_rewards_are_discounted_by_step(discount, total):
+    past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
+    world = HandSet([torch.ones(1, ACTIONS ** (h + 1)) for h in range(4)])
+    value = ExpectedUtility(world, 4, discount, branch=0).at(person(), past, 15, 0)
+    assert value(plan(None)[None]).utility.item() == pytest.approx(total, abs=1e-5)
+
+
+def test_draws_are_dealt_out_over_draws_of_the_world():
+    past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
+    own = torch.tensor([1.0, 10.0, 100.0])[:, None]
+    world = HandSet([own.expand(3, ACTIONS ** (h + 1)) for h in range(2)])
+    value = ExpectedUtility(world, 2, branch=0).at(person(7), past, 15, 0)
+    expected = torch.tensor([[2.0, 20, 200, 2, 20, 200, 2]])
+    torch.testing.assert_close(value(plan(None)[None]).utility, expected)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"horizon": 0}, "horizon must be at least 1, not 0"),
+        ({"discount": 0.0}, "discount must be above 0 and at most 1, not 0.0"),
+        ({"discount": 1.1}, "discount must be above 0 and at most 1, not 1.1"),
+        ({"branch": -0.1}, "branch must be from 0 to 1, not -0.1"),
+        ({"branch": 1.5}, "branch must be from 0 to 1, not 1.5"),
+    ],
+)
+def test_impossible_options_are_refused(options, message):
+    with pytest.raises(ValueError) as error:
+        ExpectedUtility(SimulatorWorld(DOMAIN), **options)
+    assert str(error.value) == message
+
+
+def test_a_world_has_at_least_one_draw():
+    with pytest.raises(ValueError, match="draws must be at least 1, not 0"):
+        SelfModelWorld(self_model(), 0)
+
+
+# --- divergence -------------------------------------------------------------------------------
+
+
+def told_belief(draw, past, told):
+    """``q(zH_t | told)`` of one draw: the belief before, and a step from it."""
+    eyes = {name: value[0] for name, value in draw.items() if not value.is_floating_point()}
+    now = past.then(CHANNELS.split(told), 0, past.now)
+    observation = {name: value[None, :-1] for name, value in now.observation.items()}
+    view = human().perceive(eyes, observation, {name: m[None] for name, m in now.told.items()})
+    evidence = human().evidence(view, observation)[0, -1]
+    before, last = torch.zeros(self_model().latent), torch.tensor(ACTIONS)
+    if past.time:
+        before = human().believe(view, observation, now.actions[None])[0, -2]
+        last = past.actions[-1]
+    return human().advance(before, evidence, last)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("time", [0, 1, 4])
+@pytest.mark.parametrize(("measure", "weight"), [("kl", 1.0), ("kl", 2.5), ("squared", 0.5)])
+def test_divergence_is_that_of_two_gaussians(generator, time, measure, weight):
+    past, _ = random_round(time, generator)
+    someone = Person(human(), varied_draws(4, generator))
+    candidates = candidates_of(past, generator, 2)
+    valued = Divergence(weight, measure).at(someone, past, 5, 0)(candidates)
+    assert valued.actions is None
+    mine = robot(past)
+    for c, candidate in enumerate(candidates):
+        for s in range(4):
+            draw = {name: value[s] for name, value in someone.draws.items()}
+            theirs = told_belief(draw, past, candidate[0])
+            if measure == "kl":
+                apart = kl_divergence(*(Independent(Normal(*q), 1) for q in (mine, theirs)))
+            else:
+                apart = (mine.mean - theirs.mean).pow(2).sum()
+            expected = -weight * apart - CHANNELS.cost(candidate[0])
+            torch.testing.assert_close(valued.utility[c, s], expected, rtol=1e-4, atol=1e-4)
+    # Where all is still to tell, more than costs is at stake.
+    apart = valued.utility + CHANNELS.cost(candidates[:, 0])[:, None]
+    assert time > 0 or apart.std(0).max() > 0.1
+
+
+def test_models_without_a_density_are_refused(generator):
+    past, _ = random_round(1, generator)
+    model = Averaging(self_model())
+    with pytest.raises(HumanModelError) as error:
+        Divergence().at(Person(model, implants(2, model)), past, 5, 0)
+    assert str(error.value) == (
+        "Averaging is not stepwise, and its beliefs have no density to compare; see "
+        "HumanModel.stepwise"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"measure": "js"}, 'measure must be kl or squared, not "js"'),
+        ({"weight": 0.0}, "weight must be positive, not 0.0"),
+        ({"weight": -1.0}, "weight must be positive, not -1.0"),
+        ({"weight": float("nan")}, "weight must be positive, not nan"),
+    ],
+)
+def test_impossible_measures_are_refused(options, message):
+    with pytest.raises(ValueError) as error:
+        Divergence(**options)
+    assert str(error.value) == message
