@@ -46,7 +46,8 @@ def test_the_message_in_all_forms():
 
 
 def test_the_table_of_alternatives():
-    actions = [[[0.9, 0.1]], [[0.8, 0.2]], [[0.5, 0.5]], [[0.25, 0.75]]]
+    # Now, and in the next step, which is not shown.
+    actions = [[[stay, 1 - stay], [0.6, 0.4]] for stay in (0.9, 0.8, 0.5, 0.25)]
     candidates = [plan(None, None), plan(SHOWN, SAID | OTHER), plan(OTHER, None), plan(SAID, None)]
     table = decision(2, candidates, [[0.0, 0], [1, -2], [3, 4], [0, 0]], actions).alternatives
     assert list(table.columns) == [
@@ -87,7 +88,11 @@ def test_what_each_item_adds():
     )
     assert four(1).matters == pytest.approx({("visual", "front-left"): 1.0})
     assert four(0).matters == {}
-    # Left out where the message without it was not valued; what comes later has to be the same.
+    # It is left out now alone: what comes later stays the same, whatever that is.
+    again = [plan(None, None), plan(SHOWN, SHOWN), plan(None, SHOWN), plan(SHOWN, None)]
+    twice = decision(1, again, [[0.0], [3.0], [1.0], [2.5]])
+    assert twice.matters == pytest.approx({("visual", "front-left"): 2.0})
+    # Items without which the message was not valued are not there.
     candidates = [plan(None, None), plan(SHOWN | SAID, OTHER), plan(SHOWN, None), plan(SAID, OTHER)]
     partly = decision(1, candidates, [[0.0], [3.0], [2.0], [2.5]])
     assert partly.matters == pytest.approx({("visual", "front-left"): 0.5})

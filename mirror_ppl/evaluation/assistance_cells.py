@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -168,9 +169,12 @@ def run_cells(
             for name in names
             for number in range(people)
         )
-        for name, number, played in cast(Iterator[tuple[str, int, Played]], finished):
-            results[name, number] = played
-            report(len(results), f"{name}, person {number + 1}")
+        with warnings.catch_warnings():
+            # Processes that have used much memory are replaced by new ones; nothing is lost.
+            warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
+            for name, number, played in cast(Iterator[tuple[str, int, Played]], finished):
+                results[name, number] = played
+                report(len(results), f"{name}, person {number + 1}")
 
     work(first)
     if "random" in communicators:
