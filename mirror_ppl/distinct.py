@@ -9,15 +9,15 @@ from torch import Tensor
 def random_keys(number: int, device: torch.device) -> Tensor:
     """Random 62-bit keys ``[number]``: sums of different sets of them differ.
 
-    But for a chance of about one in 2**62; and sorting numbers is a hundred times quicker than
-    sorting rows.
+    But for a chance of about one in 2**62, if what they are multiplied with is small, as masks
+    and indices are. Sorting numbers is a hundred times quicker than sorting rows.
     """
     keys = torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(0))
     return keys.to(device)
 
 
 def distinct_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """First of each set of equal rows of whole numbers ``[M, N]``, and each row's set ``[M]``."""
+    """First of each set of equal rows of small whole numbers ``[M, N]``; each row's set ``[M]``."""
     values, inverse = torch.unique(
         rows @ random_keys(rows.shape[1], rows.device), return_inverse=True
     )

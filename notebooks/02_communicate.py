@@ -15,17 +15,22 @@
 # %% [markdown]
 # # What should the robot tell this person, and when?
 #
-# A person drives in fog. They see two cells ahead and nothing behind; the robot sees the whole
-# road. It may show cars (0.01 n² for n cars in one step) or speak of them (0.03 n²). Telling
-# everything is expensive and tiring, telling nothing ends in collisions.
+# A person drives on a road with two lanes, in fog. They see two cells ahead and nothing behind.
+# The robot sees the whole road. At each step it may show them cars, speak of cars, or be silent.
+# To show *n* cars costs 0.01 n², to speak of *n* cars costs 0.03 n². Who is told nothing runs into
+# cars; who is told everything pays for it.
 #
 # From twenty recorded rounds the robot has inferred what this person sees and how they decide
-# (notebook 01). Here it uses that to choose what to say. We replay one round with and without
-# messages, look at one decision closely, and end with a comparison over some rounds.
+# (notebook 01 looks at that). Here it plans with it. For each message that it could send it asks:
+# what would this person believe, what would they do, and how would that end?
+#
+# We send messages by hand, replay a round with and without them, look closely at one decision, and
+# compare a few ways to speak.
 
 # %%
 import os
 import warnings
+from types import SimpleNamespace
 
 import pandas as pd
 import torch
@@ -34,9 +39,9 @@ import torch
 warnings.filterwarnings("ignore", message="IProgress not found")
 
 from mirror_ppl.communication import (
+    Automatic,
     Communicator,
     ExpectedUtility,
-    Patient,
     Person,
     RoundSoFar,
     SimulatorWorld,
@@ -50,193 +55,320 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 # The networks are small: one thread is as fast as several.
 torch.set_num_threads(1)
-# The project's tests run this notebook with few rounds and steps.
+# The project's tests run this notebook with few rounds, steps and draws.
 quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
 
 # %% [markdown]
 # ## The person, as the robot knows them
 #
-# The first of the ten people in the recordings that ship. 64 draws from their posterior are what
-# the communicator plans with: it does not know what they see, it has 64 opinions about it.
+# One of the ten people in the recordings that ship. The communicator plans with 64 draws from
+# their posterior. So it has not one opinion of what they see, but 64, and messages have to be
+# worth sending on average over these.
+#
+# A posterior that was saved is read with `load_posterior(path).draws(human, 64)`, from
+# `mirror_ppl.inference.posterior_file`.
 
 # %%
 domain = get_domain("driving")
 self_model, card = load_self_model(shipped_weights("driving"))
 human = HumanModel(self_model)
 recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people(["person-01"])
-options = FitOptions(steps=60 if quick else 300, draws=64)
-fit = fit_people(human, recordings, options, seed=0, train_rounds=20)
+options = FitOptions(steps=30, draws=16) if quick else FitOptions(draws=64)
+fit = fit_people(human, recordings, options, seed=0, train_rounds=10 if quick else None)
 person = Person(human, fit.posterior.draws)
 
-pd.DataFrame(fit.summary["people"][0]["implants"]).T
+pd.DataFrame(fit.summary["people"][0]["implants"]).T.round(2)
 
 # %% [markdown]
 # ## The communicator
 #
-# Three parts: the person, what messages are for, and how candidates are searched. The world that
-# is rolled forward is the domain's own simulator; where there is none,
-# `SelfModelWorld(self_model)` takes its place.
+# It has two parts: whom it speaks to, and what messages are for. Here they are for reward, looked
+# for in the domain's own simulator. Where there is no simulator, `SelfModelWorld(self_model)` takes
+# its place: what the robot has learned of the world.
 
 # %%
 communicator = Communicator(person, ExpectedUtility(SimulatorWorld(domain)))
 
 # %% [markdown]
-# ## A round, driven by you
+# ## In your own simulator, or on your robot
 #
-# No hidden loop owns the world: `plan` is a function of the round so far. The person here is
-# simulated, so we can also look at what they really think. With a real person, `driver.step` is
-# where they act, and `observe` is your robot's perception. `luck` are the random numbers by which
-# the person chooses: the same with and without messages, so that what differs is what was said.
+# No loop owns the world. `plan` is a function of the round so far: what there was to observe, what
+# the person was told, and what they did. You say what happened, it says what to tell them.
+#
+# Here is a road by hand. The person is in the left lane. A car 4 cells ahead of them slows down,
+# one 5 cells behind comes closer, and two are in the other lane. `domain.observe` writes that down
+# as tensors; on a robot, your perception does (`docs/driving.md` says what is in them).
+
+# %%
+from mirror_ppl.domains.driving import DrivingState
+
+state = DrivingState(
+    lane=torch.tensor(0),
+    position=torch.tensor([4, 8, -5, -9]),  # front left and right, rear left and right
+    speed=torch.tensor([-1, 1, 1, -1]),  # relative to the person
+)
+so_far = RoundSoFar.begin(domain, domain.observe(state))
+decision = communicator.plan(so_far)
+print(decision.message)
+print(decision.why())
+
+# %% [markdown]
+# Now send `decision.message` (here there is nothing to send), and watch. Say the person stays in
+# their lane. Tell the communicator so, with what there is to observe afterwards, and ask again.
+
+# %%
+stay = domain.actions.index("stay")
+state = domain.transition(state, torch.tensor(stay))
+so_far = so_far.then(decision.told, stay, domain.observe(state))
+decision = communicator.plan(so_far)
+print(decision.message)
+print(decision.why())
+
+# %% [markdown]
+# Below, somebody acts: the simulated person of these recordings. We know what they really think,
+# which with real people nobody does. `luck` are the random numbers by which they choose. With the
+# same start and the same luck, rounds differ only in what was said.
 
 # %%
 from mirror_ppl.people import Memory, draw_starts, simulated_drivers
 
 driver = simulated_drivers("fog", "paper", 10, 0).select([0])
-starts = draw_starts(1, 60, 0, "notebook")
+starts = draw_starts(1, 8 if quick else 60, 0, "notebook")
 silence = {m.name: torch.zeros(len(m.items), dtype=torch.bool) for m in domain.modalities}
 
 
+def begin(number):
+    """The state at the start of a round."""
+    parts = {name: part[:, number : number + 1] for name, part in vars(starts.state).items()}
+    return DrivingState(**parts)
+
+
 def observe(state):
+    """What there is to observe in one state."""
     return {name: value[0, 0] for name, value in domain.observe(state).items()}
 
 
 def drive(number, communicator=None):
-    """Play a round; returns the round, decisions, what the person knew, and rewards by step."""
-    begin = {name: part[:, number : number + 1] for name, part in vars(starts.state).items()}
-    state, memory = type(starts.state)(**begin), driver.start(1)
-    so_far = RoundSoFar.begin(domain, observe(state))
+    """Play a round.
+
+    Returns:
+        moments: the round as it was before each action, and at its end.
+        decisions: of the communicator.
+        knowledge: what the person knew at each step.
+        rewards: by step and term.
+    """
+    state, memory = begin(number), driver.start(1)
+    moments = [RoundSoFar.begin(domain, observe(state))]
     decisions, memories, rewards = [], [], []
     for step in range(domain.horizon):
-        decision = communicator.plan(so_far) if communicator else None
+        decision = communicator.plan(moments[-1]) if communicator else None
         told = decision.told if decision else silence
-        chances, memory = driver.step(
-            memory, domain.observe(state), {name: mask[None, None] for name, mask in told.items()}
-        )
+        heard = {name: mask[None, None] for name, mask in told.items()}
+        chances, memory = driver.step(memory, domain.observe(state), heard)
         action = (starts.luck[0, number, step] < chances[..., 1]).long()
         following = domain.transition(state, action)
         terms = domain.rewards(state, action, following)
         rewards.append({name: float(value) for name, value in terms.items()})
-        rewards[-1]["cost"] = -decision.cost if decision else 0.0
+        rewards[-1]["messages"] = -decision.cost if decision else 0.0
         state = following
-        so_far = so_far.then(told, int(action), observe(state))
+        moments.append(moments[-1].then(told, int(action), observe(state)))
         decisions.append(decision)
         memories.append(Memory(**{name: part[0, 0] for name, part in vars(memory).items()}))
-    return so_far, decisions, Memory.stack(memories, 0), pd.DataFrame(rewards)
+    knowledge, rewards = Memory.stack(memories, 0), pd.DataFrame(rewards)
+    return SimpleNamespace(
+        moments=moments, decisions=decisions, knowledge=knowledge, rewards=rewards
+    )
+
+
+def collides(played):
+    return bool((played.rewards["collision"] < 0).any())
 
 
 # %% [markdown]
-# Which round to look at? The first of these in which the person, told nothing, runs into a car,
-# and told what the communicator would tell them, into none.
+# ## A round that messages change
+#
+# Which round shall we look at? We play some with nobody speaking, and those with a collision once
+# more with the communicator.
 
 # %%
-for number in range(60):
-    alone = drive(number)
-    if not (alone[3]["collision"] < 0).any():
-        continue
-    aided = drive(number, communicator)
-    if not (aided[3]["collision"] < 0).any():
-        break
+alone = {number: drive(number) for number in range(starts.luck.shape[1])}
+alone = {number: played for number, played in alone.items() if collides(played)}
+aided = {number: drive(number, communicator) for number in alone}
+prevented = [number for number in aided if not collides(aided[number])]
+print(
+    f"{len(alone)} of {starts.luck.shape[1]} rounds have a collision if nothing is said;",
+    f"the communicator prevents it in {len(prevented)} of these {len(alone)}",
+)
 
-totals = {"alone": alone[3].sum(), "with the communicator": aided[3].sum()}
+# %% [markdown]
+# Not every collision can be prevented: where all ways are blocked, words do not help. And this is a
+# selection. It says nothing about rounds that go well without help; the comparison at the end does.
+#
+# Of the rounds in which the collision is prevented we leave out those in which it comes within
+# three steps, so that there is something to watch. Of the others we take the one with the message
+# of which the communicator expected most.
+
+
+# %%
+def crash_step(played):
+    """The step of the action that leads to the first collision."""
+    return int((played.rewards["collision"] < 0).values.argmax())
+
+
+def decisive_step(played):
+    """The step with the message of which most was expected."""
+    gains = [decision.gain.mean if decision.message else 0.0 for decision in played.decisions]
+    return gains.index(max(gains))
+
+
+number = max(
+    (number for number in prevented if crash_step(alone[number]) >= 3),
+    key=lambda number: aided[number].decisions[decisive_step(aided[number])].gain.mean,
+)
+told_nothing, told = alone[number], aided[number]
 print(f"round {number}")
+totals = {"told nothing": told_nothing.rewards.sum(), "communicator": told.rewards.sum()}
 pd.DataFrame(totals).T.assign(net=lambda table: table.sum(axis=1)).round(2)
 
 # %% [markdown]
-# What was said, and why:
+# Everything that was said in it, and why:
 
 # %%
-for step, decision in enumerate(aided[1]):
+for step, decision in enumerate(told.decisions):
     if decision.message:
         print(f"step {step}: {decision.message}\n    {decision.why()}\n    gain {decision.gain}")
 
 # %% [markdown]
 # ## Frame by frame
 #
-# Each frame shows the road as it is and, below it, what the person knows of it according to the
-# model. A cell is light where they would see a car; the number on a car is the share of posterior
-# draws, in percent, in which they have seen it or been told of it. The orange outline is what the
-# simulated person really thinks; the model has never seen it. The frames are those around the
-# first collision of the person who is told nothing.
+# Left, nobody speaks; right, the communicator does. Each frame shows the road as it is, and below
+# it what the person knows, in the robot's view: a cell is light where they would see a car. The
+# number on a car says how sure the robot is that they know of it, the share of the 64 draws in
+# which they have seen it or been told of it. What the simulated person really thinks is outlined;
+# the robot has not seen these outlines.
+#
+# The frames are the step of the decisive message, the last one before the collision, and the
+# collision. (The README shows this picture; `.savefig("communicate.png")` makes a file of it.)
 
 # %%
 from mirror_ppl.plots.replay import plot_frames
 
-crash = int((alone[3]["collision"] < 0).values.argmax())
-spoken = [step for step, decision in enumerate(aided[1][: crash + 1]) if decision.message]
-frames = sorted({*spoken[-2:], crash, crash + 1})
-rounds = {"told nothing": alone[0], "with the communicator": aided[0]}
-knowledge = {"told nothing": alone[2], "with the communicator": aided[2]}
-plot_frames(person, rounds, frames, knowledge)
+crash, step = crash_step(told_nothing), decisive_step(told)
+rounds = {"told nothing": told_nothing, "with the communicator": told}
+plot_frames(
+    person,
+    {title: played.moments[-1] for title, played in rounds.items()},
+    sorted({step, crash, crash + 1}),
+    {title: played.knowledge for title, played in rounds.items()},
+    cells=9,
+)
 
 # %% [markdown]
 # ## One decision
 #
-# The message before the collision that gains most. Every candidate was valued: what it gains over
-# silence, on average over the 64 draws, with its cost taken off. Silence is a candidate and wins
-# ties. Candidates that begin with "in 1 step" are plans: say nothing now, and this later. If such
-# a plan is best, the communicator waits.
+# A decision explains itself. `gain` is what the message is expected to be worth, compared with
+# silence, its cost taken off; in brackets the 90% interval of the mean over the 64 draws.
+
+# %%
+decision = told.decisions[step]
+print("message:", decision.message)
+print("gain:   ", decision.gain)
+print("why:    ", decision.why())
+
+# %% [markdown]
+# Every message was valued. The picture has the chosen one, the next best, everything at once, and
+# each car by itself. Silence is a candidate, too, and wins ties. Where a name has "in 1 step", the
+# candidate is a plan: this now, that later. Only what is for now is sent, and at the next step the
+# communicator plans anew.
 
 # %%
 from mirror_ppl.plots.communication import plot_action, plot_utilities
 
-step = max(spoken, key=lambda step: aided[1][step].gain.mean)
-decision = aided[1][step]
-print(f"step {step}: {decision.why()}")
 plot_utilities(decision)
 
 # %% [markdown]
-# The same as a table, with the predicted probability of each action right now:
+# The same as a table of all candidates, the best first. `later` is how many items follow in the
+# steps after, `probability` the share of draws in which a candidate is better than silence, and
+# `p(switch)` how probable a change of lanes is now.
 
 # %%
-decision.alternatives.head(8).round(3)
+decision.alternatives.head(6).round(3)
 
 # %% [markdown]
-# What each item of the message adds, and what the person is expected to do in the steps ahead:
+# How the message works: what the person is expected to do at this step and at the steps after it,
+# if they hear it, and if they do not.
 
 # %%
-print({" ".join(pair): round(gain, 3) for pair, gain in decision.matters.items()})
 plot_action(decision)
 
 # %% [markdown]
 # ## How sure, how patient
 #
-# `sure` is how many standard errors of its gain a message has to gain; `Patient(steps)` compares a
-# message with the same message up to `steps - 1` steps later. Without patience more is said, and
-# earlier than needed.
+# Two settings change when it speaks.
+#
+# - **Patience.** `Automatic(3)`, the default, compares each good message with the same message one
+#   or two steps later. What can wait waits: it may turn out not to be needed. `Automatic(1)` asks
+#   only whether a message is better than silence for good.
+# - **How sure.** With `sure=2`, the default, a message has to gain more than two standard errors of
+#   its gain. `sure=0` takes what is best on average, however uncertain that is. `sure=20` drops
+#   messages that gain little, and prefers a gain that is certain to one that is a bit larger.
+#
+# Here is what each would say in the round above, up to the step before the collision. All are given
+# the same past, in which the shipped settings spoke.
 
 # %%
-moments = range(3 if quick else 20)
-rows = []
-for name, search, sure in (
-    ("as shipped: 3 steps, sure 2", Patient(3), 2.0),
-    ("no patience", Patient(1), 2.0),
-    ("takes the best on average", Patient(3), 0.0),
-):
-    other = Communicator(person, ExpectedUtility(SimulatorWorld(domain)), search, sure)
-    played = [drive(number, other) for number in moments]
-    rows.append(
-        {
-            "communicator": name,
-            "items a round": sum(sum(len(d.message) for d in one[1]) for one in played)
-            / len(played),
-            "cost": -sum(one[3]["cost"].sum() for one in played) / len(played),
-            "net": sum(one[3].to_numpy().sum() for one in played) / len(played),
-        }
-    )
-played = [drive(number) for number in moments]
-net = sum(one[3].to_numpy().sum() for one in played) / len(played)
-rows.append({"communicator": "silence", "items a round": 0.0, "cost": 0.0, "net": net})
-pd.DataFrame(rows).set_index("communicator").round(2)
+utility = ExpectedUtility(SimulatorWorld(domain))
+others = {
+    "as shipped": communicator,
+    "no patience": Communicator(person, utility, Automatic(1)),
+    "sure=0": Communicator(person, utility, sure=0.0),
+    "sure=20": Communicator(person, utility, sure=20.0),
+}
+pd.DataFrame(
+    [
+        {name: str(other.plan(past).message) for name, other in others.items()}
+        for past in told.moments[: crash + 1]
+    ]
+).rename_axis("step")
 
 # %% [markdown]
-# These are a few rounds of one person; `python -m mirror_ppl.assist` does it properly, with
-# other communicators, an oracle as the ceiling, and paired intervals.
+# ## Is it worth it?
+#
+# New rounds, which nobody selected, each with the same start and the same luck for all. `none` is
+# silence, `all` tells everything at every step, `mirror` is the communicator. `oracle` is the
+# ceiling: it knows the person and the world exactly. `net` is the task's reward less the cost of
+# messages, on average over rounds; `above none` is how much more that is than with silence, and
+# `±` its standard error.
+
+# %%
+from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
+
+fresh = draw_starts(1, 2 if quick else 20, 0, "comparison")
+listener = Listener(domain, "fog", driver, fresh, person)
+rows, nothing = {}, None
+for name in ("none", "mirror", "all", "oracle"):
+    played = play(listener, speaker(name, listener, PlannerOptions(), seed=0))
+    nothing = played if nothing is None else nothing
+    above = pd.Series(played.net - nothing.net)
+    rows[name] = {
+        "collisions": sum(played.collisions) / len(above),
+        "items told": sum(map(sum, played.items.values())) / len(above),
+        "cost": sum(played.cost) / len(above),
+        "net": played.net.mean(),
+        "above none": above.mean(),
+        "±": above.sem(),
+    }
+pd.DataFrame(rows).T.round(2)
+
+# %% [markdown]
+# These are a few rounds of one person. `python -m mirror_ppl.assist` compares more ways to speak,
+# on all people of a posterior, with intervals.
 #
 # ## What to keep in mind
 #
 # - The communicator is as good as the posterior. If the model is sure of something wrong about a
-#   person, it will be sure of a wrong message. Look at notebook 01 first.
+#   person, it will be sure of a wrong message. Look at the person first, as in notebook 01.
 # - `gain` is what the model expects, not what happens. Its interval is over posterior draws: it
-#   says how much we do not know about the person, not how often the world will be kind.
-# - These people listen, understand and remember perfectly. Real ones do not; messages cost them
-#   attention, and the costs here are those of the paper.
+#   says how much is not known about the person, not how lucky a round will be.
+# - These people listen, understand and remember perfectly, and act on what they hear. Real people
+#   do not always. To them messages cost attention; the costs here are those of the paper.

@@ -129,9 +129,10 @@ def test_what_is_told_is_overlaid_on_what_is_seen(human):
     told["visual"][0, 1, 0] = True
     told["verbal"][0, 2, 3] = True
     view = human.perceive(sight(back_own=3), observation, told)
-    # The car behind is seen; one ahead is shown at step 1 only; another is spoken of at step 2.
-    expected = [[False, False, True, False], [True, False, True, False]]
-    assert view.visible["visual"][0].tolist() == [*expected, expected[0]]
+    # The car behind is seen; one ahead is shown at step 1 and known from then on; another is
+    # spoken of at step 2.
+    expected = [[False, False, True, False], *[[True, False, True, False]] * 2]
+    assert view.visible["visual"][0].tolist() == expected
     assert torch.equal(view.visible["verbal"], told["verbal"])
 
 

@@ -110,6 +110,7 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
 
     Raises:
         PosteriorError: the file is missing or damaged, holds no draws, or is of another domain.
+        UnknownNameError: it is of a domain that there is not.
     """
     if not path.is_file():
         raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 
 import numpy as np
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from torch import Tensor
 
@@ -16,7 +17,6 @@ from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY
 
 PALE = "#b9bec4"
-HATCH = "/////"
 WORDS = {"visual": "shown", "verbal": "said"}
 """What is done with items of a modality; its name where there is no word for it."""
 MOST = 12
@@ -26,58 +26,77 @@ WRAP = 46
 
 
 def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
-    """Draw what the best candidates of a decision gain over silence, with 90% intervals.
+    """Draw what candidates of a decision gain over silence, with 90% intervals.
 
-    Bars end at what is left after the cost, which is hatched. Silence, at 0, and the chosen
-    candidate are always there.
+    Silence is a square at 0. As far as there is room these are drawn: silence and the chosen
+    candidate; the two best of the others; everything at once; each item by itself; and of what is
+    left the best.
 
     Args:
         decision: with candidates to choose from.
         most: how many candidates are drawn, at least 2.
 
     Raises:
-        ValueError: there was nothing to choose from.
+        ValueError: there was nothing to choose from, or too few are to be drawn.
     """
+    if most < 2:  # noqa: PLR2004 - silence and the chosen one
+        raise ValueError(f"at least 2 candidates have to be drawn, not {most}")
     found = _found(decision)
     gains = [gain_over_silence(found.valued, index) for index in range(len(found.candidates))]
     order = sorted(range(len(gains)), key=lambda index: -gains[index].mean)
-    always = {0, decision.chosen}
-    others = [index for index in order if index not in always][: max(most - len(always), 0)]
-    drawn = [index for index in order if index in always.union(others)]
+    drawn = _drawn(found.candidates, decision.chosen, order, most)
     channels = Channels(decision.domain)
     names = [candidate_name(channels, found.candidates[index]) for index in drawn]
-    costs = channels.cost(found.candidates[drawn]).sum(-1).numpy()
-    means = np.array([gains[index].mean for index in drawn])
+    costs = channels.cost(found.candidates[drawn]).sum(-1).tolist()
+    means = [gains[index].mean for index in drawn]
     widths = np.array([np.diff(gains[index].interval)[0] / 2 for index in drawn])
-    chosen = [index == decision.chosen for index in drawn]
+    colours = [BLUE if index == decision.chosen else PALE for index in drawn]
 
-    figure = Picture(figsize=(10, 0.36 * len(drawn) + 1.6), layout="constrained")
+    figure = Picture(figsize=(10, 0.36 * len(drawn) + 1.8), layout="constrained")
     ax = figure.subplots()
     place = np.arange(len(drawn))
-    ax.barh(place, means, 0.66, color=[BLUE if mine else PALE for mine in chosen], label="gain")
-    ax.barh(place, costs, 0.66, left=means, fc="none", ec=BLACK, lw=0.6, hatch=HATCH, label="cost")
-    ax.errorbar(means, place, xerr=widths, fmt="none", ecolor=BLACK, elinewidth=1.4, capsize=3)
+    ax.barh(place, means, 0.66, color=colours)
+    # Silence gains nothing over itself, and is not uncertain about that.
+    spread = [row for row, index in enumerate(drawn) if index != 0]
+    ax.errorbar(
+        np.array(means)[spread],
+        place[spread],
+        xerr=widths[spread],
+        fmt="none",
+        ecolor=BLACK,
+        elinewidth=1.4,
+        capsize=3,
+    )
     ax.axvline(0, color=BLACK, lw=0.8)
-    lines = ["\n".join(textwrap.wrap(name, WRAP)) for name in names]
+    silence = BLUE if decision.chosen == 0 else GREY
+    ax.plot([0], [drawn.index(0)], "s", color=silence, ms=9, mec="white", clip_on=False, zorder=4)
+    lines = ["\n".join(textwrap.wrap(name, WRAP, break_on_hyphens=False)) for name in names]
     ax.set_yticks(place, lines, fontsize=9, parse_math=False)
-    for text, mine in zip(ax.get_yticklabels(), chosen, strict=True):
-        if mine:
+    for text, colour in zip(ax.get_yticklabels(), colours, strict=True):
+        if colour == BLUE:
             text.set(color=BLUE, fontweight="bold")
-    ax.invert_yaxis()
-    for y, (mean, cost) in enumerate(zip(means, costs, strict=True)):
-        ax.annotate(
-            f"{mean:+.2f}  cost {cost:.2f}",
-            (1, y),
-            (8, 0),
-            xycoords=ax.get_yaxis_transform(),
-            textcoords="offset points",
-            va="center",
-            fontsize=9,
-            annotation_clip=False,
-        )
-    ax.set_xlabel("gain over silence in units of reward, cost taken off; lines: 90% intervals")
+    ax.set_ylim(len(drawn) - 0.4, -0.6)
+    rows = [
+        ("gain", "cost"),
+        *((f"{m:+.2f}", f"{c:.2f}") for m, c in zip(means, costs, strict=True)),
+    ]
+    for y, row in enumerate(rows, -1):
+        for text, right in zip(row, (48, 92), strict=True):
+            ax.annotate(
+                text,
+                (1, y),
+                (right, 0),
+                xycoords=ax.get_yaxis_transform(),
+                textcoords="offset points",
+                ha="right",
+                va="center",
+                fontsize=9,
+                fontweight="bold" if y < 0 else "normal",
+                annotation_clip=False,
+            )
+    ax.set_xlabel("gain over silence in units of reward, cost taken off")
     ax.spines[["top", "right", "left"]].set_visible(False)
-    ax.tick_params(axis="y", length=0)
+    ax.tick_params(axis="y", length=0, pad=8)
     figure.suptitle(
         f"What could be said, and what it is worth: {len(drawn)} of {len(gains)} candidates",
         x=0.01,
@@ -85,14 +104,37 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
         fontsize=12,
         fontweight="bold",
     )
+    handles = [
+        Patch(fc=BLUE),
+        Patch(fc=PALE),
+        Line2D([], [], ls="", marker="s", color=silence, ms=9),
+        Line2D([], [], color=BLACK, lw=1.4, marker="|", ms=7),
+    ]
     figure.legend(
-        [Patch(fc=BLUE), Patch(fc=PALE), Patch(fc="none", ec=BLACK, lw=0.6, hatch=HATCH)],
-        ["chosen", "other candidates", "cost"],
+        handles,
+        ["chosen", "not chosen", "silence", "90% interval"],
         loc="outside lower center",
-        ncols=3,
+        ncols=4,
         frameon=False,
     )
     return figure
+
+
+def _drawn(candidates: Tensor, chosen: int, order: list[int], most: int) -> list[int]:
+    """Which of the candidates ``[C, L, N]`` to draw, in the given order of their gains."""
+    now, later = candidates[:, 0], candidates[:, 1:].flatten(1).any(1)
+    everything = ((now == now.any(0)).all(1) & ~later).tolist()
+    alone = ((now.sum(1) == 1) & ~later).tolist()
+    others = [index for index in order if index not in (0, chosen)]
+    preferred = [
+        *(0, chosen),
+        *others[:2],
+        *(index for index in order if everything[index]),
+        *(index for index in order if alone[index]),
+        *others,
+    ]
+    kept = list(dict.fromkeys(preferred))[:most]
+    return [index for index in order if index in kept]
 
 
 def plot_action(decision: Decision, action: str = "switch") -> Picture:
@@ -122,9 +164,9 @@ def plot_action(decision: Decision, action: str = "switch") -> Picture:
         predicted = chances[index, :, number].tolist()
         ax.plot(steps, predicted, lw=2, ms=7, label=label, color=color, marker=marker, ls=dashes)
     ax.set_ylim(-0.04, 1.04)
-    ax.set_xticks(steps, ["now", *(f"in {step}" for step in steps[1:])])
+    ax.set_xticks(steps, ["now", *map(str, steps[1:])])
     ax.set_xlabel("steps ahead")
-    ax.set_ylabel(f"probability of {action}")
+    ax.set_ylabel(f"predicted probability: {action}")
     ax.spines[["top", "right"]].set_visible(False)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", frameon=False)
     return figure

@@ -29,8 +29,8 @@ VERMILLION, GREEN, YELLOW = "#D55E00", "#009E73", "#F0E442"
 ROAD = "#e4e6e9"
 MIDDLES = (1.5, 0.5)
 """Height of the middle of each lane: people drive to the right, so the left lane is above."""
-HALF = 0.24
-"""How far from the middle of the lane each of two cars in one cell is drawn."""
+WHOLE, LOW, APART = 0.44, 0.22, 0.23
+"""Height of a car, that of each of two cars in one cell, and how far these are from its middle."""
 
 
 # --- what a person knows ----------------------------------------------------------------------
@@ -173,19 +173,19 @@ class _Place:
 def _places(past: RoundSoFar, step: int, cells: int) -> dict[int, _Place]:
     """The cars that are drawn, by number; those of one cell above each other."""
     ahead = past.observation["visual"][step, :, 0].tolist()
-    shown = [car for car, x in enumerate(ahead) if abs(x) < ROAD_END and abs(x) <= cells]
+    cell = {
+        car: (x, CAR_LANES[car])
+        for car, x in enumerate(ahead)
+        if abs(x) < ROAD_END and abs(x) <= cells
+    }
     places = {}
-    for car in shown:
-        same = [other for other in shown if (ahead[other], CAR_LANES[other]) == _cell(ahead, car)]
-        # Lanes hold two cars each, so no more than two share a cell.
-        up = 0.0 if len(same) == 1 else HALF if car == same[0] else -HALF
-        y = MIDDLES[CAR_LANES[car]] + up
-        places[car] = _Place(ahead[car], y, 0.44 if len(same) == 1 else 0.26)
+    for car, (x, lane) in cell.items():
+        # No lane has more than two cars, so no cell has.
+        same = [other for other in cell if cell[other] == cell[car]]
+        alone = len(same) == 1
+        up = 0.0 if alone else APART if car == same[0] else -APART
+        places[car] = _Place(x, MIDDLES[lane] + up, WHOLE if alone else LOW)
     return places
-
-
-def _cell(ahead: list[float], car: int) -> tuple[float, int]:
-    return ahead[car], CAR_LANES[car]
 
 
 def _collided(domain: Domain, past: RoundSoFar, step: int) -> bool:
@@ -266,7 +266,7 @@ def _draw_known(ax: Axes, place: _Place, share: float, cells: int) -> None:
         place.y,
         f"{100 * share:.0f}",
         color="white" if share < 0.6 else BLACK,  # noqa: PLR2004 - where both can be read
-        fontsize=min(9, 80 / cells),
+        fontsize=min(9, 80 / cells) if place.height == WHOLE else 6,
         ha="center",
         va="center_baseline",
         zorder=7,
@@ -281,10 +281,10 @@ def _draw_thoughts(
     for car, (thinks, x) in enumerate(zip(known, position, strict=True)):
         if not thinks or abs(x) > cells:
             continue
-        place = _Place(x, MIDDLES[CAR_LANES[car]], 0.44)
-        if car in places and places[car].x == x:
-            place = places[car]
-        high = place.height + 0.36 if place.height > HALF + 0.1 else place.height + 0.2
+        place = places.get(car)
+        if place is None or place.x != x:
+            place = _Place(x, MIDDLES[CAR_LANES[car]], WHOLE)
+        high = 0.8 if place.height == WHOLE else 2 * APART
         corner = (place.x - 0.47, place.y - high / 2)
         ax.add_patch(
             Rectangle(corner, 0.94, high, fill=False, ec=TRUE, lw=2.2, zorder=8, gid=CARS[car])
