@@ -191,8 +191,7 @@ class StepwiseBeliefs:
         ), which
 
     def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
-        """See :class:`Beliefs`; looks that tell the same, after being told the
-        same, lead to one belief."""
+        """See :class:`Beliefs`; looks that tell the same after the same lead to one belief."""
         human = self.person.human
         seen = {name: value[looks.row][:, None] for name, value in looks.observation.items()}
         told = {name: self.told[name][looks.parent] | mask for name, mask in looks.told.items()}
