@@ -287,8 +287,8 @@ from mirror_ppl.plots.communication import plot_action, plot_utilities
 plot_utilities(decision)
 
 # %% [markdown]
-# The same as a table of all candidates, the best first. `later` is how many items follow in the
-# steps after, `probability` the share of draws in which a candidate is better than silence, and
+# The same as a table of all candidates, the best first. `later` is what would follow in the steps
+# after, `probability` the share of draws in which a candidate is better than silence, and
 # `p(switch)` how probable a change of lanes is now.
 
 # %%

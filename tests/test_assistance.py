@@ -275,7 +275,7 @@ def test_an_audit_is_the_decision_as_plain_data():
     assert "front car in the left lane, 3 cells ahead, closing" in told["why"]
     best, second = told["alternatives"]
     assert best["message"] == "verbal: front-left" and second["message"] == "visual: front-left"
-    assert (best["gain"], best["cost"], best["later"]) == (1.5, pytest.approx(0.03), 0)
+    assert (best["gain"], best["cost"], best["later"]) == (1.5, pytest.approx(0.03), "")
     assert best["low"] < 1.5 < best["high"]
 
 

@@ -70,8 +70,8 @@ def test_the_table_of_alternatives():
         "verbal: front-left",
         "visual: front-left",
     ]
-    assert table["later"].tolist() == [0, 0, 0, 2]
-    assert table["cost"].tolist() == pytest.approx([0.03, 0, 0.03, 0.01])
+    assert table["later"].tolist() == ["", "", "", "in 1 step: verbal: front-left, rear-right"]
+    assert table["cost"].tolist() == pytest.approx([0.03, 0, 0.03, 0.01 + 0.12])
     assert table["gain"].tolist() == pytest.approx([3.5, 0, 0, -0.5])
     error = [0.5, 0, 0, 1.5]
     assert (table["high"] - table["gain"]).tolist() == pytest.approx([1.645 * e for e in error])
@@ -92,10 +92,16 @@ def test_what_each_item_adds():
     again = [plan(None, None), plan(SHOWN, SHOWN), plan(None, SHOWN), plan(SHOWN, None)]
     twice = decision(1, again, [[0.0], [3.0], [1.0], [2.5]])
     assert twice.matters == pytest.approx({("visual", "front-left"): 2.0})
-    # Items without which the message was not valued are not there.
+    # Items without which nothing was valued are not there.
     candidates = [plan(None, None), plan(SHOWN | SAID, OTHER), plan(SHOWN, None), plan(SAID, OTHER)]
     partly = decision(1, candidates, [[0.0], [3.0], [2.0], [2.5]])
     assert partly.matters == pytest.approx({("visual", "front-left"): 0.5})
+    # Where plans without them were not, messages for now were: 2.2 with both, 2 with one of them.
+    candidates.append(plan(SHOWN | SAID, None))
+    fully = decision(1, candidates, [[0.0], [3.0], [2.0], [2.5], [2.2]])
+    assert fully.matters == pytest.approx(
+        {("visual", "front-left"): 0.5, ("verbal", "front-left"): 0.2}
+    )
 
 
 def test_a_decision_without_a_choice():
@@ -111,7 +117,7 @@ def test_a_decision_without_a_choice():
     (row,) = one.alternatives.to_dict("records")
     assert row == {
         "message": "silence",
-        "later": 0,
+        "later": "",
         "cost": 0.0,
         "gain": 0.0,
         "low": 0.0,

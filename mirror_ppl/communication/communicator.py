@@ -101,8 +101,8 @@ class Decision:
     def alternatives(self) -> pd.DataFrame:
         """Every candidate with its gain over silence, the best first.
 
-        Columns: ``message`` (for now), ``later`` (items in the steps after, where sequences were
-        searched), ``cost`` (of the message for now), ``gain``, ``low``, ``high`` (90% interval),
+        Columns: ``message`` (for now), ``later`` (what would be said in the steps after), ``cost``
+        (of both), ``gain`` (with that taken off), ``low``, ``high`` (90% interval),
         ``probability`` (share of draws in which it is better than silence), ``chosen``, and
         ``p(action)``, the predicted probability of each action now.
         """
@@ -118,8 +118,12 @@ class Decision:
             gain = Gain(0.0, 0.0, 0.0) if valued is None else gain_over_silence(valued, index)
             row: dict[str, Any] = {
                 "message": str(channels.message(candidate[0])),
-                "later": int(candidate[1:].sum()),
-                "cost": float(channels.cost(candidate[0])),
+                "later": "; ".join(
+                    f"in {step} step{'s' * (step > 1)}: {channels.message(flags)}"
+                    for step, flags in enumerate(candidate)
+                    if step > 0 and flags.any()
+                ),
+                "cost": float(channels.cost(candidate).sum()),
                 "gain": gain.mean,
                 "low": gain.interval[0],
                 "high": gain.interval[1],
@@ -137,24 +141,28 @@ class Decision:
 
     @cached_property
     def matters(self) -> dict[tuple[str, str], float]:
-        """What each communicated item adds: the gain that is lost when it alone is left out.
+        """What each communicated item adds: the gain that is lost when it alone is left out now.
 
-        Items of which the message without them was not among the candidates are left out.
+        Where the plan without it was not among the candidates, what comes later does not count;
+        where the message for now without it was not, either, the item is not there.
         """
         if self.found is None:
             return {}
-        candidates, valued = self.found.candidates, self.found.valued
-        mean = valued.utility.mean(-1)
-        mine = candidates[self.chosen]
+        candidates, mean = self.found.candidates, self.found.valued.utility.mean(-1)
+        plan = candidates[self.chosen]
+        message = plan.clone()
+        message[1:] = False
         result = {}
         for place, pair in enumerate(Channels(self.domain).pairs):
-            if not mine[0, place]:
+            if not plan[0, place]:
                 continue
-            without = mine.clone()
-            without[0, place] = False
-            same = (candidates == without).flatten(1).all(1).nonzero()
-            if len(same):
-                result[pair] = float(mean[self.chosen] - mean[same[0, 0]])
+            for whole in (plan, message):
+                less = whole.clone()
+                less[0, place] = False
+                pairs = [(candidates == one).flatten(1).all(1).nonzero() for one in (whole, less)]
+                if all(map(len, pairs)):
+                    result[pair] = float(mean[pairs[0][0, 0]] - mean[pairs[1][0, 0]])
+                    break
         return result
 
     @property
