@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from mirror_ppl.console import Progress, run
-from mirror_ppl.errors import OptionError, OutputError, PosteriorError, UnknownNameError
+from mirror_ppl.errors import (
+    HumanModelError,
+    OptionError,
+    OutputError,
+    PosteriorError,
+    UnknownNameError,
+)
 
+KL = "mirror-kl"
 PROGRAM = "python -m mirror_ppl.assist"
 DESCRIPTION = """Let communicators speak to the simulated people of a posterior while they drive,
 and print for each what the people gained, what the messages cost and what they were about. All play
@@ -80,8 +89,13 @@ class Options:
             raise OptionError(f"--branch must be from 0 to 1, not {self.branch}")
         if not self.sure >= 0:
             raise OptionError(f"--sure must be at least 0, not {self.sure}")
-        if not self.kl_weight > 0:
-            raise OptionError(f"--kl-weight must be positive, not {self.kl_weight}")
+        if not 0 < self.kl_weight < math.inf:
+            raise OptionError(f"--kl-weight must be a positive number, not {self.kl_weight}")
+        for name in ("seed", "people_seed"):
+            number = getattr(self, name)
+            if number is not None and number < 0:
+                option = name.replace("_", "-")
+                raise OptionError(f"--{option} must be at least 0, not {number}")
         if self.kl_measure not in ("kl", "squared"):
             raise OptionError(f'--kl-measure must be kl or squared, not "{self.kl_measure}"')
 
@@ -133,6 +147,14 @@ def main(options: Options) -> None:
         keep_log=options.log is not None,
     )
     pairing.check()
+    if KL in chosen and not pairing.human.stepwise:
+        if KL in options.communicator:
+            raise HumanModelError(
+                f"{type(pairing.human).__name__} is not stepwise, so its beliefs have no density, "
+                f"which {KL} compares; see HumanModel.stepwise, or leave {KL} out"
+            )
+        chosen = tuple(name for name in chosen if name != KL)
+        print(f"{KL} is left out: {type(pairing.human).__name__} is not stepwise", file=sys.stderr)
     for path in outputs:
         prepare_output_folder(path.parent)
     kept = options.json or options.log
@@ -179,13 +201,17 @@ def main(options: Options) -> None:
 def _outputs(options: Options) -> list[Path]:
     """Files to write, none of which is something else that was named."""
     taken = {options.posterior.resolve(): "--posterior"}
+    if options.self_model is not None:
+        taken[options.self_model.resolve()] = "--self-model"
+    if options.human_model is not None:
+        taken[Path(options.human_model.rpartition(":")[0]).resolve()] = "--human-model"
     for option, path in (("--json", options.json), ("--log", options.log)):
         if path is None:
             continue
         if path.resolve() in taken:
             raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
-        if path.is_dir():
-            raise OutputError(f"cannot write {path}: it is a folder")
+        if path.exists() and not path.is_file():
+            raise OutputError(f"cannot write {path}: it is not a regular file")
         taken[path.resolve()] = option
     return [path for path in (options.json, options.log) if path is not None]
 
@@ -210,10 +236,15 @@ def _people(options: Options):
         "population": posterior.attributes.get("recorded_population", options.population),
         "seed": posterior.attributes.get("recorded_seed", options.people_seed),
     }
-    if options.population is not None:
-        source["population"] = options.population
-    if options.people_seed is not None:
-        source["seed"] = options.people_seed
+    for option, name, given in (
+        ("--population", "population", options.population),
+        ("--people-seed", "seed", options.people_seed),
+    ):
+        if given is not None and str(given) != str(source[name]):
+            raise PosteriorError(
+                f"{options.posterior}: is of people with {name} {source[name]}, not {given} "
+                f"({option})"
+            )
     if None in source.values():
         raise PosteriorError(
             f"{options.posterior}: does not say which simulated people it is of; give --population "
@@ -247,7 +278,7 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
     notions = [name.split("_")[-1] for name in first["relevant"]]
     worth = table(
         f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
-        "rewards a round; [90% interval], paired",
+        "rewards a round; ±: standard error; [90% interval], paired; -: needs none and oracle",
         ["task", "cost", "net", "above none", "way to oracle"],
     )
     said = table(

@@ -233,7 +233,12 @@ def test_posteriors_of_something_else_are_refused(posterior, tmp_path, capsys, a
         (("--discount", "nan"), "--discount must be above 0 and at most 1, not nan"),
         (("--branch", "-1"), "--branch must be from 0 to 1, not -1.0"),
         (("--sure", "-1"), "--sure must be at least 0, not -1.0"),
-        (("--kl-weight", "0"), "--kl-weight must be positive, not 0.0"),
+        (("--kl-weight", "0"), "--kl-weight must be a positive number, not 0.0"),
+        (("--kl-weight", "inf"), "--kl-weight must be a positive number, not inf"),
+        (("--seed", "-1"), "--seed must be at least 0, not -1"),
+        (("--people-seed", "-1"), "--people-seed must be at least 0, not -1"),
+        (("--people-seed", "5"), "is of people with seed 0, not 5 (--people-seed)"),
+        (("--population", "diverse"), "is of people with population paper, not diverse"),
         (("--kl-measure", "cosine"), '--kl-measure must be kl or squared, not "cosine"'),
         (("--self-model", "nowhere.safetensors"), "nowhere.safetensors"),
         (("--human-model", "nowhere.py:Class"), "nowhere.py"),
@@ -256,7 +261,11 @@ def test_outputs_that_would_overwrite_are_refused(posterior, tmp_path, capsys):
     for args, message in (
         (("--json", posterior), "it is what --posterior names"),
         (("--json", tmp_path / "a", "--log", tmp_path / "a"), "it is what --json names"),
-        (("--log", tmp_path), "it is a folder"),
+        (("--log", tmp_path), "it is not a regular file"),
+        (
+            ("--self-model", posterior.with_name("x"), "--log", posterior.with_name("x")),
+            "--self-model",
+        ),
     ):
         assert command(assist, "--posterior", posterior, *SMALL, *args) == 2
         error = capsys.readouterr().err

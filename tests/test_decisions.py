@@ -113,7 +113,7 @@ def test_a_decision_without_a_choice():
     assert one.cost == 0
     assert one.matters == {}
     assert one.turning_point is None
-    assert one.why() == "silence: nothing that could be told is worth its cost"
+    assert one.why() == "silence: there is nothing that can be told now"
     (row,) = one.alternatives.to_dict("records")
     assert row == {
         "message": "silence",
@@ -163,7 +163,13 @@ def test_silence_turns_nothing():
 
 
 def test_why_silence():
-    assert four(0).why() == "silence: nothing that could be told is worth its cost"
+    useless = decision(0, [plan(None), plan(SAID)], [[0.0, 0], [-1, 0]])
+    assert useless.why() == "silence: nothing that could be told is worth its cost"
+    unsure = decision(0, [plan(None), plan(SAID)], [[0.0, 0], [3, -1]])
+    assert unsure.why() == (
+        "silence: what could be told is not surely worth its cost "
+        "(the best gains +1.00 [-2.29, +4.29])"
+    )
 
 
 @pytest.mark.parametrize(
@@ -171,7 +177,7 @@ def test_why_silence():
 )
 def test_why_waiting(wait, steps):
     one = decision(1, [plan(None, None, None), plan(*wait)], [[0.0, 0], [1, 1]], [[[0.5, 0.5]]] * 2)
-    assert one.why() == f"silence: what would help can wait {steps}"
+    assert one.why() == f"silence: {AHEAD}: can wait {steps}"
 
 
 @pytest.mark.parametrize(
@@ -182,24 +188,31 @@ def test_why_waiting(wait, steps):
         (
             [[0.5, 0.5], [0.9, 0.1]],
             [[0.5, 0.5], [0.2, 0.8]],
-            "stay in its way in 1 step with probability 0.90; told, 0.20",
+            "stay in their lane in 1 step with probability 0.90; told, 0.20",
         ),
         (
             [[0.5, 0.5], [0.5, 0.5], [0.9, 0.1]],
             [[0.5, 0.5], [0.5, 0.5], [0.2, 0.8]],
-            "stay in its way in 2 steps with probability 0.90; told, 0.20",
+            "stay in their lane in 2 steps with probability 0.90; told, 0.20",
         ),
     ],
 )
 def test_why_a_message(silent, told, what):
-    assert turned(silent, told).why() == f"{AHEAD}: they would {what}"
+    assert turned(silent, told).why() == f"{AHEAD}: they would {what} (gain +1.00)"
+
+
+def test_why_where_no_action_changes_much():
+    assert turned([[0.9, 0.1]], [[0.87, 0.13]]).why() == (
+        f"{AHEAD}: changes a little of what they do in the steps ahead (gain +1.00)"
+    )
 
 
 def test_what_matters_most_is_told_first_and_what_would_be_done_is_about_it():
     actions = [[[0.1, 0.9]]] + [[[0.6, 0.4]]] * 3
     one = four(3, actions)
     assert one.why() == (
-        f"{BEHIND}, and {AHEAD}: they would switch into it with probability 0.90; told, 0.40"
+        f"{BEHIND}, and {AHEAD}: they would switch into that lane with probability 0.90; "
+        "told, 0.40 (gain +3.50)"
     )
 
 

@@ -9,6 +9,7 @@ drive it step by step::
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 INTERVAL = 1.645
 """Standard errors on either side of a mean that hold it with a probability of 90%."""
+LITTLE = 0.05
+"""Changes of a probability below this explain nothing."""
 TIE = 1e-6
 """Gains up to this, in units of reward, count as none."""
 
@@ -64,7 +67,7 @@ class Decision:
     Attributes:
         message: what to communicate now.
         flags: the same as flags ``[N]``.
-        gain: of the plan over saying nothing at all.
+        gain: of the plan over saying nothing at all; also where the plan begins with silence.
         domain: the world of the round.
         observation: what there was to observe, ``[E]`` and ``[K, F]``.
         found: the candidates that were compared; ``None`` where there was nothing to choose.
@@ -180,21 +183,39 @@ class Decision:
 
     def why(self) -> str:
         """The decision in a sentence that a person understands."""
-        if not self.message and any(self.plan):
-            wait = next(step for step, message in enumerate(self.plan) if message)
-            return f"silence: what would help can wait {wait} step{'s' * (wait > 1)}"
         if not self.message:
-            return "silence: nothing that could be told is worth its cost"
+            return f"silence: {self._why_not()}"
         ranked = sorted(self.message, key=lambda pair: -self.matters.get(pair, 0.0))
-        about = [self.domain.describe(self.observation, *pair) for pair in ranked]
-        text = ", and ".join(dict.fromkeys(about))
+        text = self._about(ranked)
         turn = self.turning_point
         if turn is None:
             return f"{text}: brings what they believe closer to what is so"
         step, action, without, told = turn
-        deed = self.domain.deed(self.observation, ranked[0][1], action)
+        worth = f"(gain {self.gain.mean:+.2f})"
+        if without - told < LITTLE:
+            return f"{text}: changes a little of what they do in the steps ahead {worth}"
+        # In which lane they will be later is not known.
+        deed = self.domain.deed(self.observation, None if step else ranked[0][1], action)
         when = "" if step == 0 else f" in {step} step{'s' * (step > 1)}"
-        return f"{text}: they would {deed}{when} with probability {without:.2f}; told, {told:.2f}"
+        chances = f"with probability {without:.2f}; told, {told:.2f}"
+        return f"{text}: they would {deed}{when} {chances} {worth}"
+
+    def _why_not(self) -> str:
+        if self.found is None:
+            return "there is nothing that can be told now"
+        for step, message in enumerate(self.plan):
+            if message:
+                return f"{self._about(message)}: can wait {step} step{'s' * (step > 1)}"
+        gain = gain_over_silence(
+            self.found.valued, int(self.found.valued.utility.mean(-1).argmax())
+        )
+        if gain.mean > TIE:
+            return f"what could be told is not surely worth its cost (the best gains {gain})"
+        return "nothing that could be told is worth its cost"
+
+    def _about(self, items: Iterable[tuple[str, str]]) -> str:
+        about = [self.domain.describe(self.observation, *pair) for pair in items]
+        return ", and ".join(dict.fromkeys(about))
 
 
 @dataclass(frozen=True)

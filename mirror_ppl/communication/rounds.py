@@ -40,7 +40,12 @@ class RoundSoFar:
 
     @classmethod
     def begin(cls, domain: Domain, observation: Observation) -> RoundSoFar:
-        """A round of which there is only the first observation, ``[E]`` and ``[K, F]``."""
+        """A round of which there is only the first observation, ``[E]`` and ``[K, F]``.
+
+        Raises:
+            ValueError: such an observation cannot be.
+        """
+        _check(domain, observation)
         device = observation["ego"].device
         nothing = {
             m.name: torch.zeros(0, len(m.items), dtype=torch.bool, device=device)
@@ -76,3 +81,16 @@ class RoundSoFar:
     def now(self) -> Observation:
         """The last observation, ``[E]`` and ``[K, F]``."""
         return {name: value[-1] for name, value in self.observation.items()}
+
+
+def _check(domain: Domain, observation: Observation) -> None:
+    expected = {"ego": (len(domain.ego_features),)} | {
+        m.name: (len(m.items), len(m.features)) for m in domain.modalities
+    }
+    for name, shape in expected.items():
+        found = tuple(observation[name].shape) if name in observation else None
+        if found != shape:
+            raise ValueError(f'the observation of "{name}" has shape {found}, expected {shape}')
+    for rule, broken in domain.faults(observation).items():
+        if broken:
+            raise ValueError(f"this observation cannot be: {rule}")

@@ -156,8 +156,8 @@ class Domain(Protocol):
         """An item of one observation ``[K, F]`` in words, such as "rear car, closing"."""
         ...
 
-    def deed(self, observation: Observation, item: str, action: int) -> str:
-        """An action in words, with regard to an item, such as "switch into it"."""
+    def deed(self, observation: Observation, item: str | None, action: int) -> str:
+        """An action in words, with regard to an item (now) or none, such as "switch lanes"."""
         ...
 
     def reference_values(self, state: Any, discount: float) -> Tensor:

@@ -332,11 +332,13 @@ class Driving:
         which = "front" if position > 0 else "rear"
         return f"{which} car in the {lane} lane, {cells} {where}, {motion}"
 
-    def deed(self, observation: Observation, item: str, action: int) -> str:
+    def deed(self, observation: Observation, item: str | None, action: int) -> str:
         """Whether they would switch into a car's lane, out of it, or stay in one of them."""
+        if item is None:
+            return "switch lanes" if action == SWITCH else "stay in their lane"
         own = observation["visual"][CARS.index(item), 1] == 0
         if action == SWITCH:
-            return "switch lanes" if own else "switch into it"
+            return "switch lanes" if own else "switch into that lane"
         return "stay in its way" if own else "stay where they are"
 
     def reference_values(self, state: DrivingState, discount: float) -> Tensor:

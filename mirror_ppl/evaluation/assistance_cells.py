@@ -10,6 +10,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +22,7 @@ from mirror_ppl import __version__
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.evaluation.assistance import (
+    COMMUNICATORS,
     RATES_FROM,
     Listener,
     PlannerOptions,
@@ -122,10 +124,12 @@ class Pairing:
         return digest.hexdigest()
 
     def forget(self, parts: Path) -> None:
-        """Remove the files of finished cells."""
-        for file in parts.glob("*.json"):
-            file.unlink()
-        parts.rmdir()
+        """Remove the files of finished cells, and their folder if nothing else is in it."""
+        for name in COMMUNICATORS:
+            for number in range(self.people):
+                (parts / f"{name}-{number}.json").unlink(missing_ok=True)
+        with suppress(OSError):
+            parts.rmdir()
 
 
 def run_cells(
