@@ -368,7 +368,7 @@ pd.DataFrame(rows).T.round(2)
 #
 # - The communicator is as good as the posterior. If the model is sure of something wrong about a
 #   person, it will be sure of a wrong message. Look at the person first, as in notebook 01.
-# - `gain` is what the model expects, not what happens. Its interval is over posterior draws: it
-#   says how much is not known about the person, not how lucky a round will be.
+# - `gain` is what the model expects, not what happens. Its interval is that of a mean over
+#   posterior draws: it shrinks with more draws, and does not say how lucky a round will be.
 # - These people listen, understand and remember perfectly, and act on what they hear. Real people
 #   do not always. To them messages cost attention; the costs here are those of the paper.

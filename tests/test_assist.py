@@ -1,6 +1,7 @@
 """`python -m mirror_ppl.assist`: what it writes and prints and refuses, and that it resumes."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -272,3 +273,44 @@ def test_outputs_that_would_overwrite_are_refused(posterior, tmp_path, capsys):
         assert error.count("\n") == 1 and message in error
     assert posterior.read_bytes() == before
     assert content(tmp_path) == []
+
+
+# --- human models of one's own ----------------------------------------------------------------
+
+
+def test_a_model_that_is_not_stepwise_is_planned_with_but_has_no_divergence(
+    posterior, tmp_path, capsys
+):
+    example = Path(__file__).parents[1] / "docs" / "examples" / "late_reactions.py"
+    late = ("--human-model", f"{example}:LatePerson")
+    demos = ("--demos", posterior.parents[1] / "some.nc")
+    small = ("--steps", "3", "--draws", "6", "--out", tmp_path)
+    assert command(fit, *demos, *small, *late) == 0
+    capsys.readouterr()
+    own = (
+        "--posterior",
+        tmp_path / "posterior.nc",
+        *late,
+        *SMALL,
+        "--people",
+        "1",
+        "--rounds",
+        "1",
+    )
+    assert command(assist, *own, "--communicator", "mirror-kl", "mirror") == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "LatePerson is not stepwise" in error and "leave mirror-kl out" in error
+    assert command(assist, *own, "--json", tmp_path / "a.json") == 0
+    assert "mirror-kl is left out: LatePerson is not stepwise" in capsys.readouterr().err
+    played = results_of(tmp_path / "a.json")["communicators"]
+    assert tuple(played) == tuple(name for name in COMMUNICATORS if name != "mirror-kl")
+
+
+def test_what_others_keep_in_the_folder_of_parts_stays(posterior, tmp_path):
+    parts = tmp_path / ".a.json.parts"
+    parts.mkdir()
+    (parts / "notes.json").write_text("{}")
+    args = ("--communicator", "none", "--json", tmp_path / "a.json")
+    assert command(assist, "--posterior", posterior, *SMALL, *args) == 0
+    assert content(parts) == ["notes.json"]

@@ -140,6 +140,31 @@ def test_a_round_begins_with_one_observation(generator):
         assert torch.equal(past.now[name], value)
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("ego", lambda value: value + 3, "this observation cannot be: ego lane has to be 0 or 1"),
+        ("visual", lambda value: value * torch.nan, "distance_ahead has to be a whole number"),
+        ("verbal", lambda value: value[None], r"has shape \(1, 4, 3\), expected \(4, 3\)"),
+    ],
+)
+def test_observations_that_cannot_be_are_refused(generator, name, change, message):
+    (first,), _ = states(0, generator)
+    with pytest.raises(ValueError, match=message):
+        RoundSoFar.begin(DOMAIN, first | {name: change(first[name])})
+    later = RoundSoFar.begin(DOMAIN, first)
+    later = RoundSoFar(
+        {
+            key: value.repeat(2, *[1] * (value.dim() - 1))
+            for key, value in later.observation.items()
+        },
+        torch.tensor([7]),
+        {key: torch.zeros(1, 4, dtype=torch.bool) for key in later.told},
+    )
+    with pytest.raises(ValueError, match="there is no action 7; actions count from 0 to 1"):
+        later.check(DOMAIN)
+
+
 @pytest.mark.parametrize("as_tensor", [False, True])
 def test_a_round_grows_step_by_step(generator, as_tensor):
     seen, actions = states(3, generator)

@@ -246,8 +246,12 @@ class Communicator:
         """What to communicate now.
 
         Silence is chosen where no message gains enough, and when the round is over.
+
+        Raises:
+            ValueError: the last observation or action of the round cannot be.
         """
         domain = self.person.human.domain
+        past.check(domain)
         channels = Channels(domain)
         now = past.now
         allowed = channels.join(domain.communicable(now))

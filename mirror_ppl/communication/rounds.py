@@ -45,14 +45,15 @@ class RoundSoFar:
         Raises:
             ValueError: such an observation cannot be.
         """
-        _check(domain, observation)
         device = observation["ego"].device
         nothing = {
             m.name: torch.zeros(0, len(m.items), dtype=torch.bool, device=device)
             for m in domain.modalities
         }
         first = {name: value[None] for name, value in observation.items()}
-        return cls(first, torch.zeros(0, dtype=torch.long, device=device), nothing)
+        past = cls(first, torch.zeros(0, dtype=torch.long, device=device), nothing)
+        past.check(domain)
+        return past
 
     def then(self, told: Visibility, action: int | Tensor, observation: Observation) -> RoundSoFar:
         """The round one step later.
@@ -72,6 +73,29 @@ class RoundSoFar:
             {name: torch.cat([value, told[name][None]]) for name, value in self.told.items()},
         )
 
+    def check(self, domain: Domain) -> None:
+        """Make sure that the last step can be one of this domain.
+
+        Raises:
+            ValueError: its observation or action cannot be.
+        """
+        now = self.now
+        expected = {"ego": (len(domain.ego_features),)} | {
+            m.name: (len(m.items), len(m.features)) for m in domain.modalities
+        }
+        for name, shape in expected.items():
+            found = tuple(now[name].shape) if name in now else None
+            if found != shape:
+                raise ValueError(f'the observation of "{name}" has shape {found}, expected {shape}')
+        for rule, broken in domain.faults(now).items():
+            if broken:
+                raise ValueError(f"this observation cannot be: {rule}")
+        if self.time and not 0 <= int(self.actions[-1]) < len(domain.actions):
+            raise ValueError(
+                f"there is no action {int(self.actions[-1])}; actions count from 0 to "
+                f"{len(domain.actions) - 1}"
+            )
+
     @property
     def time(self) -> int:
         """How many actions there have been, t."""
@@ -81,16 +105,3 @@ class RoundSoFar:
     def now(self) -> Observation:
         """The last observation, ``[E]`` and ``[K, F]``."""
         return {name: value[-1] for name, value in self.observation.items()}
-
-
-def _check(domain: Domain, observation: Observation) -> None:
-    expected = {"ego": (len(domain.ego_features),)} | {
-        m.name: (len(m.items), len(m.features)) for m in domain.modalities
-    }
-    for name, shape in expected.items():
-        found = tuple(observation[name].shape) if name in observation else None
-        if found != shape:
-            raise ValueError(f'the observation of "{name}" has shape {found}, expected {shape}')
-    for rule, broken in domain.faults(observation).items():
-        if broken:
-            raise ValueError(f"this observation cannot be: {rule}")
