@@ -264,6 +264,17 @@ plot_frames(
 )
 
 # %% [markdown]
+# Every frame, from the first step to the one after the collision:
+
+# %%
+plot_frames(
+    person,
+    {title: played.moments[-1] for title, played in rounds.items()},
+    range(crash + 3),
+    {title: played.knowledge for title, played in rounds.items()},
+)
+
+# %% [markdown]
 # ## One decision
 #
 # A decision explains itself. `gain` is what the message is expected to be worth, compared with
