@@ -18,6 +18,7 @@ from example_person import (
 from mirror_ppl.communication import (
     Automatic,
     Communicator,
+    CrossEntropy,
     Divergence,
     Exhaustive,
     ExpectedUtility,
@@ -343,3 +344,18 @@ def test_planning_leaves_the_round_as_it_was(rounds):
     for past, told, observation in zip(rounds, before, seen, strict=True):
         assert torch.equal(CHANNELS.join(past.told), told)
         assert all(torch.equal(past.observation[name], observation[name]) for name in observation)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cross_entropy_finds_what_trying_everything_finds(seed):
+    """On what messages are really worth, where items help or spoil one another."""
+    generator = torch.Generator().manual_seed(seed)
+    someone = Person(human(), varied_draws(8, generator))
+    past, _ = random_round(3, generator)
+    utility = ExpectedUtility(WORLD, 3)
+    every, searched = (
+        Communicator(someone, utility, search, sure=0.0).plan(past)
+        for search in (Exhaustive(), CrossEntropy(1))
+    )
+    assert searched.gain.mean == pytest.approx(every.gain.mean, abs=1e-4)
+    assert torch.equal(searched.flags, every.flags)
