@@ -1,4 +1,4 @@
-"""What makes the posterior robust to people who take the unseen to be absent: an ablation.
+"""What makes the posterior robust to people who take things for granted: an ablation.
 
 The human model is fitted to simulated people with pieces of it taken away. `held` counts the people
 whose 90% interval holds the true threshold, over all four directions.
@@ -25,15 +25,14 @@ NEVER = 1e-6
 class Ablated(HumanModel):
     """The human model with other priors."""
 
-    clear_probability = 0.5
+    assumption_probability = 0.5
     lapse = 1 / 31
 
     def prior(self) -> dict[str, torch.Tensor]:
         """The usual sites under the priors of the class."""
         like = next(self.self_model.parameters())
-        return perceptual_implants(self.domain, like, self.clear_probability) | policy_implants(
-            self.domain, self.self_model.latent, like, self.lapse
-        )
+        sight = perceptual_implants(self.domain, like, self.assumption_probability)
+        return sight | policy_implants(self.domain, self.self_model.latent, like, self.lapse)
 
 
 class NoLapse(Ablated):
@@ -42,17 +41,17 @@ class NoLapse(Ablated):
     lapse = NEVER
 
 
-class UnseenIsUnknown(Ablated):
-    """What was never seen is unknown to people, as it is to the robot."""
+class NothingTaken(Ablated):
+    """Nothing is taken for granted: the unseen is unknown to people, as it is to the robot."""
 
-    clear_probability = NEVER
+    assumption_probability = NEVER
 
 
 class Neither(Ablated):
-    """No lapses, and the unseen is unknown."""
+    """No lapses, and nothing taken for granted."""
 
     lapse = NEVER
-    clear_probability = NEVER
+    assumption_probability = NEVER
 
 
 def main() -> None:
@@ -67,7 +66,7 @@ def main() -> None:
     for population in options.populations:
         for seed in options.seeds:
             recordings = simulate("driving", "fog", population, 10, 40, seed)
-            for model in (Ablated, NoLapse, UnseenIsUnknown, Neither):
+            for model in (Ablated, NoLapse, NothingTaken, Neither):
                 fit = fit_people(model(self_model), recordings, FitOptions(), seed)
                 line = row(fit.summary, domain.reach_bins, sight_sites(domain))
                 print(f"{population:8s} seed {seed} {model.__name__:16s}: {line}", flush=True)

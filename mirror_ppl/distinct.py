@@ -24,3 +24,13 @@ def distinct_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
     first = torch.full((len(values),), len(rows), device=rows.device)
     first.scatter_reduce_(0, inverse, torch.arange(len(rows), device=rows.device), "amin")
     return first, inverse
+
+
+def as_whole_numbers(values: Tensor) -> Tensor:
+    """Numbers of any kind as whole ones of the same shape, equal where the numbers are equal."""
+    if not values.is_floating_point():
+        return values.long()
+    bits = (values.float() + 0.0).contiguous().view(torch.int32).long()  # + 0.0: -0 is 0
+    # With the halves swapped: as bits, small whole numbers end in zeros, and sums of multiples of
+    # a power of two would sooner be equal by chance.
+    return (bits >> 16) + ((bits & 0xFFFF) << 16)

@@ -8,7 +8,7 @@ from mirror_ppl.communication import Channels, Person, RoundSoFar
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.implants import ASSUMES_CLEAR, RESIDUAL_HIDDEN, SIGHT, sight_sites
+from mirror_ppl.models.implants import RESIDUAL_HIDDEN, SIGHT, assumption_sites, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DOMAIN = get_domain("driving")
@@ -47,7 +47,8 @@ def implants(number=1, model=None, sight=BLIND, **values):
         values: of each draw, or one for all.
     """
     latent, actions = (model or human()).self_model.latent, len(DOMAIN.actions)
-    given = dict.fromkeys(SIGHTS, sight) | {ASSUMES_CLEAR: 1, "consistency": 3.0, "lapse": 0.02}
+    given = dict.fromkeys(SIGHTS, sight) | dict.fromkeys(assumption_sites(DOMAIN), 1)
+    given |= {"consistency": 3.0, "lapse": 0.02}
     for name, value in values.items():
         given[SIGHT + name if name in DOMAIN.directions else name] = value
     draws = {
@@ -76,6 +77,7 @@ def varied_draws(number, generator, model=None):
         model,
         **sights,
         assumes_clear=torch.arange(number) % 2,
+        assumes_closing=torch.arange(number) // 2 % 2,
         consistency=0.3 + 2 * torch.rand(number, generator=generator),
         lapse=0.2 * torch.rand(number, generator=generator),
     )

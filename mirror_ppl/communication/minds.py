@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields, replace
+from typing import Any, Protocol
 
 import pyro
 import torch
@@ -18,8 +18,8 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.distinct import distinct_rows
-from mirror_ppl.domains.base import Observation, Visibility, digested
+from mirror_ppl.distinct import as_whole_numbers, distinct_rows
+from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.networks import Gaussian
@@ -79,8 +79,15 @@ class Person:
         """What eyes ``[n]`` see of rounds ``[n, T, ...]``."""
         implants = {name: value[eye] for name, value in self.eyes.items()}
         view = self.human.perceive(implants, observation, told)
-        shape = observation["ego"].shape[:2]
-        return View(_expanded(view.visible, shape), _expanded(view.absent, shape))
+        return view.map(lambda part: part.expand(len(eye), *part.shape[1:]))
+
+    def look(
+        self, eye: Tensor, knowledge: Any, observation: Observation, told: Visibility
+    ) -> tuple[View, Any]:
+        """One step of eyes ``[n]`` with the domain's knowledge ``[n]``; see `HumanModel.look`."""
+        implants = {name: value[eye] for name, value in self.eyes.items()}
+        view, knowledge = self.human.look(implants, knowledge, observation, told)
+        return view.map(lambda part: part.expand(len(eye), *part.shape[1:])), knowledge
 
     def act(self, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of the last action ``[S, M, A]`` of M beliefs of each draw.
@@ -146,14 +153,12 @@ class StepwiseBeliefs:
     Attributes:
         person: whose they are.
         state: ``q(zH_t | ...)``, parameters ``[n, Z]``; beliefs are the means.
-        unknown: what was never seen or told of, ``[n, K]`` by modality.
-        told: what was told at this step or before, ``[n, K]`` by modality.
+        knowledge: the domain's, ``[n]``.
     """
 
     person: Person
     state: Gaussian
-    unknown: Visibility
-    told: Visibility
+    knowledge: Any
 
     @property
     def courses(self) -> Tensor:
@@ -164,61 +169,45 @@ class StepwiseBeliefs:
     def before(cls, person: Person, past: RoundSoFar) -> tuple[StepwiseBeliefs, Tensor]:
         """See :func:`beliefs_before`; eyes that saw the same so far share a belief."""
         human = person.human
-        if past.time == 0:
-            zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
-            nothing = {
-                m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=zero.device)
-                for m in human.domain.modalities
-            }
-            unknown = {name: ~mask for name, mask in nothing.items()}
-            state = Gaussian(zero, torch.ones_like(zero))
-            return cls(person, state, unknown, nothing), torch.zeros_like(
-                person.eye[: person.eye_count]
+        device = person.eye.device
+        zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
+        nothing = human.domain.nothing_known(1, device=device)
+        beliefs = cls(person, Gaussian(zero, torch.ones_like(zero)), nothing)
+        which = torch.zeros_like(person.eye[: person.eye_count])
+        for time in range(past.time):
+            last = past.actions[time - 1] if time else len(human.domain.actions)
+            beliefs, which = beliefs.after(
+                Looks(
+                    parent=which,
+                    eye=torch.arange(person.eye_count, device=device),
+                    action=torch.full_like(which, int(last)),
+                    row=torch.zeros_like(which),
+                    observation={n: v[time : time + 1] for n, v in past.observation.items()},
+                    told={n: m[time].expand(len(which), -1) for n, m in past.told.items()},
+                )
             )
-        eyes = torch.arange(person.eye_count, device=person.eye.device)
-        observation, told, actions = _history(past, len(eyes))
-        view = person.see(eyes, observation, told)
-        masks = torch.cat([*view.visible.values(), *view.absent.values()], -1)
-        first, which = distinct_rows(masks.flatten(1).long())
-        view = View(_rows(view.visible, first), _rows(view.absent, first))
-        mean = human.believe(view, _rows(observation, first), actions[first])[:, -1]
-        unknown = human.domain.unknown_so_far(view.visible)
-        return cls(
-            person,
-            Gaussian(mean, torch.ones_like(mean)),
-            {name: mask[:, -1] for name, mask in unknown.items()},
-            {name: mask[first, -1] for name, mask in digested(told).items()},
-        ), which
+        return beliefs, which
 
     def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
         """See :class:`Beliefs`; looks that tell the same after the same lead to one belief."""
         human = self.person.human
-        seen = {name: value[looks.row][:, None] for name, value in looks.observation.items()}
-        told = {name: self.told[name][looks.parent] | mask for name, mask in looks.told.items()}
-        view = self.person.see(
-            looks.eye, seen, {name: mask[:, None] for name, mask in told.items()}
-        )
-        unknown = {
-            name: mask[:, 0] & self.unknown[name][looks.parent]
-            for name, mask in human.domain.unknown_so_far(view.visible).items()
-        }
-        visible = {name: mask[:, 0] for name, mask in view.visible.items()}
-        # Of a single step everything unseen counts as unknown so far; the steps before know better.
-        absent = {name: mask[:, 0] & unknown[name] for name, mask in view.absent.items()}
-        masks = torch.cat([*visible.values(), *absent.values()], -1).long()
-        told_by, which = distinct_rows(torch.cat([looks.row[:, None], masks], -1))
+        seen = {name: value[looks.row] for name, value in looks.observation.items()}
+        before = _rows(self.knowledge, looks.parent)
+        view, knowledge = self.person.look(looks.eye, before, seen, looks.told)
+        told_by, which = distinct_rows(torch.cat([looks.row[:, None], view.rows()], -1))
         rows = looks.row[told_by]
         evidence = human.evidence(
-            View(_rows(visible, told_by), _rows(absent, told_by)), _rows(looks.observation, rows)
+            view.map(lambda part: part[told_by]),
+            {name: value[rows] for name, value in looks.observation.items()},
         )
-        known = torch.cat([*unknown.values(), *told.values()], -1).long()
+        known = [as_whole_numbers(getattr(knowledge, part.name)) for part in fields(knowledge)]
         first, index = distinct_rows(
-            torch.cat([torch.stack([looks.parent, looks.action, which], -1), known], -1)
+            torch.cat([torch.stack([looks.parent, looks.action, which], -1), *known], -1)
         )
         state = human.advance(
             self.state.mean[looks.parent[first]], evidence[which[first]], looks.action[first]
         )
-        return StepwiseBeliefs(self.person, state, _rows(unknown, first), _rows(told, first)), index
+        return StepwiseBeliefs(self.person, state, _rows(knowledge, first)), index
 
 
 @dataclass(frozen=True)
@@ -284,9 +273,8 @@ def _history(past: RoundSoFar, number: int) -> tuple[Observation, Visibility, Te
     )
 
 
-def _rows(masks: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    return {name: mask[rows] for name, mask in masks.items()}
-
-
-def _expanded(masks: Mapping[str, Tensor], shape: torch.Size) -> dict[str, Tensor]:
-    return {name: mask.expand(*shape, mask.shape[-1]) for name, mask in masks.items()}
+def _rows(knowledge: Any, rows: Tensor) -> Any:
+    """Some rows of a domain's knowledge, a dataclass of tensors."""
+    return replace(
+        knowledge, **{part.name: getattr(knowledge, part.name)[rows] for part in fields(knowledge)}
+    )

@@ -178,7 +178,9 @@ class _Tree:
         if told is None:
             flags = torch.zeros(len(first), len(channels), dtype=torch.bool, device=key.device)
         else:
-            flags = told[message[first]]
+            # What is no longer there to be told cannot be told later, whatever the plan says.
+            communicable = channels.join(self.person.human.domain.communicable(observation))
+            flags = told[message[first]] & communicable[row[first]]
         looks = Looks(
             parent=self.belief[first],
             eye=eye[first],

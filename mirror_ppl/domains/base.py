@@ -21,7 +21,7 @@ V    views of a round: the distinct ways to have seen it
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -70,7 +70,9 @@ class Modality:
 class Domain(Protocol):
     """What a world offers to models, people, inference and communication.
 
-    ``state`` is the domain's own frozen dataclass of tensors; only the domain looks inside.
+    ``state`` and ``knowledge`` are the domain's own frozen dataclasses of tensors; only the domain
+    looks inside. Knowledge is what an observer has learned of the things behind the items from what
+    they saw or were told in a round so far.
     """
 
     name: str
@@ -86,6 +88,7 @@ class Domain(Protocol):
     directions: tuple[str, ...]
     direction_groups: tuple[tuple[int, ...], ...]
     reach_bins: tuple[float, ...]
+    assumptions: tuple[str, ...]
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
@@ -117,8 +120,58 @@ class Domain(Protocol):
         """What cannot be in this world: which observations ``[...]`` break each rule, by rule."""
         ...
 
-    def unknown_so_far(self, visibility: Visibility) -> Visibility:
-        """Items ``[..., T, K]`` of which nothing was seen or told up to each step."""
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> Any:
+        """Knowledge ``[*batch]`` before anything was observed."""
+        ...
+
+    def learn(
+        self,
+        knowledge: Any,
+        observation: Observation,
+        visible: Visibility,
+        sees: Callable[[Observation], Visibility],
+    ) -> Any:
+        """Knowledge ``[...]`` after a step, from that of the step before.
+
+        Args:
+            knowledge: of the step before.
+            observation: everything there is to observe at this step ``[..., K, F]``.
+            visible: which items are seen or told at this step ``[..., K]``.
+            sees: which items of an observation the observer would see by themselves; it tells
+                whether something that they expected is missing.
+        """
+        ...
+
+    def known(self, knowledge: Any) -> Visibility:
+        """Items ``[..., K]`` whose content follows from what was observed, at this step or before.
+
+        As the supplement has it (section B), what was seen or told is digested and not forgotten.
+        """
+        ...
+
+    def assume(
+        self, knowledge: Any, observation: Observation
+    ) -> tuple[dict[str, Visibility], Observation]:
+        """What somebody may take for granted about the things that they do not know.
+
+        Args:
+            knowledge: what they have learned.
+            observation: of this step; only what is always known of it is used.
+
+        Returns:
+            For each of ``assumptions``, the items ``[..., K]`` that it is about; and the
+            observation ``[..., K, F]`` in which those items are as assumed.
+        """
+        ...
+
+    def supposed(self, state: Any, knowledge: Any, assumes: Mapping[str, Tensor]) -> Any:
+        """The state as somebody believes it to be who makes some of the assumptions.
+
+        Args:
+            state: how it is.
+            knowledge: what they have learned.
+            assumes: for each of ``assumptions``, who makes it, boolean ``[...]``.
+        """
         ...
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
@@ -127,14 +180,6 @@ class Domain(Protocol):
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
         """What perceptual implants act on: direction index and distance of each visual item."""
-        ...
-
-    def absent(self, observation: Observation) -> Observation:
-        """The observation in which every item is taken to be absent."""
-        ...
-
-    def remove(self, state: Any, gone: Tensor) -> Any:
-        """The state without the things behind the visual items marked in ``gone`` ``[..., K]``."""
         ...
 
     def state_behind(self, observation: Observation) -> Any:
@@ -167,14 +212,6 @@ class Domain(Protocol):
     def render(self, state: Any) -> Any:
         """A picture of one state, ``uint8 [height, width, 3]``."""
         ...
-
-
-def digested(told: Visibility) -> Visibility:
-    """What is known at each step from being told at it or before, masks ``[..., T, K]``.
-
-    As the supplement has it (section B), what was communicated is digested and never forgotten.
-    """
-    return {name: mask.long().cummax(-2).values.bool() for name, mask in told.items()}
 
 
 def total_reward(terms: Mapping[str, Tensor]) -> Tensor:

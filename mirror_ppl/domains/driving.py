@@ -43,7 +43,7 @@ Version history
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,11 +52,15 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.driving_knowledge import (
+    ASSUMPTIONS,
+    ROAD_END,
+    CarKnowledge,
+    assumed_cars,
+)
 from mirror_ppl.domains.lane_values import action_values
 
 STAY, SWITCH = 0, 1
-ROAD_END = 12
-"""Distance in cells at which the visible road ends, ahead and behind."""
 NEAR = 2
 """Cars of the ego's lane at most this many cells away are too near."""
 FOG_REACH = 2
@@ -133,6 +137,7 @@ class Driving:
     reach_bins: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, float(ROAD_END))
     """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
     cells away and none at the next edge. The last bin is the whole road."""
+    assumptions: tuple[str, ...] = ASSUMPTIONS
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
@@ -234,10 +239,51 @@ class Driving:
             ).any(-1),
         }
 
-    def unknown_so_far(self, visibility: Visibility) -> Visibility:
-        """Visual items ``[..., T, 4]`` of cars neither seen nor told of at this step or before."""
-        known = (visibility["visual"] | visibility["verbal"]).long().cummax(-2).values.bool()
-        return {"visual": ~known, "verbal": torch.zeros_like(known)}
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> CarKnowledge:
+        """Knowledge ``[*batch]`` before anything was observed."""
+        return CarKnowledge.nothing(*batch, device=device)
+
+    def learn(
+        self,
+        knowledge: CarKnowledge,
+        observation: Observation,
+        visible: Visibility,
+        sees: Callable[[Observation], Visibility],
+    ) -> CarKnowledge:
+        """Two sights of a car, one utterance, or its absence where it was assumed, make it known.
+
+        See `mirror_ppl.domains.driving_knowledge`.
+        """
+        return knowledge.learn(observation, visible, sees)
+
+    def known(self, knowledge: CarKnowledge) -> Visibility:
+        """Of a known car both items ``[..., 4]``: place and speed."""
+        return {"visual": knowledge.known, "verbal": knowledge.known}
+
+    def assume(
+        self, knowledge: CarKnowledge, observation: Observation
+    ) -> tuple[dict[str, Visibility], Observation]:
+        """``clear``: cars never observed are off the road. ``closing``: unsure ones come closer."""
+        absent = ~knowledge.placed
+        position = torch.where(absent, float(ROAD_END), knowledge.position)
+        items = {
+            "clear": {"visual": absent, "verbal": torch.zeros_like(absent)},
+            "closing": {"visual": knowledge.unsure, "verbal": knowledge.unsure},
+        }
+        return items, assumed_cars(position, knowledge.speed, observation)
+
+    def supposed(
+        self, state: DrivingState, knowledge: CarKnowledge, assumes: Mapping[str, Tensor]
+    ) -> DrivingState:
+        """The state as somebody with such knowledge and assumptions ``[...]`` believes it to be."""
+        gone = ~knowledge.placed & assumes["clear"][..., None]
+        closing = knowledge.unsure & assumes["closing"][..., None]
+        position = torch.where(closing, knowledge.position.to(state.position.dtype), state.position)
+        return replace(
+            state,
+            position=torch.where(gone, 10 * ROAD_END, position),
+            speed=torch.where(closing, knowledge.speed.to(state.speed.dtype), state.speed),
+        )
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Observations as discrete symbols, the form in which networks read them.
@@ -265,18 +311,6 @@ class Driving:
         """Direction (index into ``directions``) and distance in cells of each car, ``[..., 4]``."""
         ahead, offset = observation["visual"].unbind(-1)
         return 2 * (ahead < 0).long() + (offset != 0).long(), ahead.abs()
-
-    def absent(self, observation: Observation) -> Observation:
-        """The same lane and an empty road: every car beyond the visible end."""
-        empty = {name: value.clone() for name, value in observation.items()}
-        for name in ("visual", "verbal"):
-            empty[name][..., 0] = ROAD_END
-        empty["verbal"][..., 2] = 0.0
-        return empty
-
-    def remove(self, state: DrivingState, gone: Tensor) -> DrivingState:
-        """The state without the cars marked in ``gone`` ``[..., 4]``: they are far off the road."""
-        return replace(state, position=torch.where(gone, 10 * ROAD_END, state.position))
 
     def state_behind(self, observation: Observation) -> DrivingState:
         """The state ``[...]`` behind an observation; a car off the road stays there.

@@ -1,8 +1,8 @@
 """How good a self-model is: its returns, and its agreement with exact planners in any view.
 
 In full view the yardstick is the exact planner that knows everything. In partial view it is the
-exact planner that knows only the cars that were seen or told of so far, which is what a credulous
-person knows (see `mirror_ppl.models.views`).
+exact planner of the world as somebody with that view believes it to be who remembers everything
+and makes every assumption (see `mirror_ppl.models.views`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Domain, total_reward
-from mirror_ppl.inference.experience import drive, experience, map_state, roll_out
+from mirror_ppl.inference.experience import (
+    drive,
+    experience,
+    follow,
+    map_state,
+    roll_out,
+    supposed,
+)
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.views import ViewPlan
 
@@ -34,17 +41,20 @@ def fixed_views(
         domain: the world.
         batch: number of rounds B.
         generator: source of the numbers that a plan needs; they decide nothing here.
-        reach: distance for each direction; given, the observer takes the unseen to be absent.
+        reach: distance for each direction; given, the observer remembers, and makes every
+            assumption.
         speech: whether everything is also told.
     """
     farthest = (domain.reach_bins[-1],) * len(domain.directions)
     some = torch.ones(batch, device=generator.device)
+    limited = torch.full_like(some, reach is not None, dtype=torch.bool)
     rates = {m.name: some * (m.name == "visual" or speech) for m in domain.modalities}
     return ViewPlan(
         reach=torch.tensor(reach or farthest, device=generator.device).expand(batch, -1),
         keep=rates,
         told={name: torch.zeros_like(some) for name in rates},
-        credulous=torch.full_like(some, reach is not None, dtype=torch.bool),
+        remembers=limited,
+        assumes=dict.fromkeys(domain.assumptions, limited),
         noise={
             m.name: torch.rand(
                 batch,
@@ -136,9 +146,8 @@ def self_model_quality(
 def _exact_values(
     domain: Domain, start: Any, actions: Tensor, plan: ViewPlan, discount: float
 ) -> Tensor:
-    """Values ``[B, T, A]`` for whom the things seen or told of so far are all there is."""
+    """Values ``[B, T, A]`` of the world as the observer believes it to be."""
     states = roll_out(domain, start, actions)
-    seen = plan.visibility(domain, domain.observe(states))
-    unknown = domain.unknown_so_far(seen)["visual"]
-    known_world = domain.remove(states, unknown & plan.credulous[:, None, None])
-    return domain.reference_values(map_state(lambda part: part[:, :-1], known_world), discount)
+    _, knowledge = follow(domain, plan, domain.observe(states))
+    believed = supposed(domain, plan, states, knowledge)
+    return domain.reference_values(map_state(lambda part: part[:, :-1], believed), discount)

@@ -62,8 +62,8 @@ def roll_out(domain: Domain, start: Any, actions: Tensor) -> Any:
 def experience(domain: Domain, start: Any, actions: Tensor, plan: ViewPlan) -> Experience:
     """What an observer with a view gets from rounds.
 
-    A credulous observer's world holds nothing that they have not seen or been told of, so neither
-    do the observations, rewards and outcomes from which the networks learn to think like them.
+    The world of an observer who takes things for granted is as they believe it to be, and so are
+    the observations, rewards and outcomes from which the networks learn to think like them.
 
     Args:
         domain: the world.
@@ -72,29 +72,33 @@ def experience(domain: Domain, start: Any, actions: Tensor, plan: ViewPlan) -> E
         plan: views of B rounds.
     """
     states = roll_out(domain, start, actions)
-    seen = plan.visibility(domain, domain.observe(states))
-    unknown = domain.unknown_so_far(seen)["visual"] & plan.credulous[:, None, None]
-    believed = domain.remove(states, unknown)
-    before, unknown_before = map_state(lambda part: part[:, :-1], states), unknown[:, :-1]
-    current = map_state(lambda part: part[:, :-1], believed)
+    visible, knowledge = follow(domain, plan, domain.observe(states))
+    believed = supposed(domain, plan, states, knowledge)
+    current, so_far = (
+        map_state(lambda part: part[:, :-1], whole) for whole in (believed, knowledge)
+    )
 
     def outcome(action: Tensor) -> Outcomes:
-        following = domain.remove(domain.transition(before, action), unknown_before)
+        following = domain.transition(current, action)
         observation = domain.observe(following)
-        visible = plan.visibility(domain, observation, first=1)
+        seen, after = plan.look(domain, so_far, observation, 1)
+        taken = plan.taken(domain, after, observation)
         return Outcomes(
             reward=total_reward(domain.rewards(current, action, following)),
             observation=observation,
-            visible=_imagine_absent(visible, unknown_before),
+            visible={name: mask | taken[name] for name, mask in seen.items()},
         )
 
-    taken = domain.remove(map_state(lambda part: part[:, 1:], states), unknown_before)
+    observation = domain.observe(believed)
+    taken = plan.taken(domain, knowledge, observation)
     return Experience(
         rounds=Rounds(
-            observation=domain.observe(believed),
-            visible=_imagine_absent(seen, unknown),
+            observation=observation,
+            visible={name: mask | taken[name] for name, mask in visible.items()},
             actions=actions,
-            rewards=total_reward(domain.rewards(current, actions, taken)),
+            rewards=total_reward(
+                domain.rewards(current, actions, domain.transition(current, actions))
+            ),
         ),
         outcomes=tuple(
             outcome(torch.full_like(actions, index)) for index in range(len(domain.actions))
@@ -102,12 +106,25 @@ def experience(domain: Domain, start: Any, actions: Tensor, plan: ViewPlan) -> E
     )
 
 
-def _imagine_absent(seen: Visibility, unknown: Tensor) -> Visibility:
-    """Unknown items count as seen: their observation says that nothing is there."""
-    return {
-        name: (mask & ~unknown) | (unknown if name == "visual" else False)
-        for name, mask in seen.items()
-    }
+def follow(domain: Domain, plan: ViewPlan, observation: Observation) -> tuple[Visibility, Any]:
+    """What is visible of rounds ``[B, T + 1, K]``, and what is known of them ``[B, T + 1]``."""
+    batch, steps = observation["ego"].shape[:2]
+    knowledge = domain.nothing_known(batch, 1, device=observation["ego"].device)
+    looks = []
+    for step in range(steps):
+        now = {name: value[:, step : step + 1] for name, value in observation.items()}
+        visible, knowledge = plan.look(domain, knowledge, now, step)
+        looks.append((visible, knowledge))
+    return (
+        {name: torch.cat([visible[name] for visible, _ in looks], 1) for name in looks[0][0]},
+        map_state(lambda *parts: torch.cat(parts, 1), *(after for _, after in looks)),
+    )
+
+
+def supposed(domain: Domain, plan: ViewPlan, states: Any, knowledge: Any) -> Any:
+    """States ``[B, T']`` as the observers believe them to be."""
+    assumes = {name: makes[:, None] for name, makes in plan.assumes.items()}
+    return domain.supposed(states, knowledge, assumes)
 
 
 @torch.no_grad()
@@ -134,21 +151,21 @@ def drive(
         discount: discount of the exact planner.
     """
     domain = self_model.domain
-    batch = len(plan.credulous)
+    batch = len(plan.remembers)
     device = generator.device
     by_expert = torch.rand(batch, generator=generator, device=device) < expert
     belief = torch.zeros(batch, self_model.latent, device=device)
     previous = torch.full((batch,), len(domain.actions), device=device)
-    unknown = torch.ones(batch, 1, len(domain.modalities[0].items), device=device).bool()
+    knowledge = domain.nothing_known(batch, 1, device=device)
     state, actions = start, []
     for step in range(steps):
-        observation = {name: value[:, None] for name, value in domain.observe(state).items()}
-        seen = plan.visibility(domain, observation, first=step)
-        unknown = unknown & domain.unknown_so_far(seen)["visual"]
-        imagined = unknown & plan.credulous[:, None, None]
-        believed = domain.remove(map_state(lambda part: part[:, None], state), imagined)
-        embedded = self_model.encoder.embed(domain.symbols(domain.observe(believed)))
-        evidence = self_model.encoder.combine(embedded, _imagine_absent(seen, imagined))[:, 0]
+        now = map_state(lambda part: part[:, None], state)
+        visible, knowledge = plan.look(domain, knowledge, domain.observe(now), step)
+        observation = domain.observe(supposed(domain, plan, now, knowledge))
+        taken = plan.taken(domain, knowledge, observation)
+        visible = {name: mask | taken[name] for name, mask in visible.items()}
+        embedded = self_model.encoder.embed(domain.symbols(observation))
+        evidence = self_model.encoder.combine(embedded, visible)[:, 0]
         evidence = evidence + self_model.encoder.action(previous)
         belief = self_model.encoder(belief, evidence).mean
         action = self_model.action_values(belief).argmax(-1)

@@ -227,15 +227,12 @@ def _views(
     resolution: float,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Distinct views of one round, and which of them each combination has."""
-    view = View(*(_expanded(masks, combinations) for masks in (view.visible, view.absent)))
-    bits = _bits(view, real)
+    view = view.map(lambda part: part.expand(combinations, *part.shape[1:]))
+    bits = view.rows() * real[:, None]
     first, inverse = distinct_rows(bits.flatten(1))
     beliefs = []
     for rows in first.split(CHUNK):
-        some = View(
-            {name: mask[rows] for name, mask in view.visible.items()},
-            {name: mask[rows] for name, mask in view.absent.items()},
-        )
+        some = view.map(lambda part: part[rows])  # noqa: B023 - used at once
         beliefs.append(human.believe(some, observation, actions))
     belief = torch.cat(beliefs)
     # Views that agree up to a step agree in the belief at that step.
@@ -297,18 +294,8 @@ class _Screen:
         return log_probabilities
 
 
-def _expanded(masks: Mapping[str, Tensor], rows: int) -> dict[str, Tensor]:
-    return {name: mask.expand(rows, *mask.shape[1:]) for name, mask in masks.items()}
-
-
-def _bits(view: View, real: Tensor) -> Tensor:
-    """What distinguishes views, ``[M, T, N]``; padding steps do not."""
-    masks = [*view.visible.values(), *view.absent.values()]
-    return torch.cat(masks, -1).long() * real[:, None]
-
-
 def _prefixes(bits: Tensor) -> Tensor:
-    """A number ``[M, T]`` for each beginning of each view, the same for the same beginnings."""
+    """A number ``[M, T]`` for each beginning of rows ``[M, T, N]``, the same for the same ones."""
     # A key of its own tells steps apart: seeing nothing now differs from having seen nothing.
     step_key, keys = random_keys(1 + bits[0].numel(), bits.device).split([1, bits[0].numel()])
     steps = torch.arange(bits.shape[1], device=bits.device) * step_key

@@ -4,29 +4,35 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
 
     psi_p      ~ prior                                     inside pyro.plate("person", P)
     n_t        = natural visibility of each item           perceptual implants
-    v_t        = n_t or told_<=t                           what was communicated is overlaid
-    zH_t       = mean of q(. | zH_{t-1}, v_t * x_t, v_t, a_{t-1})         social projection
+    k_t        = what follows from everything seen and told up to t
+    v_t        = n_t or told_t or k_t                      what was communicated is overlaid
+    u_t        = what psi_p takes for granted about the rest
+    zH_t       = mean of q(. | zH_{t-1}, v_t * x_t + u_t, v_t, a_{t-1})   social projection
     a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
     z_t, x_t, r_t ~ the self-model's transition, observation and reward likelihoods
 
-To change the model, derive from :class:`HumanModel` and override one of ``prior``, ``perceive``,
-``believe`` and ``act``, in Pyro's syntax; fitting, predicting and simulating call those methods.
+To change the model, derive from :class:`HumanModel` and override one of ``prior``, ``sees``,
+``perceive``, ``believe`` and ``act``, in Pyro's syntax; fitting, predicting and simulating call
+those methods.
 
 Departures from the supplement: thresholds are inferred by the bin between distances that can occur;
-a person may take the unseen to be absent (``assumes_clear``); actions may be lapses. Reasons and
-measurements stand in ``docs/decisions.md``.
+a person may take things for granted (``assumes_clear``, ``assumes_closing``); actions may be
+lapses. Reasons and measurements stand in ``docs/decisions.md``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import pyro
 import torch
 from torch import Tensor, nn
 
-from mirror_ppl.domains.base import Domain, Observation, Visibility, digested
+from mirror_ppl.distinct import as_whole_numbers
+from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import Rounds, SelfModel
@@ -37,15 +43,53 @@ Implants = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class View:
-    """What of a round enters a person's belief; masks ``[..., T, K]`` for each modality.
+    """What enters a person's belief: masks ``[..., K]`` for each modality, and what they imagine.
 
     Attributes:
-        visible: seen or told.
-        absent: not seen or told, and taken to be absent.
+        visible: seen, told or remembered.
+        taken: neither, but taken for granted; empty if nothing is.
+        imagined: the observation ``[..., K, F]`` in which the taken items are as they take them.
     """
 
     visible: Visibility
-    absent: Visibility
+    taken: Visibility = field(default_factory=dict)
+    imagined: Observation = field(default_factory=dict)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> View:
+        """A view of each mask and each imagined item changed alike, along leading dimensions."""
+        return View(
+            {name: function(mask) for name, mask in self.visible.items()},
+            {name: function(mask) for name, mask in self.taken.items()},
+            {name: function(value) for name, value in self.imagined.items()},
+        )
+
+    @classmethod
+    def stack(cls, steps: Sequence[View]) -> View:
+        """A view of a round ``[..., T, K]`` of those of its steps."""
+
+        def stacked(parts: Sequence[dict[str, Tensor]], behind: int) -> dict[str, Tensor]:
+            return {
+                name: torch.stack(
+                    torch.broadcast_tensors(*(part[name] for part in parts)),
+                    -2 if name == "ego" else -1 - behind,
+                )
+                for name in parts[0]
+            }
+
+        return cls(
+            stacked([step.visible for step in steps], 1),
+            stacked([step.taken for step in steps], 1),
+            stacked([step.imagined for step in steps], 2),
+        )
+
+    def rows(self) -> Tensor:
+        """Everything that counts, as whole numbers ``[..., N]``, equal where views are equal."""
+        parts = [mask.long() for mask in (*self.visible.values(), *self.taken.values())]
+        for name, mask in self.taken.items():
+            value = torch.where(mask[..., None], self.imagined[name], 0.0)
+            parts.append(as_whole_numbers(value).flatten(-2))
+        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*shape, -1) for part in parts], -1)
 
 
 class HumanModel(nn.Module):
@@ -92,25 +136,69 @@ class HumanModel(nn.Module):
             self.domain, like
         ) | implant_priors.policy_implants(self.domain, self.self_model.latent, like)
 
+    def sees(self, implants: Implants, observation: Observation) -> Visibility:
+        """What a person sees by themselves at one step, masks ``[..., K]``: ``n_t``.
+
+        Args:
+            implants: the discrete sites of :meth:`prior`, ``[...]``.
+            observation: everything that could be seen at this step, ``[..., K, F]``.
+        """
+        direction, distance = self.domain.distance(observation)
+        thresholds = implant_priors.reach(self.domain, implants)[..., None, :]
+        within = distance[..., None] <= thresholds
+        visual = within.gather(-1, direction[..., None].expand(*within.shape[:-1], 1)).squeeze(-1)
+        unseen = torch.zeros_like(visual)
+        return {
+            modality.name: visual if modality.name == "visual" else unseen
+            for modality in self.domain.modalities
+        }
+
+    def look(
+        self, implants: Implants, knowledge: Any, observation: Observation, told: Visibility
+    ) -> tuple[View, Any]:
+        """One step of :meth:`perceive`.
+
+        Args:
+            implants: the discrete sites of :meth:`prior`, ``[...]``.
+            knowledge: the domain's, of the step before.
+            observation: everything that could be seen at this step, ``[..., K, F]``.
+            told: what is communicated at this step, ``[..., K]``.
+
+        Returns:
+            The view of this step, and the knowledge after it.
+        """
+        domain = self.domain
+        seen = self.sees(implants, observation)
+        visible = {name: mask | told[name] for name, mask in seen.items()}
+        knowledge = domain.learn(knowledge, observation, visible, partial(self.sees, implants))
+        visible = {name: visible[name] | mask for name, mask in domain.known(knowledge).items()}
+        items, imagined = domain.assume(knowledge, observation)
+        taken = {name: torch.zeros_like(mask) for name, mask in visible.items()}
+        for assumption, about in items.items():
+            makes = implants[implant_priors.ASSUMES + assumption][..., None] == 1
+            for name, mask in about.items():
+                taken[name] = taken[name] | (mask & makes & ~visible[name])
+        return View(visible, taken, imagined), knowledge
+
     def perceive(self, implants: Implants, observation: Observation, told: Visibility) -> View:
-        """What a person sees, and takes to be absent.
+        """What a person sees, is told, remembers and takes for granted, masks ``[..., T, K]``.
 
         Args:
             implants: the discrete sites of :meth:`prior`, ``[...]``.
             observation: everything that could be seen, ``[..., T, K, F]``.
-            told: what is communicated, ``[..., T, K]``; from then on it is known.
+            told: what is communicated, ``[..., T, K]``.
         """
-        told = digested(told)
-        direction, distance = self.domain.distance(observation)
-        thresholds = implant_priors.reach(self.domain, implants)[..., None, None, :]
-        selected = torch.zeros_like(distance)
-        for index in range(thresholds.shape[-1]):
-            selected = torch.where(direction == index, thresholds[..., index], selected)
-        visible = {name: mask.expand(selected.shape) for name, mask in told.items()}
-        visible["visual"] = (distance <= selected) | told["visual"]
-        unknown = self.domain.unknown_so_far(visible)
-        clear = implants[implant_priors.ASSUMES_CLEAR][..., None, None] == 1
-        return View(visible, {name: mask & clear for name, mask in unknown.items()})
+        knowledge = self.domain.nothing_known(1, device=observation["ego"].device)
+        views = []
+        for step in range(observation["ego"].shape[-2]):
+            now = {
+                name: value[..., step, :] if name == "ego" else value[..., step, :, :]
+                for name, value in observation.items()
+            }
+            heard = {name: mask[..., step, :] for name, mask in told.items()}
+            view, knowledge = self.look(implants, knowledge, now, heard)
+            views.append(view)
+        return View.stack(views)
 
     def believe(self, view: View, observation: Observation, actions: Tensor) -> Tensor:
         """Beliefs ``zH`` ``[..., T, Z]`` of views of rounds: the means of the robot's own encoder.
@@ -127,10 +215,11 @@ class HumanModel(nn.Module):
     def evidence(self, view: View, observation: Observation) -> Tensor:
         """What views ``[..., K]`` of observations tell the encoder at each step, ``[..., H]``."""
         encoder, domain = self.self_model.encoder, self.domain
-        real = encoder.embed(domain.symbols(observation))
-        empty = encoder.embed(domain.symbols(domain.absent(observation)))
-        evidence = encoder.combine(real, view.visible)
-        return encoder.combine({**empty, "ego": evidence}, view.absent)
+        evidence = encoder.combine(encoder.embed(domain.symbols(observation)), view.visible)
+        if not view.taken:
+            return evidence
+        imagined = encoder.embed(domain.symbols(view.imagined))
+        return encoder.combine({**imagined, "ego": evidence}, view.taken)
 
     def advance(self, belief: Tensor, evidence: Tensor, action: Tensor) -> Gaussian:
         """One step of :meth:`believe`: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.

@@ -18,8 +18,8 @@ from mirror_ppl.domains.base import Domain
 
 SIGHT = "sight_"
 """Prefix of the sites of directional sight thresholds, one for each direction of the domain."""
-ASSUMES_CLEAR = "assumes_clear"
-"""Site of what the person makes of things they have not seen or been told of."""
+ASSUMES = "assumes_"
+"""Prefix of the sites of what a person takes for granted, one for each assumption of the domain."""
 RESIDUAL_HIDDEN = 8
 
 
@@ -28,24 +28,30 @@ def sight_sites(domain: Domain) -> tuple[str, ...]:
     return tuple(SIGHT + direction for direction in domain.directions)
 
 
+def assumption_sites(domain: Domain) -> tuple[str, ...]:
+    """Names of the sites of what is taken for granted, in the order of the domain."""
+    return tuple(ASSUMES + assumption for assumption in domain.assumptions)
+
+
 def perceptual_implants(
-    domain: Domain, like: Tensor, clear_probability: float = 0.5
+    domain: Domain, like: Tensor, assumption_probability: float = 0.5
 ) -> dict[str, Tensor]:
     """Sample what a person sees, as indices that can be enumerated.
 
     ``sight_<direction>`` is an index into the domain's ``reach_bins``, uniform: a threshold matters
     only where it crosses a distance that can occur, so those crossings are all there is to infer.
-    ``assumes_clear`` is 1 for a person to whom what they never saw is not there, and 0 for one to
-    whom it is unknown, as it is to the robot; its prior probability can be given.
+    ``assumes_<assumption>`` is 1 for a person who takes it for granted, and 0 for one to whom it is
+    open, as it is to the robot; the prior probability of 1 can be given.
     """
     bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
     implants = {
         site: pyro.sample(site, dist.Categorical(bins / bins.sum())) for site in sight_sites(domain)
     }
-    clear = torch.tensor(
-        [1 - clear_probability, clear_probability], dtype=like.dtype, device=like.device
+    open_or_taken = torch.tensor(
+        [1 - assumption_probability, assumption_probability], dtype=like.dtype, device=like.device
     )
-    implants[ASSUMES_CLEAR] = pyro.sample(ASSUMES_CLEAR, dist.Categorical(clear))
+    for site in assumption_sites(domain):
+        implants[site] = pyro.sample(site, dist.Categorical(open_or_taken))
     return implants
 
 

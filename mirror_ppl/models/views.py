@@ -7,14 +7,16 @@ what they make of it. So each training round is seen in a way of its own, of thr
 - *dropout*: each item with a probability drawn for the round, in each modality;
 - *sight*: cars up to a reach drawn for each direction, and now and then something is told.
 
-In a sight view the observer may be *credulous*: what they have never seen or been told of is absent
-to them. For such a round the world itself is taken to be as believed, so that the encoder learns
-what such an observer would conclude; an item that is merely not visible stays unknown.
+An observer with a sight view remembers: what follows from what they have seen and been told counts
+as visible. And they may take things for granted, such as that a car never seen is not there. For
+such a round the world itself is taken to be as believed, so that the encoder learns what such an
+observer would conclude; an item that is merely not visible stays unknown.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +25,8 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility
 
 KINDS = ("full", "dropout", "sight")
 KIND_PROBABILITIES = (0.1, 0.1, 0.8)
-CREDULOUS_PROBABILITY = 0.6
+ASSUMPTION_PROBABILITY = 0.7
+"""Share of sight views in which each assumption is made."""
 TOLD_PROBABILITY = 0.4
 ALIKE_PROBABILITY = 0.5
 """Share of sight views with the same reach in all directions of a group: most people's eyes."""
@@ -37,35 +40,74 @@ class ViewPlan:
         reach: sight threshold for each direction ``[B, D]``, in the domain's unit of distance.
         keep: for each modality, the probability ``[B]`` that an item within reach is visible.
         told: for each modality, the probability ``[B]`` that a communicable item is told.
-        credulous: ``[B]``, whether never-seen items are taken to be absent.
+        remembers: ``[B]``, whether what follows from earlier observations counts as visible.
+        assumes: for each of the domain's assumptions, whether it is made, ``[B]``.
         noise: for each modality, uniform numbers ``[B, T + 1, K, 2]`` that decide keep and told.
     """
 
     reach: Tensor
     keep: Visibility
     told: Visibility
-    credulous: Tensor
+    remembers: Tensor
+    assumes: dict[str, Tensor]
     noise: dict[str, Tensor]
 
-    def visibility(self, domain: Domain, observation: Observation, first: int = 0) -> Visibility:
-        """What is visible ``[B, T', K]`` of observations ``[B, T', ...]`` from step ``first``."""
+    def sees(self, domain: Domain, observation: Observation, first: int = 0) -> Visibility:
+        """What is seen unaided ``[B, T', K]`` of observations ``[B, T', ...]`` from a step on."""
         direction, distance = domain.distance(observation)
         batch = torch.arange(len(self.reach), device=self.reach.device)[:, None, None]
-        within = {
+        seen = {
             modality.name: torch.ones_like(distance, dtype=torch.bool)
             for modality in domain.modalities
         }
-        within["visual"] = distance <= self.reach[batch, direction]
-        communicable = domain.communicable(observation)
+        seen["visual"] = distance <= self.reach[batch, direction]
         steps = slice(first, first + distance.shape[1])
-        visible = {}
-        for name, near in within.items():
-            keep, told = (
-                self.noise[name][:, steps].unbind(-1)[i] < probability[name][:, None, None]
-                for i, probability in enumerate((self.keep, self.told))
-            )
-            visible[name] = (near & keep) | (communicable[name] & told)
+        return {
+            name: near & (self.noise[name][:, steps, :, 0] < self.keep[name][:, None, None])
+            for name, near in seen.items()
+        }
+
+    def visibility(self, domain: Domain, observation: Observation, first: int = 0) -> Visibility:
+        """What is seen or told ``[B, T', K]`` of observations from step ``first``."""
+        communicable = domain.communicable(observation)
+        visible = self.sees(domain, observation, first)
+        for name, seen in visible.items():
+            luck = self.noise[name][:, first : first + seen.shape[1], :, 1]
+            visible[name] = seen | (communicable[name] & (luck < self.told[name][:, None, None]))
         return visible
+
+    def look(
+        self, domain: Domain, knowledge: Any, observation: Observation, first: int
+    ) -> tuple[Visibility, Any]:
+        """What is visible, all told, and the knowledge after each of some steps.
+
+        Args:
+            domain: the world.
+            knowledge: before each of these steps, ``[B, T']``.
+            observation: ``[B, T', ...]``, from step ``first`` on.
+            first: number of the first of these steps.
+
+        Returns:
+            Masks ``[B, T', K]`` of items seen, told of or remembered, and knowledge ``[B, T']``.
+        """
+        visible = self.visibility(domain, observation, first)
+        knowledge = domain.learn(
+            knowledge, observation, visible, lambda supposed: self.sees(domain, supposed, first)
+        )
+        remembered = domain.known(knowledge)
+        return {
+            name: mask | (remembered[name] & self.remembers[:, None, None])
+            for name, mask in visible.items()
+        }, knowledge
+
+    def taken(self, domain: Domain, knowledge: Any, observation: Observation) -> Visibility:
+        """Items ``[B, T', K]`` that are taken for granted, given knowledge ``[B, T']``."""
+        items, _ = domain.assume(knowledge, observation)
+        taken = {name: torch.zeros_like(mask) for name, mask in items[next(iter(items))].items()}
+        for assumption, about in items.items():
+            for name, mask in about.items():
+                taken[name] = taken[name] | (mask & self.assumes[assumption][:, None, None])
+        return taken
 
 
 def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generator) -> ViewPlan:
@@ -99,6 +141,9 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
         reach=torch.where(sight[:, None], bins[drawn], bins[-1]),
         keep=keep,
         told=told,
-        credulous=sight & (uniform(batch) < CREDULOUS_PROBABILITY),
+        remembers=sight,
+        assumes={
+            name: sight & (uniform(batch) < ASSUMPTION_PROBABILITY) for name in domain.assumptions
+        },
         noise=noise,
     )

@@ -224,7 +224,7 @@ def simulate_driving(
         scenarios=start.scenario,
         truth={
             **{f"sight_{direction}": reach for direction, reach in sight},
-            "assumes_clear": torch.ones(people),
+            **{f"assumes_{name}": torch.ones(people) for name in Driving.assumptions},
             "consistency": drivers.consistency,
         },
         action_entropy=recording.action_entropy,

@@ -55,8 +55,8 @@ def share_known(person: Person, past: RoundSoFar) -> Tensor:
         for name, mask in past.told.items()
     }
     visible = person.see(eyes, observation, told).visible
-    unknown = person.human.domain.unknown_so_far(visible)["visual"]
-    return (~unknown)[person.eye].float().mean(0)
+    observed = torch.stack(list(visible.values())).any(0).long().cummax(1).values
+    return observed[person.eye].float().mean(0)
 
 
 def share_seen(person: Person, lane: int) -> Tensor:
