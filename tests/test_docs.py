@@ -180,8 +180,10 @@ def test_views_of_training_are_told_with_their_shares():
     }
     told = [f"{views.ALIKE_PROBABILITY:.0%}", f"{views.TOLD_PROBABILITY:.0%}"]
     assert re.findall(r"in (\d+%)", rows["sight"][2]) == told
-    credulous = f"In {views.CREDULOUS_PROBABILITY:.0%} of the"
-    assert credulous in page("docs/self_model.md") and credulous in page("docs/decisions.md")
+    share = f"in {views.ASSUMPTION_PROBABILITY:.0%}"
+    for name in ("docs/self_model.md", "docs/decisions.md"):
+        # Once for each assumption.
+        assert page(name).lower().count(share) == 2, name
 
 
 def test_priors_are_told_as_they_are(self_model):
@@ -369,6 +371,7 @@ def known(human, people, reach_bin):
     sites = {f"sight_{direction}": reach_bin * ones.long() for direction in human.domain.directions}
     return sites | {
         "assumes_clear": 0 * ones.long(),
+        "assumes_closing": 0 * ones.long(),
         "consistency": 3.0 * ones,
         "lapse": 0.01 * ones,
         "residual_out": torch.zeros(people, 1, 9, 2),

@@ -93,8 +93,8 @@ class Pairing:
         check_contract(self.human)
         self.file.draws(self.human, self.draws)
 
-    def play(self, number: int, name: str, rates: dict[str, float] | None) -> Played:
-        """Rounds of the person of that number with one communicator."""
+    def listener(self, number: int, inferred: bool = True) -> Listener:
+        """The person of that number, with their rounds, and what was inferred of them."""
         driver = simulated_drivers(
             self.setting, self.population, self.people, self.people_seed
         ).select([number])
@@ -104,10 +104,14 @@ class Pairing:
             map_state(lambda part: part[own], starts.state), starts.scenario[own], starts.luck[own]
         )
         person = None
-        if name.startswith("mirror"):
+        if inferred:
             draws = self.file.draws(self.human, self.draws)
             person = Person(self.human, {site: value[:, own] for site, value in draws.items()})
-        listener = Listener(self.domain, self.setting, driver, start, person)
+        return Listener(self.domain, self.setting, driver, start, person)
+
+    def play(self, number: int, name: str, rates: dict[str, float] | None) -> Played:
+        """Rounds of the person of that number with one communicator."""
+        listener = self.listener(number, name.startswith("mirror"))
         say = speaker(name, listener, self.planner, self.seed + number, rates)
         return play(listener, say, self.keep_log)
 

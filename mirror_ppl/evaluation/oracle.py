@@ -64,18 +64,21 @@ class Oracle:
         self._steps = _everything(driver, start)
         value = torch.zeros(int(self._steps[-1].following.max()) + 1)
         self._best: list[Tensor] = []
+        self._lost: list[Tensor] = []
         channels = Channels(Driving())
         for step in reversed(self._steps):
             chance = (step.probability * (step.reward + value[step.following])).sum(-1)
             worth = chance[step.outcome] - channels.cost(step.message)
             value = torch.full((step.states,), -torch.inf)
             value = value.scatter_reduce(0, step.state, worth, "amax")
+            self._lost.append(value[step.state] - worth)
             # Choices of a state are in the order of messages, silence first: it wins ties.
             number = torch.arange(len(worth))
             good = worth >= value[step.state] - 1e-6
             first = torch.full((step.states,), len(worth))
             self._best.append(first.scatter_reduce(0, step.state[good], number[good], "amin"))
         self._best.reverse()
+        self._lost.reverse()
         self.value = value
 
     def messages(self, actions: Tensor) -> Tensor:
@@ -90,6 +93,30 @@ class Oracle:
             state = step.following[outcome, action]
         time = actions.shape[1]
         return self._steps[time].message[self._best[time][state]]
+
+    def losses(self, flags: Tensor, actions: Tensor) -> Tensor:
+        """What each message of somebody else lost against the best one then, ``[R, T]``.
+
+        Expected net reward of the rest of the round with the best message now, less that with the
+        given one, each followed by the best messages: the losses of a round add up to what its
+        messages lose on the whole, in expectation.
+
+        Args:
+            flags: messages ``[R, T, items]``, each of them possible then.
+            actions: what the person did after each, ``[R, T]``.
+        """
+        state = torch.arange(len(actions))
+        places = 2 ** torch.arange(flags.shape[-1])
+        lost = []
+        for time, (said, action) in enumerate(zip(flags.unbind(1), actions.unbind(1), strict=True)):
+            step = self._steps[time]
+            names = step.state * 2 ** len(places) + (step.message * places).sum(-1)
+            order = names.argsort()
+            wanted = state * 2 ** len(places) + (said * places).sum(-1)
+            choice = order[torch.searchsorted(names[order], wanted)]
+            lost.append(self._lost[time][choice])
+            state = step.following[step.outcome[choice], action]
+        return torch.stack(lost, 1)
 
 
 def _everything(driver: Drivers, start: DrivingState) -> list[_Step]:

@@ -37,12 +37,13 @@ def fixed_views(
 ) -> ViewPlan:
     """The same view of B rounds: up to ``reach`` in each direction (everything unless given).
 
+    The observer remembers: what follows from earlier observations counts as visible.
+
     Args:
         domain: the world.
         batch: number of rounds B.
         generator: source of the numbers that a plan needs; they decide nothing here.
-        reach: distance for each direction; given, the observer remembers, and makes every
-            assumption.
+        reach: distance for each direction; given, the observer makes every assumption.
         speech: whether everything is also told.
     """
     farthest = (domain.reach_bins[-1],) * len(domain.directions)
@@ -53,7 +54,7 @@ def fixed_views(
         reach=torch.tensor(reach or farthest, device=generator.device).expand(batch, -1),
         keep=rates,
         told={name: torch.zeros_like(some) for name in rates},
-        remembers=limited,
+        remembers=torch.ones_like(limited),
         assumes=dict.fromkeys(domain.assumptions, limited),
         noise={
             m.name: torch.rand(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from mirror_ppl.models.implants import SIGHT
+from mirror_ppl.models.implants import ASSUMES, SIGHT
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import POSTERIOR, PRIOR, SAMPLE, TRUE, draws, of_person, truth
 
@@ -21,6 +21,7 @@ TITLES = {
     "sight_back_own": "sight behind, own lane",
     "sight_back_other": "sight behind, other lane",
     "assumes_clear": "takes the unseen to be absent",
+    "assumes_closing": "takes what they cannot judge to come closer",
     "consistency": "consistency of choices",
     "lapse": "lapses: choices at random",
 }
@@ -28,7 +29,7 @@ TITLES = {
 UNITS = {"consistency": "1 / unit of reward", "lapse": "probability"}
 WHOLE_ROAD = {12: "all"}
 VALUES = {name: WHOLE_ROAD for name in TITLES if name.startswith(SIGHT)}
-VALUES |= {"assumes_clear": {0: "no", 1: "yes"}}
+VALUES |= {name: {0: "no", 1: "yes"} for name in TITLES if name.startswith(ASSUMES)}
 """What single values of implants are called."""
 MOST_BARS = 25
 """Whole numbers of more different values than this are drawn as a density."""
