@@ -70,14 +70,15 @@ def main(options: Options) -> None:
     )
     simulator = SimulatorWorld(human.domain)
     planners = {
-        "every message, simulator": (simulator, Exhaustive()),
-        "every message, self-model": (SelfModelWorld(self_model), Exhaustive()),
-        "and plans of 3 steps (the default)": (simulator, Patient()),
-        "cross-entropy, plans of 3 steps": (simulator, CrossEntropy(3)),
+        "every message, simulator": (simulator, Exhaustive(), 6),
+        "every message, self-model": (SelfModelWorld(self_model), Exhaustive(), 6),
+        "and plans of 3 steps": (simulator, Patient(), 6),
+        "and horizon 10 (the default)": (simulator, Patient(), 10),
+        "cross-entropy, plans of 3 steps": (simulator, CrossEntropy(3), 6),
     }
     times = {}
-    for name, (world, search) in planners.items():
-        planner = Communicator(person, ExpectedUtility(world), search)
+    for name, (world, search, horizon) in planners.items():
+        planner = Communicator(person, ExpectedUtility(world, horizon), search)
         number = 3 if isinstance(search, CrossEntropy) else len(pasts)
         times[name] = [timed(lambda p=planner, x=past: p.plan(x)) for past in pasts[:number]]
     times["released settings: 3 x 1,000 sequences, 8 steps"] = [

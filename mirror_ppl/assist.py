@@ -45,7 +45,7 @@ class Options:
     """How many of the people, from the first on; all unless given."""
     draws: int = 64
     """Posterior draws that are planned with."""
-    horizon: int = 6
+    horizon: int = 10
     """Steps that planners look ahead."""
     discount: float = 1.0
     """Worth of a reward one step later, from above 0 to 1."""

@@ -72,7 +72,7 @@ class ExpectedUtility:
     """
 
     world: World
-    horizon: int = 6
+    horizon: int = 10
     discount: float = 1.0
     branch: float = 0.1
 

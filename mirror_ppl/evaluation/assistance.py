@@ -60,7 +60,7 @@ class PlannerOptions:
         kl_measure: what mirror-kl measures, see :class:`Divergence`.
     """
 
-    horizon: int = 6
+    horizon: int = 10
     discount: float = 1.0
     branch: float = 0.1
     patience: int = 3
