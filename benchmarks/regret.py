@@ -31,7 +31,7 @@ class Options:
     """What to measure."""
 
     posterior: Path | None = None
-    """Posterior of simulated people; they are fitted into runs/regret unless given."""
+    """Posterior of simulated people; they are fitted into runs/ unless given."""
     setting: str = "fog"
     """Setting of the domain."""
     population: str = "paper"
@@ -53,11 +53,12 @@ def main(options: Options) -> None:
     torch.set_num_threads(1)
     posterior = options.posterior
     if posterior is None:
-        folder = Path("runs/regret")
+        folder = Path(f"runs/regret_{options.setting}_{options.population}")
         posterior = folder / "posterior.nc"
         if not posterior.exists():
-            where = {"setting": options.setting, "population": options.population}
-            fit.main(fit.Options(**where, out=folder))
+            fit.main(
+                fit.Options(setting=options.setting, population=options.population, out=folder)
+            )
     print(f"{'planner':<24} {'lost':>6} {'silent':>6} {'spoken':>6}")
     for horizon in options.horizons:
         for patience in options.patience:
