@@ -199,20 +199,45 @@ def test_silence_at_the_last_action_of_somebody_who_acts_the_same_anyway(monkeyp
     assert silent(talker(sight=2).plan(begun(0, [9, 9, -9, -9], [1, 1, -1, -1])))
 
 
+def second_look(lane, positions, speeds):
+    """A round that came to this scene after one step, in which nothing was said."""
+    before = [place - speed for place, speed in zip(positions, speeds, strict=True)]
+    past = begun(lane, before, speeds)
+    return past.then(CHANNELS.split(flags()), 0, begun(lane, positions, speeds).now)
+
+
+@pytest.mark.parametrize("assumes_closing", [0, 1])
 @pytest.mark.parametrize("assumes_clear", [0, 1])
-@pytest.mark.parametrize("past", [BLOCKED, (1, [5, 8, -6, -4], [1, 1, -1, -1])])
-def test_silence_to_somebody_who_sees_everything(assumes_clear, past):
-    """What is shown to them is news to nobody: it gains nothing and costs what it costs."""
-    someone = talker(sight=FULL_SIGHT, assumes_clear=assumes_clear)
-    decision = someone.plan(begun(*past))
+@pytest.mark.parametrize("scene", [BLOCKED, (1, [5, 8, -6, -4], [1, 1, -1, -1])])
+def test_silence_to_somebody_who_sees_everything(assumes_clear, assumes_closing, scene):
+    """What they see for the second time they know: no news of it, so it costs what it costs."""
+    someone = talker(sight=FULL_SIGHT, assumes_clear=assumes_clear, assumes_closing=assumes_closing)
+    past = second_look(*scene)
+    decision = someone.plan(past)
     assert silent(decision)
-    shown = torch.stack([plan(flags(visual=cars)) for cars in (["front-left"], ["front-right"])])
-    both = shown[:1] | shown[1:]
-    value = someone.objective.at(someone.person, begun(*past), 15, 0)
-    utility = value(torch.cat([plan(None)[None], shown, both])).utility
-    torch.testing.assert_close(
-        utility[1:] - utility[0], torch.tensor([[-0.01], [-0.01], [-0.04]]).expand(3, 4)
-    )
+    ahead, behind = ["front-left", "front-right"], ["rear-left", "rear-right"]
+    messages = [flags(visual=ahead[:1]), flags(visual=ahead[1:]), flags(visual=ahead)]
+    messages += [flags(verbal=ahead[:1]), flags(verbal=ahead + behind)]
+    value = someone.objective.at(someone.person, past, 14, 0)
+    utility = value(torch.stack([plan(None), *map(plan, messages)])).utility
+    expected = -torch.tensor([0.01, 0.01, 0.04, 0.03, 0.48])[:, None].expand(5, 4)
+    torch.testing.assert_close(utility[1:] - utility[0], expected)
+    # At first sight of it, to be shown it is no news either, but how it moves is.
+    first = someone.objective.at(someone.person, begun(*scene), 15, 0)
+    utility = first(torch.stack([plan(None), *map(plan, messages)])).utility
+    torch.testing.assert_close(utility[1:4] - utility[0], expected[:3])
+    assert ((utility[5] - utility[0]) - expected[4]).abs().min() > 0.01
+
+
+def test_speech_at_first_sight_to_somebody_who_sees_everything():
+    """They see a car and take it to come closer, so they would switch lanes for nothing, -1."""
+    scene = (0, [3, 9, -9, -9], [1, 1, -1, -1])
+    someone = talker(sight=FULL_SIGHT)
+    decision = someone.plan(begun(*scene))
+    assert decision.message.items == {"visual": (), "verbal": ("front-left",)}
+    assert decision.gain.mean == pytest.approx(1 - decision.cost, abs=0.05)
+    assert decision.turning_point[:2] == (0, 1)
+    assert silent(someone.plan(second_look(*scene)))
 
 
 def test_silence_to_somebody_who_does_not_listen(generator):

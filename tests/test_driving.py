@@ -251,32 +251,71 @@ def test_reach_bins_go_up_to_the_whole_road(domain):
     assert 2 in domain.reach_bins  # what fog leaves
 
 
-def test_unknown_so_far_is_neither_seen_nor_told_yet(domain):
+def blind(expected):
+    """What somebody sees by themselves who sees nothing."""
+    nothing = torch.zeros_like(expected["visual"][..., 0], dtype=torch.bool)
+    return {"visual": nothing, "verbal": nothing}
+
+
+def after_one_step(domain, now, **visible):
+    """Knowledge of somebody to whom these items of a state were shown or told."""
+    observed = domain.observe(now)
+    return domain.learn(
+        domain.nothing_known(*now.lane.shape), observed, blind(observed) | visible, blind
+    )
+
+
+def test_clear_is_about_cars_neither_seen_nor_told_yet(domain):
     seen = torch.tensor([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0]]).bool()
     told = torch.tensor([[0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]]).bool()
-    unknown = domain.unknown_so_far({"visual": seen, "verbal": told})
-    assert unknown["visual"].int().tolist() == [[0, 1, 1, 1], [0, 1, 0, 1], [0, 0, 0, 1]]
-    assert not unknown["verbal"].any()
+    observed = domain.observe(state(0, (5, 6, -7, -8)))
+    knowledge, unknown = domain.nothing_known(), []
+    for visual, verbal in zip(seen, told, strict=True):
+        visible = {"visual": visual, "verbal": verbal}
+        knowledge = domain.learn(knowledge, observed, visible, blind)
+        items, _ = domain.assume(knowledge, observed)
+        unknown.append(items["clear"]["visual"].int().tolist())
+        assert not items["clear"]["verbal"].any()
+    assert unknown == [[0, 1, 1, 1], [0, 1, 0, 1], [0, 0, 0, 1]]
 
 
-def test_absent_is_the_same_lane_and_an_empty_road(domain):
+def test_clear_is_the_same_lane_and_an_empty_road(domain):
     observed = domain.observe(state(1, (3, 0, -4, -20)))
     kept = {name: value.clone() for name, value in observed.items()}
-    empty = domain.absent(observed)
+    _, empty = domain.assume(domain.nothing_known(), observed)
     assert same(observed, kept)  # a copy, not the original
     gone = state(1, (99, 99, 99, 99))
     assert same(empty, domain.observe(gone))
     assert not any(mask.any() for mask in domain.communicable(empty).values())
 
 
-def test_remove_takes_cars_off_the_road_for_a_whole_round(domain, generator):
+def test_who_assumes_a_clear_road_supposes_it_for_a_whole_round(domain, generator):
     start = domain.initial(50, generator)
-    gone = torch.rand(50, 4, generator=generator) < 0.5
-    states, _ = rollout(domain, domain.remove(start, gone), torch.zeros(50, 15).long())
+    spoken = torch.rand(50, 4, generator=generator) < 0.5
+    clear = torch.rand(50, generator=generator) < 0.5
+    knowledge = after_one_step(domain, start, verbal=spoken)
+    assumes = {"clear": clear, "closing": ~clear}
+    supposed = domain.supposed(start, knowledge, assumes)
+    states, _ = rollout(domain, supposed, torch.zeros(50, 15).long())
     full, _ = rollout(domain, start, torch.zeros(50, 15).long())
+    gone = ~spoken & clear[:, None]
     for after, before in zip(states, full, strict=True):
         assert (after.position[gone].abs() >= 12).all()
         assert torch.equal(after.position[~gone], before.position[~gone])
+        assert torch.equal(after.lane, before.lane)
+
+
+def test_who_assumes_cars_to_come_closer_supposes_it_of_those_seen_once(domain, generator):
+    start = domain.initial(50, generator)
+    seen = torch.rand(50, 4, generator=generator) < 0.5
+    closing = torch.rand(50, generator=generator) < 0.5
+    knowledge = after_one_step(domain, start, visual=seen)
+    assumes = {"clear": torch.zeros(50).bool(), "closing": closing}
+    supposed = domain.supposed(start, knowledge, assumes)
+    unsure = seen & closing[:, None]
+    assert torch.equal(supposed.position, start.position)
+    assert torch.equal(supposed.speed[unsure], -start.position[unsure].sign())
+    assert torch.equal(supposed.speed[~unsure], start.speed[~unsure])
 
 
 def test_symbols_tell_all_observations_apart(domain):

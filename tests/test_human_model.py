@@ -20,13 +20,18 @@ from mirror_ppl.inference.experience import experience
 from mirror_ppl.inference.svi import FitOptions, continuous_guide, fit_implants, predict_actions
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models import HumanModel, View
-from mirror_ppl.models.implants import RESIDUAL_HIDDEN, residual, sight_sites
+from mirror_ppl.models.implants import (
+    RESIDUAL_HIDDEN,
+    assumption_sites,
+    residual,
+    sight_sites,
+)
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.view_table import NO_VIEW
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")
-SIGHTS = sight_sites(DRIVING)
+SIGHTS, ASSUMED = sight_sites(DRIVING), assumption_sites(DRIVING)
 BINS = DRIVING.reach_bins
 STEPS, LATENT, ACTIONS = 15, 48, 2
 
@@ -45,7 +50,7 @@ def recordings():
 
 @pytest.fixture(scope="module")
 def table(human, recordings):
-    """All 4802 combinations of the first round."""
+    """All 9604 combinations of the first round."""
     return build_view_table(human, recordings.select_rounds([0]))
 
 
@@ -74,10 +79,10 @@ def nothing_told(steps):
     return {name: torch.zeros(1, steps, 4, dtype=torch.bool) for name in ("visual", "verbal")}
 
 
-def sight(assumes_clear=0, **bins):
+def sight(clear=0, closing=0, **bins):
     """Perceptual implants ``[1]``: bins by direction, 0 where not given."""
     values = {site: bins.get(site.removeprefix("sight_"), 0) for site in SIGHTS}
-    values["assumes_clear"] = assumes_clear
+    values |= {"assumes_clear": clear, "assumes_closing": closing}
     return {site: torch.tensor([value]) for site, value in values.items()}
 
 
@@ -95,32 +100,42 @@ def test_threshold_of_its_direction_decides_at_every_edge(human, lane, car):
     distances = list(range(0 if side > 0 else 1, ROAD_END + 1))  # abreast counts as ahead
     far = [ROAD_END, ROAD_END, -ROAD_END, -ROAD_END]
     positions = [[*far[:car], side * distance, *far[car + 1 :]] for distance in distances]
-    observation = looked_at(positions, lane)
-    told = nothing_told(len(distances))
+    # One look at each distance.
+    observation = {name: value[0] for name, value in looked_at(positions, lane).items()}
     direction = DIRECTIONS[lane][car]
     for index, edge in enumerate(BINS):
-        view = human.perceive(sight(**{direction: index}), observation, told)
+        seen = human.sees(sight(**{direction: index}), observation)
         expected = [distance <= edge for distance in distances]
-        assert view.visible["visual"][0, :, car].tolist() == expected
-        assert not view.visible["verbal"].any()
+        assert seen["visual"][:, car].tolist() == expected
+        assert not seen["verbal"].any()
         # No other threshold matters to it.
         others = {name: 6 for name in DRIVING.directions if name != direction}
-        view = human.perceive(sight(**others, **{direction: index}), observation, told)
-        assert view.visible["visual"][0, :, car].tolist() == expected
+        implants = sight(**others, **{direction: index})
+        assert human.sees(implants, observation)["visual"][:, car].tolist() == expected
+        # Each look the first of a round: a car seen twice would be known wherever it is then.
+        rounds = {name: value[:, None] for name, value in observation.items()}
+        view = human.perceive(implants, rounds, nothing_told(1))
+        assert view.visible["visual"][:, 0, car].tolist() == expected
+        # What is seen once is not known, but for a car that is seen to be gone.
+        gone = [distance == ROAD_END and edge == ROAD_END for distance in distances]
+        assert view.visible["verbal"][:, 0, car].tolist() == gone
 
 
 def test_many_people_perceive_at_once_as_they_do_alone(human, recordings):
     implants = {site: torch.randint(len(BINS), (7,)) for site in SIGHTS}
-    implants["assumes_clear"] = torch.randint(2, (7,))
+    implants |= {site: torch.randint(2, (7,)) for site in ASSUMED}
     observation = {name: value[:1, 0, :STEPS] for name, value in recordings.observation().items()}
     told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
     together = human.perceive(implants, observation, told)
+    assert all(mask.any() for mask in together.taken.values())
     for row in range(7):
         own = {site: value[row : row + 1] for site, value in implants.items()}
         alone = human.perceive(own, observation, told)
+        assert torch.equal(together.rows()[row], alone.rows()[0])
         for name in told:
             assert torch.equal(together.visible[name][row], alone.visible[name][0])
-            assert torch.equal(together.absent[name][row], alone.absent[name][0])
+            assert torch.equal(together.taken[name][row], alone.taken[name][0])
+            assert torch.equal(together.imagined[name][row], alone.imagined[name][0])
 
 
 def test_what_is_told_is_overlaid_on_what_is_seen(human):
@@ -129,11 +144,17 @@ def test_what_is_told_is_overlaid_on_what_is_seen(human):
     told["visual"][0, 1, 0] = True
     told["verbal"][0, 2, 3] = True
     view = human.perceive(sight(back_own=3), observation, told)
-    # The car behind is seen; one ahead is shown at step 1 and known from then on; another is
-    # spoken of at step 2.
-    expected = [[False, False, True, False], *[[True, False, True, False]] * 2]
+    # The car behind is seen, and from the second time on known; one ahead is shown at step 1;
+    # another is spoken of at step 2.
+    expected = [
+        [False, False, True, False],
+        [True, False, True, False],
+        [False, False, True, True],
+    ]
     assert view.visible["visual"][0].tolist() == expected
-    assert torch.equal(view.visible["verbal"], told["verbal"])
+    expected = [[False] * 4, [False, False, True, False], [False, False, True, True]]
+    assert view.visible["verbal"][0].tolist() == expected
+    assert not any(mask.any() for mask in view.taken.values())
 
 
 def test_absent_is_what_was_never_seen_nor_told(human):
@@ -142,14 +163,121 @@ def test_absent_is_what_was_never_seen_nor_told(human):
     told = nothing_told(3)
     told["verbal"][0, 1, 1] = True
     view = human.perceive(sight(1, front_own=2, back_own=1), observation, told)
-    assert view.absent["visual"][0].tolist() == [
+    assert view.taken["visual"][0].tolist() == [
         [True, True, False, True],
         [False, False, False, True],
         [False, False, False, True],
     ]
-    assert not view.absent["verbal"].any()
+    assert not view.taken["verbal"].any()
+    assert (view.imagined["visual"][..., 0][view.taken["visual"]] == ROAD_END).all()
     view = human.perceive(sight(0, front_own=2, back_own=1), observation, told)
-    assert not view.absent["visual"].any()
+    assert not any(mask.any() for mask in view.taken.values())
+
+
+def test_a_car_seen_once_comes_closer_until_they_know_better(human):
+    # Shown at step 0 only; in truth it draws away. From two cells on they would see it.
+    observation = looked_at([[5, 9, -9, -9], [6, 9, -9, -9], [7, 9, -9, -9], [8, 9, -9, -9]])
+    told = nothing_told(4)
+    told["visual"][0, 0, 0] = True
+    view = human.perceive(sight(closing=1, front_own=3), observation, told)
+    assert view.visible["visual"][0, :, 0].tolist() == [True, False, True, True]
+    assert view.visible["verbal"][0, :, 0].tolist() == [False, False, True, True]
+    assert view.taken["visual"][0, :, 0].tolist() == [False, True, False, False]
+    assert view.taken["verbal"][0, :, 0].tolist() == [True, True, False, False]
+    assert view.imagined["visual"][0, :2, 0].tolist() == [[5, 0], [4, 0]]
+    assert view.imagined["verbal"][0, :2, 0].tolist() == [[5, 0, -1], [4, 0, -1]]
+    # Whoever sees less far goes on believing it, and others take nothing for granted.
+    view = human.perceive(sight(closing=1, front_own=1), observation, told)
+    assert view.taken["visual"][0, :, 0].tolist() == [False, True, True, True]
+    assert view.imagined["visual"][0, :, 0, 0].tolist() == [5, 4, 3, 2]
+    view = human.perceive(sight(closing=0, front_own=1), observation, told)
+    assert not any(mask.any() for mask in view.taken.values())
+
+
+def test_each_car_is_taken_as_what_is_known_of_it_allows(human):
+    # All draw away: one shown ahead, one behind, one spoken of, one never. They see three cells.
+    observation = looked_at([[5, -5, 4, 9], [6, -6, 5, 9], [7, -7, 6, 9], [8, -8, 7, 9]])
+    told = nothing_told(4)
+    told["visual"][0, 0, :2] = True
+    told["verbal"][0, 0, 2] = True
+    for clear in (0, 1):
+        view = human.perceive(sight(clear, 1, front_own=3, front_other=3), observation, told)
+        # From 5 cells ahead it would be at 3 cells at step 2, and in sight; it is not.
+        visual = [[0, 0, 0, clear], [1, 1, 0, clear], *[[0, 1, 0, clear]] * 2]
+        assert view.taken["visual"][0].int().tolist() == visual
+        # Of the speed not even the first sight tells.
+        verbal = [*[[1, 1, 0, 0]] * 2, *[[0, 1, 0, 0]] * 2]
+        assert view.taken["verbal"][0].int().tolist() == verbal
+        assert view.imagined["verbal"][0, :, 1].tolist() == [[-5 + t, 1, 1] for t in range(4)]
+        assert view.visible["visual"][0].int().tolist() == [
+            [1, 1, 1, 0],
+            [0, 0, 1, 0],
+            [1, 0, 1, 0],
+            [1, 0, 1, 0],
+        ]
+        assert view.visible["verbal"][0].int().tolist() == [
+            *[[0, 0, 1, 0]] * 2,
+            *[[1, 0, 1, 0]] * 2,
+        ]
+
+
+def test_rows_of_views_are_equal_where_views_are(human, recordings):
+    observation, _ = first_round(recordings)
+    told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
+    view = human.perceive(sight(1, 1, front_own=3, back_other=2), observation, told)
+    rows = view.rows()
+    for name, mask in view.taken.items():
+        assert mask.any() and not mask.all()
+        value = view.imagined[name]
+        # Of what is not taken, and of the ego, it does not matter what was imagined.
+        other = torch.where(mask[..., None], value, value + 1)
+        imagined = view.imagined | {name: other, "ego": 1 - view.imagined["ego"]}
+        assert torch.equal(View(view.visible, view.taken, imagined).rows(), rows)
+        for feature in range(value.shape[-1]):
+            other = value.clone()
+            other[..., feature] += 0.5
+            changed = View(view.visible, view.taken, view.imagined | {name: other})
+            assert torch.equal((changed.rows() != rows).any(-1), mask.any(-1))
+    for group in ("visible", "taken"):
+        masks = getattr(view, group)
+        for name, mask in masks.items():
+            changed = replace(view, **{group: {**masks, name: ~mask}})
+            assert (changed.rows() != rows).any(-1).all()
+
+
+def test_steps_by_hand_are_those_of_the_round(human, recordings):
+    implants = {site: torch.randint(len(BINS), (7,)) for site in SIGHTS}
+    implants |= {site: torch.randint(2, (7,)) for site in ASSUMED}
+    observation = {name: value[:1, 0, :STEPS] for name, value in recordings.observation().items()}
+    told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
+    view = human.perceive(implants, observation, told)
+    assert torch.equal(view.imagined["ego"], observation["ego"])
+    whole = view.rows()
+    knowledge = DRIVING.nothing_known(1)
+    for step in range(STEPS):
+        now = {name: value[:, step] for name, value in observation.items()}
+        heard = {name: mask[:, step] for name, mask in told.items()}
+        view, knowledge = human.look(implants, knowledge, now, heard)
+        assert torch.equal(view.rows(), whole[:, step])
+
+
+def test_a_model_may_say_what_is_visible_and_no_more(human, recordings):
+    class Attentive(HumanModel):
+        """They see every other car, whatever the distance."""
+
+        def sees(self, implants, observation):
+            seen = super().sees(implants, observation)
+            return seen | {"visual": (torch.arange(4) % 2 == 0).expand(seen["visual"].shape)}
+
+    observation, actions = first_round(recordings)
+    model = Attentive(human.self_model)
+    assert model.stepwise
+    view = model.perceive(sight(), observation, nothing_told(STEPS))
+    assert view.visible["visual"][0].all(0).tolist() == [True, False, True, False]
+    bare = View(view.visible)
+    torch.testing.assert_close(
+        model.believe(bare, observation, actions), model.believe(view, observation, actions)
+    )
 
 
 # --- believe ----------------------------------------------------------------------------------
@@ -161,40 +289,72 @@ def first_round(recordings):
     return observation, recordings.actions[:1, 0]
 
 
-def view_of(visible, absent=None):
-    """A view ``[1, T, 4]`` with nothing said."""
+def emptied(observation):
+    """The same lane and an empty road: every car beyond its visible end."""
+    empty = {name: value.clone() for name, value in observation.items()}
+    for name in ("visual", "verbal"):
+        empty[name][..., 0] = ROAD_END
+    empty["verbal"][..., 2] = 0.0
+    return empty
+
+
+def view_of(visible, absent=None, observation=None):
+    """A view ``[1, T, 4]`` with nothing said, and some cars taken to be absent."""
     nothing = torch.zeros_like(visible)
-    absent = nothing if absent is None else absent
-    return View({"visual": visible, "verbal": nothing}, {"visual": absent, "verbal": nothing})
+    seen = {"visual": visible, "verbal": nothing}
+    if absent is None:
+        return View(seen)
+    return View(seen, {"visual": absent, "verbal": nothing}, emptied(observation))
 
 
 def test_belief_in_full_view_is_that_of_the_robot(human, recordings):
     observation, actions = first_round(recordings)
     for share in (1.0, 0.5):
         masks = {name: torch.rand(1, STEPS, 4) < share for name in ("visual", "verbal")}
-        nothing = {name: torch.zeros_like(mask) for name, mask in masks.items()}
-        belief = human.believe(View(masks, nothing), observation, actions)
         model = human.self_model
         expected = model.believe(model.evidence(observation, masks, actions[:, :-1]))
-        torch.testing.assert_close(belief, expected)
+        nothing = {name: torch.zeros_like(mask) for name, mask in masks.items()}
+        # Whether nothing is said of what is taken for granted, or that nothing is.
+        for view in (View(masks), View(masks, nothing, emptied(observation))):
+            belief = human.believe(view, observation, actions)
+            torch.testing.assert_close(belief, expected)
     assert belief.shape == (1, STEPS, LATENT)
 
 
 def test_assuming_absence_is_like_seeing_an_empty_road(human, recordings):
     observation, actions = first_round(recordings)
     everything = torch.ones(1, STEPS, 4, dtype=torch.bool)
-    belief = human.believe(view_of(~everything, everything), observation, actions)
-    empty = DRIVING.absent(observation)
+    belief = human.believe(view_of(~everything, everything, observation), observation, actions)
+    empty = emptied(observation)
     torch.testing.assert_close(belief, human.believe(view_of(everything), empty, actions))
     # One car seen and the others taken to be absent: like seeing a road with one car.
     only = everything & (torch.arange(4) == 1)
     mixed = {name: value.clone() for name, value in empty.items()}
     mixed["visual"][..., 1, :] = observation["visual"][..., 1, :]
-    belief = human.believe(view_of(only, ~only), observation, actions)
+    belief = human.believe(view_of(only, ~only, observation), observation, actions)
     torch.testing.assert_close(belief, human.believe(view_of(everything), mixed, actions))
     # And not like knowing nothing of them.
     unknown = human.believe(view_of(only), observation, actions)
     assert (unknown - belief).abs().max() > 0.1
+
+
+def test_what_is_imagined_is_believed_like_what_is_seen_and_said(human, recordings):
+    observation, actions = first_round(recordings)
+    lane = observation["ego"][..., 0].long()
+    speed = torch.where(torch.rand(1, STEPS, 4) < 0.5, -1, 1)
+    imagined = DRIVING.observe(DrivingState(lane, torch.randint(-11, 12, (1, STEPS, 4)), speed))
+    taken = {name: torch.rand(1, STEPS, 4) < 0.5 for name in ("visual", "verbal")}
+    visible = {name: (torch.rand(1, STEPS, 4) < 0.5) & ~mask for name, mask in taken.items()}
+    belief = human.believe(View(visible, taken, imagined), observation, actions)
+    mixed = {"ego": observation["ego"]} | {
+        name: torch.where(mask[..., None], imagined[name], observation[name])
+        for name, mask in taken.items()
+    }
+    both = View({name: visible[name] | mask for name, mask in taken.items()})
+    torch.testing.assert_close(belief, human.believe(both, mixed, actions))
+    # Where they are themselves, people do not imagine.
+    imagined["ego"] = 1 - imagined["ego"]
+    assert torch.equal(human.believe(View(visible, taken, imagined), observation, actions), belief)
 
 
 def test_masks_of_every_step_are_used(human, recordings):
@@ -208,23 +368,26 @@ def test_masks_of_every_step_are_used(human, recordings):
         belief = human.believe(view_of(less), observation, actions)
         assert torch.equal(belief[:, :step], full[:, :step])
         assert (belief[:, step:] != full[:, step:]).any(-1).all()
-        absent = human.believe(view_of(less, ~less), observation, actions)
+        absent = human.believe(view_of(less, ~less, observation), observation, actions)
         assert torch.equal(absent[:, :step], full[:, :step])
         assert not torch.equal(absent[:, step], belief[:, step])
 
 
-def test_telling_at_a_step_counts_from_that_step_on(human, recordings):
+@pytest.mark.parametrize("name", ["visual", "verbal"])
+@pytest.mark.parametrize("clear", [0, 1])
+@pytest.mark.parametrize("closing", [0, 1])
+def test_telling_at_a_step_counts_from_that_step_on(human, recordings, name, clear, closing):
     observation, actions = first_round(recordings)
-    for assumes_clear in (0, 1):
-        quiet = human.perceive(sight(assumes_clear), observation, nothing_told(STEPS))
-        before = human.believe(quiet, observation, actions)
-        for step in (0, 6, STEPS - 1):
-            told = nothing_told(STEPS)
-            told["verbal"][0, step, 2] = True
-            view = human.perceive(sight(assumes_clear), observation, told)
-            belief = human.believe(view, observation, actions)
-            assert torch.equal(belief[:, :step], before[:, :step])
-            assert (belief[:, step:] != before[:, step:]).any(-1).all()
+    implants = sight(clear, closing)
+    quiet = human.perceive(implants, observation, nothing_told(STEPS))
+    before = human.believe(quiet, observation, actions)
+    for step in (0, 6, STEPS - 1):
+        told = nothing_told(STEPS)
+        told[name][0, step, 2] = True
+        view = human.perceive(implants, observation, told)
+        belief = human.believe(view, observation, actions)
+        assert torch.equal(belief[:, :step], before[:, :step])
+        assert (belief[:, step:] != before[:, step:]).any(-1).all()
 
 
 def test_belief_reads_the_action_before_it_and_never_the_last(human, recordings):
@@ -320,7 +483,7 @@ def test_every_discrete_implant_changes_the_likelihood(human, recordings):
     # person sees had a gradient of exactly zero: whatever they did, sight stayed where it began.
     table = build_view_table(human, recordings)
     joint = log_joint(human, table, policy(human, 2)).unflatten(-1, table.sizes)
-    assert table.sites == (*SIGHTS, "assumes_clear")
+    assert table.sites == (*SIGHTS, *ASSUMED)
     for axis, site in enumerate(table.sites, start=1):
         spread = joint.amax(axis) - joint.amin(axis)
         assert spread.flatten(1).amax(1).min() > 0.5, site
@@ -381,11 +544,11 @@ def test_model_with_a_new_site_works_unchanged(tmp_path, human, recordings, code
     mine = user_model(tmp_path, human, code, name)
     check_contract(mine)
     one = recordings.select_rounds([0]).select_people([0])
-    whole = build_view_table(mine, one, [torch.arange(0, 4802, 50)])
+    whole = build_view_table(mine, one, [torch.arange(0, 9604, 100)])
     assert (site in whole.sites) == (site == "every")
     posterior = fit_implants(mine, whole, FitOptions(steps=2, draws=6), seed=0)
     draws = posterior.draws
-    assert set(draws) == {*SIGHTS, "assumes_clear", *policy(human), site}
+    assert set(draws) == {*SIGHTS, *ASSUMED, *policy(human), site}
     assert draws[site].shape == (6, 1, 1)
     assert ((draws[site] >= 0) & (draws[site] <= 2)).all()
     # Combinations that were not looked at are never drawn.

@@ -155,10 +155,10 @@ def test_bound_at_a_point_is_the_exact_evidence(few, table):
 def test_bound_at_a_point_is_the_exact_evidence_of_the_own_model(self_model, rounds):
     human = HumanModel(self_model)
     one = rounds.select_people([0]).select_rounds([0])
-    table = build_view_table(human, one, [torch.arange(0, 4802, 7)])
+    table = build_view_table(human, one, [torch.arange(0, 9604, 7)])
     policy = some_policy(human)
     joint = log_joint(human, table, policy)
-    assert (joint > -1e5).sum() == 4802 / 7
+    assert (joint > -1e5).sum() == 9604 / 7
     expected = log_prior_by_hand(policy) + torch.logsumexp(joint, -1).sum()
     assert bound_at(human, table, policy) == pytest.approx(expected.item(), rel=1e-5)
 

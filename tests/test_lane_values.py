@@ -180,7 +180,13 @@ def test_unknown_cars_are_ignored(generator):
     )
     values = known_car_values(now, known, 15, 0.95)
     assert torch.equal(values, known_car_values(mixed, known, 15, 0.95))
-    assert torch.equal(values, DOMAIN.reference_values(DOMAIN.remove(now, ~known), 0.95))
+    # As for somebody who was told of the known ones, and takes those to be all there are.
+    told = {"visual": torch.zeros_like(known), "verbal": known}
+    before = DOMAIN.nothing_known(500)
+    knowledge = DOMAIN.learn(before, DOMAIN.observe(now), told, lambda expected: told)
+    always = torch.ones(500).bool()
+    supposed = DOMAIN.supposed(now, knowledge, {"clear": always, "closing": always})
+    assert torch.equal(values, DOMAIN.reference_values(supposed, 0.95))
     assert not torch.equal(values, DOMAIN.reference_values(now, 0.95))
     nobody = known_car_values(now, torch.zeros_like(known), 15, 0.95)
     assert torch.equal(nobody, torch.tensor([0.0, -1.0]).expand(500, 2))

@@ -1,14 +1,29 @@
-"""What was told stays known, shown or said: in masks, in what people perceive, and in planning."""
+"""What was told or seen lasts: in what people perceive and believe, and in planning."""
 
 import pytest
 import torch
-from example_person import BLIND, CHANNELS, DOMAIN, SIGHTS, begun, flags, human, person
+from example_person import (
+    BLIND,
+    CHANNELS,
+    DOMAIN,
+    FULL_SIGHT,
+    SIGHTS,
+    begun,
+    flags,
+    human,
+    observed,
+    person,
+)
 
 from mirror_ppl.communication.minds import Looks, StepwiseBeliefs
-from mirror_ppl.domains.base import digested
+from mirror_ppl.domains.driving import CARS, DrivingState
+from mirror_ppl.models import View
+from mirror_ppl.models.implants import assumption_sites
 
 STEPS = 4
 NAMES = ("visual", "verbal")
+FRONT_LEFT, FRONT_RIGHT, REAR_LEFT, REAR_RIGHT = range(4)
+LEAVING = (FRONT_RIGHT, REAR_RIGHT)  # in `far_off`; the others close in
 
 
 def told_at(*times, steps=STEPS):
@@ -20,97 +35,193 @@ def told_at(*times, steps=STEPS):
     return mask
 
 
-# --- digested ---------------------------------------------------------------------------------
+def told_of(car, *times):
+    """Masks ``[1, T, 4]``: one car is told of at these times."""
+    mask = torch.zeros(1, STEPS, 4, dtype=torch.bool)
+    mask[0, list(times), car] = True
+    return mask
 
 
-def test_what_is_told_is_known_from_then_on():
-    known = digested({"shown": told_at(0, 2, None)})["shown"]
-    assert known.dtype == torch.bool
-    assert known.tolist() == [
-        [True, False, False],
-        [True, False, False],
-        [True, True, False],
-        [True, True, False],
-    ]
+def since(*times, steps=STEPS):
+    """Masks ``[T, K]``: item k at the k-th of these times and ever after, or never."""
+    begin = torch.tensor([steps if time is None else time for time in times])
+    return torch.arange(steps)[:, None] >= begin
 
 
-def test_modalities_are_digested_one_by_one():
-    """Being told of an item in one modality is not being told of it in another."""
-    known = digested({"first": told_at(1, None), "second": told_at(None, 2)})
-    assert known["first"].tolist() == [[False, False]] + [[True, False]] * 3
-    assert known["second"].tolist() == [[False, False]] * 2 + [[False, True]] * 2
+def viewer(sight=BLIND, clear=1, closing=1):
+    """Implants ``[1]`` of somebody with the same sight in all directions."""
+    assumes = dict(zip(assumption_sites(DOMAIN), (clear, closing), strict=True))
+    return {k: torch.tensor([v]) for k, v in (dict.fromkeys(SIGHTS, sight) | assumes).items()}
 
 
-def test_rounds_are_digested_one_by_one(generator):
-    told = torch.rand(5, 7, STEPS, 3, generator=generator) < 0.2
-    before = told.clone()
-    known = digested({"spoken": told})["spoken"]
-    assert torch.equal(told, before)  # what was given is left as it was
-    for i in range(5):
-        for j in range(7):
-            assert torch.equal(known[i, j], digested({"spoken": told[i, j]})["spoken"])
+def far_off(steps=STEPS):
+    """Observations ``[1, T, ...]`` of cars, all on the road, the left ones of which close in."""
+    start = DrivingState(
+        torch.tensor([0]), torch.tensor([[9, 7, -9, -7]]), torch.tensor([[-1, 1, 1, -1]])
+    )
+    states = [start]
+    for _ in range(steps - 1):
+        states.append(DOMAIN.transition(states[-1], torch.tensor([0])))
+    seen = [observed(state) for state in states]
+    return {name: torch.stack([now[name] for now in seen])[None] for name in seen[0]}
 
 
-@pytest.mark.parametrize("steps", [0, 1])
-def test_one_step_is_as_it_was_told_and_no_steps_are_none(generator, steps):
-    told = torch.rand(5, steps, 3, generator=generator) < 0.5
-    assert torch.equal(digested({"spoken": told})["spoken"], told)
-
-
-def test_digesting_again_changes_nothing(generator):
-    """Planning gives models what was digested already, step by step."""
-    known = digested({"spoken": torch.rand(9, STEPS, 3, generator=generator) < 0.2})
-    assert torch.equal(digested(known)["spoken"], known["spoken"])
-
-
-# --- what a person perceives ------------------------------------------------------------------
-
-
-def blind(assumes_clear=1):
-    values = dict.fromkeys(SIGHTS, BLIND) | {"assumes_clear": assumes_clear}
-    return {name: torch.tensor([value]) for name, value in values.items()}
-
-
-def far_away(steps):
-    """Observations ``[1, T, ...]`` of a road with cars that nobody sees by themselves."""
-    now = begun(0, [9, 8, -9, -8], [-1, -1, 1, 1]).now
-    return {name: value.expand(1, steps, *value.shape).clone() for name, value in now.items()}
-
-
-def perceived(assumes_clear=1, **told):
-    nothing = torch.zeros(1, STEPS, 4, dtype=torch.bool)
+def perceived(implants=None, steps=STEPS, **told):
+    nothing = torch.zeros(1, steps, 4, dtype=torch.bool)
     given = dict.fromkeys(NAMES, nothing) | told
-    return human().perceive(blind(assumes_clear), far_away(STEPS), given)
+    return human().perceive(implants or viewer(), far_off(steps), given)
+
+
+def same(first, second):
+    """Whether two views hold the same masks and values."""
+    return all(
+        one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+        for one, other in zip(vars(first).values(), vars(second).values(), strict=True)
+    )
+
+
+# --- what lasts -------------------------------------------------------------------------------
+
+
+def test_what_is_said_once_is_known_from_then_on():
+    view = perceived(verbal=told_at(0, 2, None, 3)[None])
+    for name in NAMES:  # place and speed
+        assert torch.equal(view.visible[name][0], since(0, 2, None, 3)), name
+
+
+def test_what_is_shown_twice_is_known_from_then_on():
+    shown = told_at(0, 1, None, 2) | told_at(1, 3, 3, None)
+    view = perceived(visual=shown[None])
+    known = since(1, 3, None, None)
+    assert torch.equal(view.visible["visual"][0], shown | known)
+    assert torch.equal(view.visible["verbal"][0], known)
+
+
+def test_cars_become_known_one_by_one():
+    """Two cars that were shown once are not one that was shown twice."""
+    shown = told_at(0, 1, 2, 3)
+    view = perceived(visual=shown[None])
+    assert torch.equal(view.visible["visual"][0], shown)
+    assert not view.visible["verbal"].any()
+    view = perceived(visual=shown[None], verbal=told_at(1, None, None, 3)[None])
+    assert torch.equal(view.visible["verbal"][0], since(1, None, None, 3))
+    assert torch.equal(view.visible["visual"][0], shown | since(1, None, None, 3))
+
+
+def test_a_car_seen_once_and_shown_once_is_known():
+    """They see as far as six cells: the car ahead that closes in comes within sight at step 3."""
+    six = DOMAIN.reach_bins.index(6.0)
+    view = perceived(viewer(six), visual=told_of(FRONT_LEFT, 1))
+    assert torch.equal(view.visible["verbal"][0], since(3, None, None, None))
+    alone = perceived(viewer(six))
+    assert alone.visible["visual"][0, 3, FRONT_LEFT]
+    assert not alone.visible["verbal"].any()
+
+
+def test_what_is_seen_twice_is_known_without_a_word():
+    view = perceived(viewer(FULL_SIGHT))
+    assert view.visible["visual"].all()
+    assert torch.equal(view.visible["verbal"][0], since(1, 1, 1, 1))
+
+
+def test_rounds_are_remembered_one_by_one(generator):
+    told = {name: torch.rand(9, STEPS, 4, generator=generator) < 0.2 for name in NAMES}
+    before = {name: mask.clone() for name, mask in told.items()}
+    together = perceived(**told).map(lambda part: part.expand(9, *part.shape[1:]))
+    for name in NAMES:
+        assert torch.equal(told[name], before[name])  # what was given is left as it was
+    for row in range(9):
+        alone = perceived(**{name: mask[row : row + 1] for name, mask in told.items()})
+        own = ({k: v[row : row + 1] for k, v in part.items()} for part in vars(together).values())
+        assert same(alone, View(*own))
+
+
+def test_the_first_step_is_as_it_was_told(generator):
+    told = {name: torch.rand(9, 1, 4, generator=generator) < 0.5 for name in NAMES}
+    view = perceived(steps=1, **told)
+    assert torch.equal(view.visible["visual"], told["visual"] | told["verbal"])
+    assert torch.equal(view.visible["verbal"], told["verbal"])
+
+
+def test_telling_again_what_is_known_changes_nothing(generator):
+    told = {name: torch.rand(9, STEPS, 4, generator=generator) < 0.2 for name in NAMES}
+    view = perceived(**told)
+    assert not torch.equal(view.visible["verbal"], told["verbal"])
+    assert same(perceived(**view.visible), view)
+
+
+# --- what a person makes of it ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("time", range(STEPS))
 @pytest.mark.parametrize("car", range(4))
-def test_what_is_told_stays_in_view(name, time, car):
-    mask = told_at(*(time if index == car else None for index in range(4)))[None]
-    view = perceived(**{name: mask})
-    known = (torch.arange(STEPS) >= time)[:, None] & (torch.arange(4) == car)
-    (other,) = set(NAMES) - {name}
-    assert torch.equal(view.visible[name][0], known)
-    assert not view.visible[other].any()
-    # And it is no longer taken to be absent, whichever way it was told.
-    assert torch.equal(view.absent["visual"][0], ~known)
-    assert not perceived(0, **{name: mask}).absent["visual"].any()
+def test_what_is_told_is_no_longer_taken_to_be_absent(name, time, car):
+    told = told_of(car, time)
+    placed = since(*(time if index == car else None for index in range(4)))
+    view = perceived(viewer(closing=0), **{name: told})
+    assert torch.equal(view.taken["visual"][0], ~placed)
+    assert not view.taken["verbal"].any()
+    neither = perceived(viewer(clear=0, closing=0), **{name: told})
+    assert not any(mask.any() for mask in neither.taken.values())
+    # What was said is in view from then on; what was shown may be taken to close in.
+    view = perceived(viewer(clear=0), **{name: told})
+    if name == "verbal":
+        assert all(torch.equal(view.visible[part][0], placed) for part in NAMES)
+        assert not any(mask.any() for mask in view.taken.values())
+    else:
+        assert torch.equal(view.visible["visual"], told) and not view.visible["verbal"].any()
+        assert torch.equal(view.taken["visual"][0], placed & ~told[0])
+        assert torch.equal(view.taken["verbal"][0], placed)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_beliefs_follow_a_car_that_was_told_of_once(name):
+def believed(implants, **told):
+    done = torch.zeros(1, STEPS, dtype=torch.long)
+    return human().believe(perceived(implants, **told), far_off(), done)[0]
+
+
+def differ(first, second):
+    """At which steps two beliefs differ, and by more than rounding."""
+    return ((first - second).abs().amax(-1) > 0.01).tolist()
+
+
+@pytest.mark.parametrize("car", range(4))
+def test_beliefs_follow_a_car_that_was_spoken_of_once(car):
     """As if it were told of at each step; and not as if it were told of never, or later."""
+    implants = viewer(clear=0, closing=0)
+    once = believed(implants, verbal=told_of(car, 1))
+    always = told_of(car, 1, 2, 3)
+    torch.testing.assert_close(once, believed(implants, verbal=always), rtol=0, atol=0)
+    both = believed(implants, verbal=always, visual=always)
+    torch.testing.assert_close(once, both, rtol=0, atol=0)
+    assert differ(once, believed(implants)) == [False, True, True, True]
+    assert differ(once, believed(implants, verbal=told_of(car, 2)))[1]
 
-    def believed(*steps):
-        told = torch.zeros(1, STEPS, 4, dtype=torch.bool)
-        told[0, list(steps), 0] = True
-        done = torch.zeros(1, STEPS, dtype=torch.long)
-        return human().believe(perceived(**{name: told}), far_away(STEPS), done)
 
-    torch.testing.assert_close(believed(1), believed(1, 2, 3), rtol=0, atol=0)
-    for others in ((), (2,)):
-        assert (believed(1) - believed(*others))[0, 1:].abs().amax(-1).min() > 0.01
+@pytest.mark.parametrize("car", range(4))
+def test_beliefs_follow_a_car_that_was_shown_twice(car):
+    implants = viewer(clear=0, closing=0)
+    twice = believed(implants, visual=told_of(car, 0, 1))
+    always = told_of(car, 0, 1, 2, 3)
+    torch.testing.assert_close(twice, believed(implants, visual=always), rtol=0, atol=0)
+    spoken = believed(implants, visual=told_of(car, 0), verbal=told_of(car, 1))
+    torch.testing.assert_close(twice, spoken, rtol=0, atol=0)
+    once = believed(implants, visual=told_of(car, 0))
+    assert differ(twice, once) == [False, True, True, True]
+
+
+@pytest.mark.parametrize("car", range(4))
+def test_beliefs_about_a_car_shown_once_are_those_of_one_that_closes_in(car):
+    """Right of a car that does: as if it were known. Wrong of one that leaves."""
+    shown, spoken = told_of(car, 1), told_of(car, 1)
+    closing = believed(viewer(clear=0), visual=shown)
+    known = believed(viewer(clear=0), verbal=spoken)
+    if car in LEAVING:
+        assert differ(closing, known) == [False, True, True, True]
+    else:
+        torch.testing.assert_close(closing, known)
+    open_minded = believed(viewer(clear=0, closing=0), visual=shown)
+    assert differ(closing, open_minded) == [False, True, True, True]
 
 
 # --- planning step by step --------------------------------------------------------------------
@@ -129,33 +240,65 @@ def look(parent, past, message, action):
     )
 
 
+def names(mask):
+    return [name for name, marked in zip(CARS, mask.tolist(), strict=True) if marked]
+
+
+def lasting(beliefs, which):
+    """Cars of which somebody knows how they move, and cars of which they know only the place."""
+    knowledge = beliefs.knowledge
+    known = DOMAIN.known(knowledge)
+    unsure = DOMAIN.assume(knowledge, beginning().now)[0]["closing"]
+    assert torch.equal(known["visual"], known["verbal"])
+    assert torch.equal(unsure["visual"], unsure["verbal"])
+    return names(known["visual"][which[0]]), names(unsure["visual"][which[0]])
+
+
+def beginning():
+    return begun(0, [9, 8, -9, -8], [-1, -1, 1, 1])
+
+
 def steps_of_planning(*messages):
-    """What somebody blind was told, in flags, by beliefs after each of these messages."""
-    past = begun(0, [9, 8, -9, -8], [-1, -1, 1, 1])
-    beliefs, parent = StepwiseBeliefs.before(person(), past)
+    """What lasts for somebody blind after each of these messages."""
+    past = beginning()
+    beliefs, which = StepwiseBeliefs.before(person(), past)
     result, action = [], len(DOMAIN.actions)
     for message in messages:
-        beliefs, parent = beliefs.after(look(parent, past, message, action))
+        beliefs, which = beliefs.after(look(which, past, message, action))
         action = 0
-        result.append(CHANNELS.join(beliefs.told)[parent[0]].tolist())
+        result.append(lasting(beliefs, which))
     return result
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_planning_remembers_what_was_told(name):
-    silence, rear, front = flags(), flags(**{name: ["rear-left"]}), flags(**{name: ["front-left"]})
-    both = rear | front
-    told = steps_of_planning(silence, rear, silence, front, silence)
-    assert told == [each.tolist() for each in (silence, rear, rear, both, both)]
+def test_planning_remembers_what_was_said():
+    silence, rear, front = flags(), flags(verbal=["rear-left"]), flags(verbal=["front-left"])
+    lasts = steps_of_planning(silence, rear, silence, front, silence)
+    both = ["front-left", "rear-left"]
+    assert lasts == [([], []), *[(["rear-left"], [])] * 2, *[(both, [])] * 2]
+
+
+def test_planning_remembers_what_was_shown():
+    silence, rear, front = flags(), flags(visual=["rear-left"]), flags(visual=["front-left"])
+    lasts = steps_of_planning(rear, silence, front | rear, silence, front)
+    both = ["front-left", "rear-left"]
+    assert lasts == [
+        *[([], ["rear-left"])] * 2,
+        *[(["rear-left"], ["front-left"])] * 2,
+        (both, []),
+    ]
 
 
 def test_planning_goes_on_from_what_was_told_in_the_round_so_far():
-    past = begun(0, [9, 8, -9, -8], [-1, -1, 1, 1])
+    past = beginning()
     message = flags(visual=["front-left"], verbal=["rear-right"])
     past = past.then(CHANNELS.split(message), 0, past.now)
     past = past.then(CHANNELS.split(flags()), 0, past.now)
-    beliefs, parent = StepwiseBeliefs.before(person(), past)
-    assert torch.equal(CHANNELS.join(beliefs.told)[parent[0]], message)
-    after, which = beliefs.after(look(parent, past, flags(verbal=["front-right"]), 0))
-    assert torch.equal(CHANNELS.join(after.told)[which[0]], message | flags(verbal=["front-right"]))
-    assert after.unknown["visual"][which[0]].tolist() == [False, False, True, False]
+    beliefs, which = StepwiseBeliefs.before(person(), past)
+    assert lasting(beliefs, which) == (["rear-right"], ["front-left"])
+    after, then = beliefs.after(look(which, past, flags(verbal=["front-right"]), 0))
+    assert lasting(after, then) == (["front-right", "rear-right"], ["front-left"])
+    never = DOMAIN.assume(after.knowledge, past.now)[0]["clear"]["visual"]
+    assert names(never[then[0]]) == ["rear-left"]
+    # A second sight counts, the first having been before planning began.
+    after, then = beliefs.after(look(which, past, flags(visual=["front-left"]), 0))
+    assert lasting(after, then) == (["front-left", "rear-right"], [])

@@ -28,9 +28,11 @@ from mirror_ppl.communication.minds import (
 )
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.implants import assumption_sites
 
 ACTIONS = len(DOMAIN.actions)
 KINDS = (StepwiseBeliefs, CourseBeliefs)
+ASSUMED = assumption_sites(DOMAIN)
 
 
 # --- a person ---------------------------------------------------------------------------------
@@ -44,7 +46,7 @@ def test_without_draws_there_is_no_person(number):
     assert str(error.value) == "planning needs at least one posterior draw"
 
 
-@pytest.mark.parametrize("site", ["sight_back_own", "assumes_clear", "consistency", "residual_out"])
+@pytest.mark.parametrize("site", ["sight_back_own", *ASSUMED, "consistency", "residual_out"])
 def test_a_site_without_draws_is_refused(site):
     draws = implants(3)
     del draws[site]
@@ -61,31 +63,54 @@ def test_all_sites_without_draws_are_named():
 
 
 def test_draws_with_the_same_perception_share_an_eye():
-    someone = person(
-        6, front_own=[1, 2, 1, 1, 2, 1], assumes_clear=[0, 0, 0, 1, 0, 0], lapse=[0.1] * 5 + [0.2]
-    )
-    assert someone.number == 6
-    assert someone.eye_count == 3
-    groups = [[0, 2, 5], [1, 4], [3]]
+    values = {
+        "sight_front_own": [1, 2, 1, 1, 2, 1, 1],
+        "assumes_clear": [0, 0, 0, 1, 0, 0, 0],
+        "assumes_closing": [1, 1, 1, 1, 1, 1, 0],
+    }
+    someone = person(7, **values, lapse=[0.1] * 5 + [0.2] * 2)
+    assert someone.number == 7
+    assert someone.eye_count == 4
+    groups = [[0, 2, 5], [1, 4], [3], [6]]
     for group in groups:
         assert len(set(someone.eye[group].tolist())) == 1
-    assert len(set(someone.eye.tolist())) == 3
-    assert someone.eyes["sight_front_own"][someone.eye].tolist() == [1, 2, 1, 1, 2, 1]
-    assert someone.eyes["assumes_clear"][someone.eye].tolist() == [0, 0, 0, 1, 0, 0]
+    assert len(set(someone.eye.tolist())) == 4
+    for name, value in values.items():
+        assert someone.eyes[name][someone.eye].tolist() == value
     # Sites that are not discrete say nothing of eyes.
     assert "lapse" not in someone.eyes
 
 
 def test_everybody_sees_for_themselves():
     past = begun(0, [3, 9, -2, -9], [-1, 1, 1, -1])
-    someone = person(2, front_own=[0, 4], back_own=[2, 0], assumes_clear=[0, 1])
-    observation = {name: value.expand(2, 1, *value.shape) for name, value in past.now.items()}
-    nothing = CHANNELS.split(torch.zeros(2, 1, len(CHANNELS), dtype=torch.bool))
+    someone = person(
+        3,
+        front_own=[0, 4, 4],
+        back_own=[2, 0, 0],
+        assumes_clear=[0, 1, 1],
+        assumes_closing=[1, 1, 0],
+    )
+    number = someone.eye_count
+    observation = {name: value.expand(3, 1, *value.shape) for name, value in past.now.items()}
+    nothing = CHANNELS.split(torch.zeros(3, 1, len(CHANNELS), dtype=torch.bool))
     view = someone.see(someone.eye, observation, nothing)
-    seen = [[False, False, True, False], [True, False, False, False]]
-    assert view.visible["visual"][:, 0].tolist() == seen
-    assert view.absent["visual"][:, 0].tolist() == [[False] * 4, [False, True, True, True]]
-    assert view.visible["verbal"].shape == (2, 1, 4)
+    behind, ahead = [False, False, True, False], [True, False, False, False]
+    assert view.visible["visual"][:, 0].tolist() == [behind, ahead, ahead]
+    others = [False, True, True, True]
+    assert view.taken["visual"][:, 0].tolist() == [[False] * 4, others, others]
+    # How the car moves that they see can only be assumed: closer, from behind and from ahead.
+    assert view.taken["verbal"][:, 0].tolist() == [behind, ahead, [False] * 4]
+    assert view.imagined["verbal"][0, 0, 2].tolist() == [-2, 0, 1]
+    assert view.imagined["verbal"][1, 0, 0].tolist() == [3, 0, -1]
+    assert view.visible["verbal"].shape == (3, 1, 4)
+    assert not view.visible["verbal"].any()
+    # A look at one step is the same, and tells what they have learned.
+    knowledge = DOMAIN.nothing_known(number)
+    first = {name: value[:, 0] for name, value in observation.items()}
+    told = {name: mask[:, 0] for name, mask in nothing.items()}
+    look, after = someone.look(someone.eye, knowledge, first, told)
+    assert torch.equal(look.rows(), view.rows()[:, 0])
+    assert after.unsure.tolist() == [behind, ahead, ahead]
 
 
 def test_each_draw_acts_by_its_own_implants(generator):
@@ -108,9 +133,10 @@ class Tracks:
     """Random courses of action and messages of all eyes, from one round so far.
 
     Each is looked at by :class:`Looks` step by step; ``expected`` goes through its whole round.
+    With ``alike``, all do and hear the same.
     """
 
-    def __init__(self, someone, past, horizon, number, generator):
+    def __init__(self, someone, past, horizon, number, generator, alike=False):
         self.person, self.past = someone, past
         self.futures = SimulatorWorld(DOMAIN).futures(past, horizon, generator)
         self.eye = torch.arange(number) % someone.eye_count
@@ -119,6 +145,8 @@ class Tracks:
         kinds[0] = False
         self.told = kinds[torch.randint(3, (number,), generator=generator)]
         self.actions = torch.randint(ACTIONS, (number, horizon), generator=generator)
+        if alike:
+            self.told[:], self.actions[:] = kinds[1], self.actions[:1].clone()
         self.path = torch.zeros(number, horizon, dtype=torch.long)
         for step in range(1, horizon):
             self.path[:, step] = self.path[:, step - 1] * ACTIONS + self.actions[:, step - 1]
@@ -187,6 +215,36 @@ def test_beliefs_are_those_of_whole_rounds(someone, generator, kind, time):
     different = torch.stack([(part[:, None] != part).any(-1) for part in parts])
     for part in different:
         assert apart[part & (different.sum(0) == 1)].max() > 0.01
+
+
+@pytest.mark.parametrize("time", [0, 1, 3, 8])
+@pytest.mark.parametrize("kind", KINDS)
+def test_beliefs_of_whoever_takes_things_for_granted_are_those_of_whole_rounds(
+    generator, kind, time
+):
+    """Eyes of three kinds with each assumption and without; one matters where the other is made."""
+    made = list(itertools.product((0, 1), repeat=2))
+    matters = torch.zeros(3, 4, dtype=torch.bool)
+    for _ in range(6):
+        past, _ = random_round(time, generator, rate=0.15)
+        sights = {name: torch.randint(5, (3,), generator=generator) for name in DOMAIN.directions}
+        someone = person(
+            12,
+            **{name: value.repeat_interleave(4) for name, value in sights.items()},
+            **dict(zip(ASSUMED, torch.tensor(made * 3).unbind(-1), strict=True)),
+        )
+        tracks = Tracks(someone, past, 6, someone.eye_count, generator, alike=True)
+        beliefs, before = kind.before(someone, past)
+        parent = before[tracks.eye]
+        for step in range(6):
+            beliefs, parent = beliefs.after(tracks.looks(step, parent))
+            mine, expected = beliefs.courses[parent, -1], tracks.expected(step)[:, -1]
+            torch.testing.assert_close(mine, expected, rtol=0, atol=1e-5)
+            mine = mine[someone.eye].unflatten(0, (3, 4))
+            apart = (mine[:, :, None] - mine[:, None]).abs().amax(-1)
+            for index, (one, other) in enumerate(((0, 1), (2, 3), (0, 2), (1, 3))):
+                matters[:, index] |= apart[:, one, other] > 0.01
+    assert matters.any(0).all()
 
 
 @pytest.mark.parametrize("time", [0, 4])
@@ -278,8 +336,8 @@ def test_what_eyes_saw_before_keeps_their_beliefs_apart():
     past = begun(0, [4, 30, -30, -30], [1, 1, -1, -1])
     later = begun(0, [11, 30, -30, -30], [1, 1, -1, -1]).now
     past = past.then(CHANNELS.split(flags()), 0, later)
-    for assumes_clear in (0, 1):
-        someone = person(2, front_own=[3, 4], assumes_clear=assumes_clear)
+    for clear, closing in itertools.product((0, 1), repeat=2):
+        someone = person(2, front_own=[3, 4], assumes_clear=clear, assumes_closing=closing)
         beliefs, which = look_around(someone, past, flags()[None])
         assert len(set(which[0].tolist())) == 2
         assert not torch.allclose(*beliefs.courses[which[0]])
@@ -289,12 +347,17 @@ def test_what_eyes_saw_before_keeps_their_beliefs_apart():
     assert own.tolist() == [0, 0]
 
 
-def test_somebody_who_assumes_a_clear_road_believes_otherwise():
-    past = begun(0, [4, 30, -30, -30], [-1, 1, -1, -1])
-    someone = person(2, assumes_clear=[0, 1])
+@pytest.mark.parametrize("assumption", ASSUMED)
+def test_somebody_who_takes_something_for_granted_believes_otherwise(assumption):
+    """Of one car seen and one out of sight, until both are spoken of."""
+    past = begun(0, [4, 30, -5, -30], [-1, 1, -1, -1])
+    someone = person(2, front_own=4, **{assumption: [0, 1]})
     beliefs, which = look_around(someone, past, flags()[None])
     assert len(set(which[0].tolist())) == 2
     assert (beliefs.courses[which[0, 0]] - beliefs.courses[which[0, 1]]).abs().max() > 0.01
+    spoken = flags(verbal=["front-left", "front-right", "rear-left", "rear-right"])
+    _, which = look_around(someone, past, spoken[None])
+    assert len(set(which[0].tolist())) == 1
 
 
 # --- models that look back further ------------------------------------------------------------

@@ -145,43 +145,59 @@ def test_outcomes_of_both_actions_in_full_view():
     assert all(mask.all() for outcome in lived.outcomes for mask in outcome.visible.values())
 
 
-@pytest.mark.parametrize("credulous", [True, False])
-def test_world_of_somebody_who_sees_one_cell_ahead(credulous):
+@pytest.mark.parametrize("assuming", [True, False])
+def test_world_of_somebody_who_sees_one_cell_ahead(assuming):
     plan = fixed_views(DRIVING, 1, torch.Generator(), (1.0, 0.0, 0.0, 0.0))
-    plan = replace(plan, credulous=torch.tensor([credulous]))
+    assert list(plan.assumes) == ["clear", "closing"] and all(plan.assumes.values())
+    plan = replace(plan, assumes=dict.fromkeys(plan.assumes, torch.tensor([assuming])))
     lived = experience(DRIVING, two_cars_near(), STAY4, plan)
     rounds, (stay, switch) = lived.rounds, lived.outcomes
-    ahead, seen = rounds.observation["visual"][0, :, 0, 0], rounds.visible["visual"][0, :, 0]
-    if credulous:
-        # Never seen at 3 and 2 cells: not there. Once seen it stays in the world, seen or not.
+    ahead = rounds.observation["visual"][0, :, 0, 0]
+    # Seen at 1 cell and again at 0; from then on the car is known, in sight or not.
+    visual, verbal = (
+        [rounds.visible[name][0, :, 0].tolist(), stay.visible[name][0, :, 0].tolist()]
+        for name in ("visual", "verbal")
+    )
+    if assuming:
+        # Never seen at 3 and 2 cells: not there. Seen once, it is taken to come closer.
         assert ahead.tolist() == [ROAD_END, ROAD_END, 1, 0, -1]
-        assert seen.tolist() == [True, True, True, True, False]
-        assert rounds.observation["verbal"][0, :2, 0, 2].tolist() == [0, 0]  # nor does it move
+        assert visual == [[True] * 5, [True] * 4]
+        assert verbal == [[False, False, True, True, True], [False, False, True, True]]
+        assert rounds.observation["verbal"][0, :, 0, 2].tolist() == [0, 0, -1, -1, -1]
         # The car at 1 cell surprised them: to the best knowledge before, there was none.
         assert rounds.rewards.tolist() == [[0.0, 0.0, -7.0, -2.0]]
         assert stay.observation["visual"][0, :, 0, 0].tolist() == [ROAD_END, ROAD_END, 0, -1]
-        assert stay.visible["visual"][0, :, 0].tolist() == [True, True, True, False]
         # The other cars are never seen.
         assert (rounds.observation["visual"][0, :, 1:, 0] == ROAD_END).all()
         assert rounds.visible["visual"][0, :, 1:].all()
     else:
         assert ahead.tolist() == [3, 2, 1, 0, -1]
-        assert seen.tolist() == [False, False, True, True, False]
+        assert visual == [[False, False, True, True, True], [False, True, True, True]]
+        assert verbal == [[False, False, False, True, True], [False, False, True, True]]
         assert rounds.rewards.tolist() == [[-2.0, -2.0, -7.0, -2.0]]
         assert not rounds.visible["visual"][0, :, 1:].any()
     assert torch.equal(stay.reward, rounds.rewards)
     assert switch.reward.tolist() == [[-1.0, -1.0, -1.0, -1.0]]
-    assert not any(mask.any() for name, mask in rounds.visible.items() if name == "verbal")
+    assert not rounds.visible["verbal"][0, :, 1:].any()
 
 
-def test_whoever_is_told_knows(generator):
+def test_whoever_is_told_knows_from_then_on(generator):
     plan = fixed_views(DRIVING, 1, generator, (0.0, 0.0, 0.0, 0.0))
-    told = {"visual": torch.zeros(1), "verbal": torch.ones(1)}
+    plan.noise["verbal"][..., 1] = 1.0
+    plan.noise["verbal"][0, 1, 0, 1] = 0.0  # the car ahead is spoken of at step 1
+    told = {"visual": torch.zeros(1), "verbal": torch.full((1,), 0.5)}
     rounds = experience(DRIVING, two_cars_near(), STAY4, replace(plan, told=told)).rounds
-    assert rounds.observation["visual"][0, :, 0, 0].tolist() == [3, 2, 1, 0, -1]
-    assert rounds.visible["verbal"][0, :, 0].all()
-    # Spoken of, not seen; it is seen only where it is abreast.
-    assert rounds.visible["visual"][0, :, 0].tolist() == [False, False, False, True, False]
+    assert rounds.observation["visual"][0, :, 0, 0].tolist() == [ROAD_END, 2, 1, 0, -1]
+    assert rounds.observation["verbal"][0, :, 0, 2].tolist() == [0, -1, -1, -1, -1]
+    # Before, it was taken to be absent, of which there is no word.
+    assert rounds.visible["verbal"][0, :, 0].tolist() == [False, True, True, True, True]
+    assert rounds.visible["visual"].all()
+    # To somebody who does not remember, speech is only of the step at which it is heard.
+    open_to_it = dict.fromkeys(plan.assumes, torch.tensor([False]))
+    plan = replace(plan, told=told, remembers=torch.tensor([False]), assumes=open_to_it)
+    visible = experience(DRIVING, two_cars_near(), STAY4, plan).rounds.visible
+    assert visible["verbal"][0, :, 0].tolist() == [False, True, False, False, False]
+    assert visible["visual"][0, :, 0].tolist() == [False, False, False, True, False]
 
 
 def test_the_robot_drives_by_the_beliefs_that_it_learns_from(shipped, generator):
@@ -211,10 +227,22 @@ def test_learning_looks_ahead_from_belief_to_belief(lived):
     belief = model.believe(model.evidence(rounds.observation, rounds.visible, rounds.actions))
     taken = rounds.actions[..., None, None].expand(-1, -1, 1, model.latent)
     following = torch.stack(asked, 2).gather(2, taken).squeeze(2)
-    # Where nothing came into view that was taken to be absent.
-    known = torch.stack([outcome.observation["visual"] for outcome in lived.outcomes], 2)
-    expected = [known[..., action, :, :] for action in range(2)]
-    same = (expected[0][..., 0] == rounds.observation["visual"][:, 1:, :, 0]).all(-1)
+    # Where the world went on as they believed: what they see and assume is what they expected.
+    same = torch.ones_like(rounds.actions, dtype=torch.bool)
+    for name, visible in rounds.visible.items():
+        expected, shown = (
+            torch.stack(parts, 2)[torch.arange(40)[:, None], torch.arange(STEPS), rounds.actions]
+            for parts in zip(
+                *((one.observation[name], one.visible[name]) for one in lived.outcomes),
+                strict=True,
+            )
+        )
+        real, now = rounds.observation[name][:, 1:], visible[:, 1:]
+        as_expected = (expected == real).all(-1)
+        # On the road, what is where it was expected to be is in view if and only if expected so.
+        on_road = real[..., 0].abs() < ROAD_END
+        assert torch.equal(shown[as_expected & on_road], now[as_expected & on_road])
+        same &= ((shown == now) & (as_expected | ~now)).all(-1)
     assert same.float().mean() > 0.5
     torch.testing.assert_close(following[same], belief[:, 1:][same], rtol=1e-4, atol=1e-5)
     # By hand: nothing follows the last action.

@@ -22,10 +22,10 @@ from mirror_ppl.inference.views import (
     restricted,
 )
 from mirror_ppl.models import HumanModel, View
-from mirror_ppl.models.implants import policy_implants, sight_sites
+from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewedActions
 from mirror_ppl.models.views import (
-    CREDULOUS_PROBABILITY,
+    ASSUMPTION_PROBABILITY,
     KIND_PROBABILITIES,
     TOLD_PROBABILITY,
     draw_views,
@@ -34,13 +34,21 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")
 STEPS = DRIVING.horizon
-SIGHTS = sight_sites(DRIVING)
+SIGHTS, ASSUMED = sight_sites(DRIVING), assumption_sites(DRIVING)
 
 
 class Few(HumanModel):
-    """Somebody of whom it is open how far they see ahead in their lane, and what they assume."""
+    """Somebody of whom it is open how far they see ahead in their lane, and what they assume.
 
-    KNOWN = {"sight_front_other": 2, "sight_back_own": 0, "sight_back_other": 0}
+    Of cars that they saw once, they assume that these come closer; of others it is open.
+    """
+
+    KNOWN = {
+        "sight_front_other": 2,
+        "sight_back_own": 0,
+        "sight_back_other": 0,
+        "assumes_closing": 1,
+    }
 
     def prior(self):
         bins = torch.arange(1.0, len(self.domain.reach_bins) + 1)
@@ -70,8 +78,7 @@ class Sure(Few):
         return policy_implants(self.domain, self.self_model.latent, like)
 
     def perceive(self, implants, observation, told):
-        seen = self.domain.visibility("fog", observation)
-        return View(seen, {name: torch.zeros_like(mask) for name, mask in seen.items()})
+        return View(self.domain.visibility("fog", observation))
 
 
 @pytest.fixture(scope="module")
@@ -150,12 +157,10 @@ def assert_tables_equal(one, other, tolerance=0.0):
 @pytest.mark.parametrize("kind", [HumanModel, Few], ids=["own", "few"])
 def test_table_agrees_with_perceive_believe_act(self_model, recordings, kind):
     human, rounds = kind(self_model), ragged(recordings, LENGTHS)
-    number = 4802 if kind is HumanModel else 14
-    some = torch.randperm(number)[:14].sort().values
+    number = 9604 if kind is HumanModel else 14
+    some = torch.randperm(number)[:28].sort().values
     table = build_view_table(human, rounds, [some] * 3)
-    assert table.sites == (
-        (*SIGHTS, "assumes_clear") if number > 14 else (SIGHTS[0], "assumes_clear")
-    )
+    assert table.sites == ((*SIGHTS, *ASSUMED) if number > 14 else (SIGHTS[0], ASSUMED[0]))
     assert math.prod(table.sizes) == table.index.shape[-1] == number
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
     found = combination_scores(table, human.act(policy, table.belief, table.values))
@@ -427,13 +432,12 @@ def test_kinds_of_views_come_as_often_as_stated(many_views):
         error = standard_error(share, 20_000)
         assert kind.float().mean().item() == pytest.approx(share, abs=4 * error)
     number = int(sight.sum())
-    assert not plan.credulous[~sight].any()
+    assert torch.equal(plan.remembers, sight)
     spoken_to = plan.told["visual"] > 0
     assert not spoken_to[~sight].any()
     assert torch.equal(spoken_to, plan.told["verbal"] > 0)
-    for chosen, share in ((plan.credulous, CREDULOUS_PROBABILITY), (spoken_to, TOLD_PROBABILITY)):
-        error = standard_error(share, number)
-        assert chosen[sight].float().mean().item() == pytest.approx(share, abs=4 * error)
+    error = standard_error(TOLD_PROBABILITY, number)
+    assert spoken_to[sight].float().mean().item() == pytest.approx(TOLD_PROBABILITY, abs=4 * error)
     # Each reach is equally likely in each direction; only sight is limited.
     assert (plan.reach[~sight] == DRIVING.reach_bins[-1]).all()
     bins = len(DRIVING.reach_bins)

@@ -62,7 +62,9 @@ class CarKnowledge:
         position = self.position + self.speed
         expected = assumed_cars(position, self.speed, observation)
         missed = sees(expected)["visual"] & (position.abs() < ROAD_END) & ~shown
-        known = self.known | spoken | (self.placed & shown) | (self.unsure & missed)
+        # A car seen to be off the road is gone for good, wherever it came from.
+        gone = shown & (ahead.abs() >= ROAD_END)
+        known = self.known | spoken | gone | (self.placed & shown) | (self.unsure & missed)
         placed = self.placed | shown | spoken
         first = placed & ~self.placed
         # One that came from ahead would have been ahead before: a car abreast came from behind.
