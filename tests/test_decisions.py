@@ -96,12 +96,6 @@ def test_what_each_item_adds():
     candidates = [plan(None, None), plan(SHOWN | SAID, OTHER), plan(SHOWN, None), plan(SAID, OTHER)]
     partly = decision(1, candidates, [[0.0], [3.0], [2.0], [2.5]])
     assert partly.matters == pytest.approx({("visual", "front-left"): 0.5})
-    # Where plans without them were not, messages for now were: 2.2 with both, 2 with one of them.
-    candidates.append(plan(SHOWN | SAID, None))
-    fully = decision(1, candidates, [[0.0], [3.0], [2.0], [2.5], [2.2]])
-    assert fully.matters == pytest.approx(
-        {("visual", "front-left"): 0.5, ("verbal", "front-left"): 0.2}
-    )
 
 
 def test_a_decision_without_a_choice():

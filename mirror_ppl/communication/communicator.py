@@ -19,9 +19,9 @@ from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, Message
 from mirror_ppl.communication.minds import Person
-from mirror_ppl.communication.objectives import Objective, Valued
+from mirror_ppl.communication.objectives import Objective, Value, Valued
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.communication.search import Automatic, Found, Search
+from mirror_ppl.communication.search import Automatic, Found, Search, joined
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 
 if TYPE_CHECKING:
@@ -146,26 +146,20 @@ class Decision:
     def matters(self) -> dict[tuple[str, str], float]:
         """What each communicated item adds: the gain that is lost when it alone is left out now.
 
-        Where the plan without it was not among the candidates, what comes later does not count;
-        where the message for now without it was not, either, the item is not there.
+        An item without which the plan was not among the candidates is not there.
         """
         if self.found is None:
             return {}
         candidates, mean = self.found.candidates, self.found.valued.utility.mean(-1)
         plan = candidates[self.chosen]
-        message = plan.clone()
-        message[1:] = False
         result = {}
         for place, pair in enumerate(Channels(self.domain).pairs):
-            if not plan[0, place]:
-                continue
-            for whole in (plan, message):
-                less = whole.clone()
+            if plan[0, place]:
+                less = plan.clone()
                 less[0, place] = False
-                pairs = [(candidates == one).flatten(1).all(1).nonzero() for one in (whole, less)]
-                if all(map(len, pairs)):
-                    result[pair] = float(mean[pairs[0][0, 0]] - mean[pairs[1][0, 0]])
-                    break
+                without = (candidates == less).flatten(1).all(1).nonzero()
+                if len(without):
+                    result[pair] = float(mean[self.chosen] - mean[without[0, 0]])
         return result
 
     @property
@@ -265,6 +259,7 @@ class Communicator:
         value = self.objective.at(self.person, past, steps_left, seed)
         found = self.search(value, allowed, seed)
         chosen = choose(found.valued, self.sure)
+        found, chosen = slimmed(value, found, chosen, self.sure)
         flags = found.candidates[chosen, 0]
         gain = gain_over_silence(found.valued, chosen)
         return Decision(channels.message(flags), flags, gain, domain, now, found, chosen)
@@ -275,12 +270,41 @@ def choose(valued: Valued, sure: float) -> int:
 
     Silence, candidate 0, where none gains anything; of equally good ones the first.
     """
-    gain = valued.utility - valued.utility[:1]
-    least = gain.mean(-1)
-    if gain.shape[-1] > 1:
-        least = least - sure * gain.std(-1) / gain.shape[-1] ** 0.5
+    least = _least(valued.utility - valued.utility[:1], sure)
     best = int(least.argmax())
     return best if float(least[best]) > TIE else 0
+
+
+def slimmed(value: Value, found: Found, chosen: int, sure: float) -> tuple[Found, int]:
+    """A plan in which every item that is communicated now is itself surely worth it.
+
+    A plan can gain much by what it says later, and a message by one of its items. So the plan is
+    compared with itself less each item that it communicates now, and the item of which least is
+    left after ``sure`` standard errors is dropped if that is nothing, until none is.
+
+    Returns:
+        The candidates with those that were valued besides, and which of them is chosen.
+    """
+    while True:
+        plan = found.candidates[chosen]
+        places = plan[0].nonzero().squeeze(-1)
+        if not len(places):
+            return found, chosen
+        less = plan.repeat(len(places), 1, 1)
+        less[torch.arange(len(places)), 0, places] = False
+        first = len(found.candidates)
+        found = joined(found, less, value)
+        least = _least(found.valued.utility[chosen] - found.valued.utility[first:], sure)
+        worst = int(least.argmin())
+        if float(least[worst]) > TIE:
+            return found, chosen
+        chosen = first + worst
+
+
+def _least(gain: Tensor, sure: float) -> Tensor:
+    """What is left of gains ``[C, S]`` after so many standard errors, ``[C]``."""
+    mean = gain.mean(-1)
+    return mean - sure * gain.std(-1) / gain.shape[-1] ** 0.5 if gain.shape[-1] > 1 else mean
 
 
 def gain_over_silence(valued: Valued, index: int) -> Gain:

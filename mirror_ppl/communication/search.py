@@ -88,16 +88,8 @@ class Patient:
                 plan[1] = message
                 plan[0, item], plan[1, item] = True, False
                 plans.append(plan)
-        later = torch.stack(plans)
-        valued = in_chunks(value, later)
         now = torch.nn.functional.pad(first.candidates, [0, 0, 0, self.steps - 1])
-        actions = None
-        if first.valued.actions is not None and valued.actions is not None:
-            actions = torch.cat([first.valued.actions, valued.actions])
-        return Found(
-            torch.cat([now, later]),
-            Valued(torch.cat([first.valued.utility, valued.utility]), actions),
-        )
+        return joined(Found(now, first.valued), torch.stack(plans), value)
 
 
 @dataclass(frozen=True)
@@ -164,6 +156,18 @@ class Automatic:
         if 2 ** int(allowed.sum()) <= self.most:
             return Patient(self.steps)(value, allowed, seed)
         return CrossEntropy(self.steps)(value, allowed, seed)
+
+
+def joined(found: Found, more: Tensor, value: Value) -> Found:
+    """What was found, and more candidates ``[C, L, N]`` with their values after it."""
+    valued = in_chunks(value, more)
+    actions = None
+    if found.valued.actions is not None and valued.actions is not None:
+        actions = torch.cat([found.valued.actions, valued.actions])
+    return Found(
+        torch.cat([found.candidates, more]),
+        Valued(torch.cat([found.valued.utility, valued.utility]), actions),
+    )
 
 
 def in_chunks(value: Value, candidates: Tensor) -> Valued:

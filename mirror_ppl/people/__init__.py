@@ -57,8 +57,8 @@ def simulate(
     Returns:
         P people with B rounds each. Its truths are ``sight_...`` for each of the domain's
         directions (how far the person sees, in the domain's unit of distance; the last of
-        ``reach_bins`` is everything), ``assumes_...`` for each of the domain's assumptions (1: made)
-        and ``consistency`` (1 / units of reward).
+        ``reach_bins`` is everything), ``assumes_...`` for each of the domain's assumptions (1:
+        made) and ``consistency`` (1 / units of reward).
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
