@@ -321,8 +321,9 @@ plot_action(decision)
 #   or two steps later. What can wait waits: it may turn out not to be needed. `Automatic(1)` asks
 #   only whether a message is better than silence for good.
 # - **How sure.** With `sure=2`, the default, a message has to gain more than two standard errors of
-#   its gain. `sure=0` takes what is best on average, however uncertain that is. `sure=20` drops
-#   messages that gain little, and prefers a gain that is certain to one that is a bit larger.
+#   its gain, and so has each of its items, compared with leaving it out. `sure=0` takes
+#   what is best on average, however uncertain that is. `sure=20` drops messages that gain little,
+#   and prefers a gain that is certain to one that is a bit larger.
 #
 # Here is what each would say in the round above, up to the step before the collision. All are given
 # the same past, in which the shipped settings spoke.
