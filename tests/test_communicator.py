@@ -158,7 +158,7 @@ def silent(decision):
     assert decision.gain == Gain(0.0, 0.0, 0.0)
     return decision.why() in (
         "silence: nothing that could be told is worth its cost",
-        "silence: there is nothing that can be told now",
+        "silence: there is nothing new that can be told now",
     )
 
 

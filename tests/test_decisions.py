@@ -107,7 +107,7 @@ def test_a_decision_without_a_choice():
     assert one.cost == 0
     assert one.matters == {}
     assert one.turning_point is None
-    assert one.why() == "silence: there is nothing that can be told now"
+    assert one.why() == "silence: there is nothing new that can be told now"
     (row,) = one.alternatives.to_dict("records")
     assert row == {
         "message": "silence",

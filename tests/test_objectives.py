@@ -28,6 +28,7 @@ from mirror_ppl.communication import (
     every_message,
 )
 from mirror_ppl.domains.base import total_reward
+from mirror_ppl.domains.driving import CARS
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
 
@@ -100,6 +101,8 @@ def worth(model, draw, past, world, candidate, horizon, discount):
         told = candidate[step] if step < len(candidate) else torch.zeros(8, dtype=torch.bool)
         shown, said = int(told[:4].sum()), int(told[4:].sum())
         utility = -(0.01 * shown**2 + 0.03 * said**2)
+        # What has left the road, or fallen behind, can no longer be told of, or shown.
+        told = told & CHANNELS.join(DOMAIN.communicable(past.now))
         for action, chance in enumerate(chances(model, draw, past, told)):
             predicted[step, action] += weight * chance
             following, observation, reward = world.step(state, action)
@@ -174,7 +177,9 @@ def test_utilities_are_those_of_every_course(
     past, state = random_round(time, generator)
     model = model(self_model())
     someone = Person(model, varied_draws(3, generator, model))
-    candidates = candidates_of(past, generator, steps)
+    # The last is to show everything at each step, as far as it can be shown.
+    everything = flags(visual=CARS).expand(1, steps, -1)
+    candidates = torch.cat([candidates_of(past, generator, steps), everything])
     if world is SimulatorWorld:
         real, own = Simulated(past, state), SimulatorWorld(DOMAIN)
     else:
@@ -191,6 +196,39 @@ def test_utilities_are_those_of_every_course(
         alone = value(candidate[None])
         torch.testing.assert_close(alone.utility[0], expected[c], rtol=0, atol=1e-4)
         torch.testing.assert_close(alone.actions[0], predicted[c], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("clear", "closing"), [(0, 0), (0, 1), (1, 0), (1, 1)])
+@pytest.mark.parametrize(
+    ("name", "car", "places"),
+    [
+        ("visual", "front-left", [11, 12]),  # as far as can be shown
+        ("verbal", "front-left", [11, 12]),
+        ("visual", "rear-right", [0, -1]),  # only what is ahead can be shown
+        ("verbal", "rear-right", [-11, -12]),
+    ],
+)
+def test_what_can_no_longer_be_told_at_its_step_changes_nothing_but_its_cost(
+    clear, closing, name, car, places
+):
+    """The same message a step earlier does, but where everybody sees the car; and so do others."""
+    positions, speeds, index = [3, 5, -3, -3], [-1, -1, 1, 1], CARS.index(car)
+    positions[index], speeds[index] = places[0], places[1] - places[0]
+    past = begun(0, positions, speeds)
+    someone = person(3, front_own=[0, 2, 4], assumes_clear=clear, assumes_closing=closing)
+    told, other = flags(**{name: [car]}), flags(verbal=["rear-left"])
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 3, 0.9, branch=0).at(someone, past, 15, 0)
+    candidates = [plan(None, None), plan(None, told), plan(told, None), plan(None, told | other)]
+    valued = value(torch.stack([*candidates, plan(None, other)]))
+    costs = CHANNELS.cost(torch.stack([told, told | other, other])) * 0.9
+    silence, late, early, both, alone = valued.utility
+    torch.testing.assert_close(late, silence - costs[0], rtol=0, atol=1e-5)
+    torch.testing.assert_close(both + costs[1], alone + costs[2], rtol=0, atol=1e-5)
+    assert torch.equal(valued.actions[1], valued.actions[0])
+    assert torch.equal(valued.actions[3], valued.actions[4])
+    gain = (early - silence + costs[0] / 0.9).abs()
+    assert gain.max() > 1e-3 if places[0] else gain.max() < 1e-5
+    assert (both - late).abs().max() > 0.05
 
 
 def test_silence_after_a_message_is_the_message_alone(generator):

@@ -378,6 +378,7 @@ def test_shapes_and_truths(fog):
         "sight_back_own": [0.0] * 10,
         "sight_back_other": [0.0] * 10,
         "assumes_clear": [1.0] * 10,
+        "assumes_closing": [1.0] * 10,
     }
     assert fog.provenance["population"] == "paper"
     assert fog.provenance["seed"] == 0

@@ -65,6 +65,7 @@ def made_up(rng, people=PEOPLE, with_truth=True, with_test=True):
     def implants(number):
         drawn = {
             "assumes_clear": rng.integers(0, 2, (1, number, P)),
+            "assumes_closing": rng.integers(0, 2, (1, number, P)),
             "consistency": rng.lognormal(1, 0.5, (1, number, P)),
             "lapse": rng.beta(1, 30, (1, number, P)),
             "residual_in": rng.normal(size=(1, number, P, 2, 3)),
@@ -74,6 +75,7 @@ def made_up(rng, people=PEOPLE, with_truth=True, with_test=True):
         return drawn
 
     posterior = implants(4)
+    posterior["assumes_closing"][0, :, 0] = [0, 1, 1, 1]
     for site in SITES:
         posterior[site][0, :, 0] = REACH[site]
         posterior[site][0, :, 1:] = 12
@@ -90,6 +92,7 @@ def made_up(rng, people=PEOPLE, with_truth=True, with_test=True):
     if with_truth:
         for site in SITES:
             constants["truth_" + site] = np.array([TRUTH[site], *[np.nan] * (P - 1)])
+        constants["truth_assumes_closing"] = np.ones(P)
         constants["truth_consistency"] = np.full(P, 3.0)
     rounds = ["person", "round", "step"]
     dims = {name: ["person"] for name in [*posterior, *constants]}
@@ -255,7 +258,8 @@ def test_human_models_without_thresholds_have_no_road(data):
 
 
 def test_scalar_implants_are_those_with_one_number_a_person(data):
-    assert set(scalar_implants(data)) == {*SITES, "assumes_clear", "consistency", "lapse"}
+    assumes = {"assumes_clear", "assumes_closing"}
+    assert set(scalar_implants(data)) == {*SITES, *assumes, "consistency", "lapse"}
 
 
 def test_implants_are_drawn_beside_the_prior_with_the_truth_marked(data):
@@ -272,7 +276,11 @@ def test_implants_are_drawn_beside_the_prior_with_the_truth_marked(data):
     # The truth, 2 cells, is the third of the possible values.
     assert ax.lines[-1].get_label() == "truth"
     assert ax.lines[-1].get_xdata() == [2]
-    assert [label.get_text() for label in axes["takes the unseen to be absent"].get_xticklabels()]
+    for what in ("takes the unseen to be absent", "takes what they cannot judge to come closer"):
+        ax = axes[what]
+        assert [label.get_text() for label in ax.get_xticklabels()] == ["no", "yes"]
+    assert [bar.get_height() for bar in ax.containers[1]] == [0.25, 0.75]
+    assert ax.lines[-1].get_xdata() == [1]  # the truth: yes
     ax = axes["consistency of choices"]
     assert ax.lines[-1].get_xdata() == [3]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [

@@ -238,6 +238,10 @@ def test_share_known_is_of_what_was_seen_or_told_so_far():
     assert known[:, 1].tolist() == [0, 0, 0, 0]
     assert known[:, 2].tolist() == [0, 1, 1, 1]
     assert known[:, 3].tolist() == [0, 0, 0, 0]
+    # What was shown once is known of ever after, though not how it moves.
+    known = share_known(someone, a_round(flags(visual=("front-right",)), None, None))
+    assert known[:, 1].tolist() == [1, 1, 1, 1]
+    assert known[:, 2].tolist() == [0, 0, 0, 0]
 
 
 def test_share_seen_is_by_lane_and_distance():

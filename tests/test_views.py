@@ -25,7 +25,6 @@ from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewedActions
 from mirror_ppl.models.views import (
-    ASSUMPTION_PROBABILITY,
     KIND_PROBABILITIES,
     TOLD_PROBABILITY,
     draw_views,

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, Message
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.minds import Person, telling
 from mirror_ppl.communication.objectives import Objective, Value, Valued
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
@@ -196,7 +196,7 @@ class Decision:
 
     def _why_not(self) -> str:
         if self.found is None:
-            return "there is nothing that can be told now"
+            return "there is nothing new that can be told now"
         for step, message in enumerate(self.plan):
             if message:
                 return f"{self._about(message)}: can wait {step} step{'s' * (step > 1)}"
@@ -250,6 +250,8 @@ class Communicator:
         now = past.now
         allowed = channels.join(domain.communicable(now))
         steps_left = domain.horizon - past.time
+        if steps_left > 0 and allowed.any():
+            allowed = telling(self.person, past, allowed)
         if steps_left < 1 or not allowed.any():
             silence = torch.zeros_like(allowed)
             return Decision(

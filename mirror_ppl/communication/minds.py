@@ -17,6 +17,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility
@@ -146,6 +147,37 @@ def beliefs_before(person: Person, past: RoundSoFar) -> tuple[Beliefs, Tensor]:
     return CourseBeliefs.before(person, past)
 
 
+@torch.no_grad()
+def telling(person: Person, past: RoundSoFar, allowed: Tensor) -> Tensor:
+    """Which of the allowed items ``[N]`` tell anything now, in at least one posterior draw.
+
+    What everybody sees or knows already leads to the same beliefs if it is told besides, so no
+    message with it is worth its cost. Items tell something each by itself or not at all. Of models
+    that are not stepwise nothing is known: what is told now may count later.
+    """
+    if not person.human.stepwise:
+        return allowed
+    places = allowed.nonzero().squeeze(-1)
+    eyes, number = person.eye_count, len(places) + 1
+    messages = allowed.new_zeros(number, len(allowed))
+    messages[torch.arange(1, number), places] = True
+    before, own = beliefs_before(person, past)
+    eye = torch.arange(eyes, device=allowed.device).repeat(number)
+    last = past.actions[-1] if past.time else len(person.human.domain.actions)
+    looks = Looks(
+        parent=own[eye],
+        eye=eye,
+        action=torch.full_like(eye, int(last)),
+        row=torch.zeros_like(eye),
+        observation={name: value[None] for name, value in past.now.items()},
+        told=Channels(person.human.domain).split(messages.repeat_interleave(eyes, 0)),
+    )
+    index = before.after(looks)[1].view(number, eyes)
+    result = torch.zeros_like(allowed)
+    result[places] = (index[1:] != index[:1]).any(1)
+    return result
+
+
 @dataclass(frozen=True)
 class StepwiseBeliefs:
     """Beliefs of human models in which each step follows from the one before.
@@ -168,25 +200,25 @@ class StepwiseBeliefs:
     @classmethod
     def before(cls, person: Person, past: RoundSoFar) -> tuple[StepwiseBeliefs, Tensor]:
         """See :func:`beliefs_before`; eyes that saw the same so far share a belief."""
-        human = person.human
-        device = person.eye.device
-        zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
-        nothing = human.domain.nothing_known(1, device=device)
-        beliefs = cls(person, Gaussian(zero, torch.ones_like(zero)), nothing)
-        which = torch.zeros_like(person.eye[: person.eye_count])
+        human, eyes = person.human, torch.arange(person.eye_count, device=person.eye.device)
+        knowledge = human.domain.nothing_known(1, device=eyes.device)
+        if past.time == 0:
+            zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
+            beliefs = cls(person, Gaussian(zero, torch.ones_like(zero)), knowledge)
+            return beliefs, torch.zeros_like(eyes)
+        views = []
         for time in range(past.time):
-            last = past.actions[time - 1] if time else len(human.domain.actions)
-            beliefs, which = beliefs.after(
-                Looks(
-                    parent=which,
-                    eye=torch.arange(person.eye_count, device=device),
-                    action=torch.full_like(which, int(last)),
-                    row=torch.zeros_like(which),
-                    observation={n: v[time : time + 1] for n, v in past.observation.items()},
-                    told={n: m[time].expand(len(which), -1) for n, m in past.told.items()},
-                )
-            )
-        return beliefs, which
+            now = {name: value[time : time + 1] for name, value in past.observation.items()}
+            told = {name: mask[time : time + 1] for name, mask in past.told.items()}
+            view, knowledge = person.look(eyes, knowledge, now, told)
+            views.append(view)
+        view = View.stack(views)
+        known = torch.cat(_whole_numbers(knowledge), -1)
+        first, which = distinct_rows(torch.cat([view.rows().flatten(1), known], -1))
+        observation, _, actions = _history(past, len(first))
+        mean = human.believe(view.map(lambda part: part[first]), observation, actions)[:, -1]
+        state = Gaussian(mean, torch.ones_like(mean))
+        return cls(person, state, _rows(knowledge, first)), which
 
     def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
         """See :class:`Beliefs`; looks that tell the same after the same lead to one belief."""
@@ -200,7 +232,7 @@ class StepwiseBeliefs:
             view.map(lambda part: part[told_by]),
             {name: value[rows] for name, value in looks.observation.items()},
         )
-        known = [as_whole_numbers(getattr(knowledge, part.name)) for part in fields(knowledge)]
+        known = _whole_numbers(knowledge)
         first, index = distinct_rows(
             torch.cat([torch.stack([looks.parent, looks.action, which], -1), *known], -1)
         )
@@ -271,6 +303,11 @@ def _history(past: RoundSoFar, number: int) -> tuple[Observation, Visibility, Te
         {name: repeated(mask) for name, mask in past.told.items()},
         repeated(past.actions),
     )
+
+
+def _whole_numbers(knowledge: Any) -> list[Tensor]:
+    """A domain's knowledge ``[n]`` as whole numbers, equal where it is equal."""
+    return [as_whole_numbers(getattr(knowledge, part.name)) for part in fields(knowledge)]
 
 
 def _rows(knowledge: Any, rows: Tensor) -> Any:

@@ -1,9 +1,10 @@
 """What an observer has learned of each car, and what they take for granted about the others.
 
 One sight of a car tells where it is; a second one, or an utterance, tells how it moves, and as cars
-keep their speed that is known for the rest of the round. Until then the observer may assume that
-the car comes closer, and of cars never observed that there are none. An assumption is wrong as soon
-as the car should be in sight and is not; it then moves the other way, there being two speeds.
+keep their speed that is known for the rest of the round. So it is if a car that was seen once would
+be in sight by now had it come closer, and is not: there are two speeds, and it has the other one.
+Until then the observer may assume that it comes closer, and of cars never observed that there are
+none.
 """
 
 from __future__ import annotations
@@ -58,13 +59,13 @@ class CarKnowledge:
     ) -> CarKnowledge:
         """Knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
         ahead = observation["visual"][..., 0]
-        shown, spoken = visible["visual"], visible["verbal"]
+        # Off the road there is nothing to observe, however far somebody sees.
+        here = ahead.abs() < ROAD_END
+        shown, spoken = visible["visual"] & here, visible["verbal"] & here
         position = self.position + self.speed
         expected = assumed_cars(position, self.speed, observation)
         missed = sees(expected)["visual"] & (position.abs() < ROAD_END) & ~shown
-        # A car seen to be off the road is gone for good, wherever it came from.
-        gone = shown & (ahead.abs() >= ROAD_END)
-        known = self.known | spoken | gone | (self.placed & shown) | (self.unsure & missed)
+        known = self.known | spoken | (self.placed & shown) | (self.unsure & missed)
         placed = self.placed | shown | spoken
         first = placed & ~self.placed
         # One that came from ahead would have been ahead before: a car abreast came from behind.
