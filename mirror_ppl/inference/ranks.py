@@ -1,0 +1,296 @@
+"""Ranks of the truth among posterior draws: what they say of the posterior, in numbers and a file.
+
+Where people are drawn from the prior, what they do from the program, and inference is right, the
+truth is exchangeable with the S posterior draws of it: its rank among them is uniform over 0 .. S.
+Posteriors that are too narrow give too many extreme ranks, too wide ones too few, and shifted ones
+too many at one end. A posterior that is the prior is right, too, and so are all that leave out part
+of the data: how much is inferred is told by sharpness. Nothing here knows where draws come from.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy.stats import entropy
+
+from mirror_ppl.errors import PosteriorError
+from mirror_ppl.files import write_whole
+from mirror_ppl.inference.uniformity import ecdf_p_value, histogram_p_value
+
+FAILURE_RATE = 1e-3
+"""How often a right posterior may be rejected, for each site and number of rounds."""
+LEVELS = (0.5, 0.8, 0.9)
+"""Probabilities of the central intervals whose coverage is counted."""
+ENDS = (0.05, 0.95)
+"""Quantiles at the ends of the interval whose width is measured."""
+HIGH_PARETO_K = 0.7
+"""Above it, importance weights are not to be trusted."""
+EXACTLY: Any = {
+    "join": "exact",
+    "combine_attrs": "override",
+    "data_vars": "all",
+    "coords": "minimal",
+}
+"""How parts are put together: they have to match."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How posteriors compare with the truth, for each site and number of rounds.
+
+    Attributes:
+        data: dimensions ``site``, ``rounds`` and ``person``, variables of :func:`judge` and
+            :func:`collect`; attributes say what was calibrated.
+        failure_rate: probability that a right posterior is rejected, for each site and number of
+            rounds.
+
+    Raises:
+        ValueError: the failure rate is no probability.
+    """
+
+    data: xr.Dataset
+    failure_rate: float = FAILURE_RATE
+
+    def __post_init__(self) -> None:
+        if not 0 < self.failure_rate < 1:
+            raise ValueError(f"failure_rate must be between 0 and 1, not {self.failure_rate}")
+
+    @property
+    def people(self) -> int:
+        """Number of people P."""
+        return self.data.sizes["person"]
+
+    @property
+    def draws(self) -> int:
+        """Number of posterior draws S of each person."""
+        return int(self.data.attrs["draws"])
+
+    @property
+    def coverage(self) -> xr.DataArray:
+        """Share of people whose central interval holds the truth, ``[site, rounds, level]``.
+
+        S draws leave S + 1 gaps, equally probable to hold the truth. ``place`` is a random point of
+        the truth's gap, so it is uniform over 0 .. 1 if the posterior is right; and the interval of
+        level q holds the truth if ``|2 place - 1| <= q``, which has probability q exactly. An
+        interval that ends inside of a gap, or inside of the probability of one value of a discrete
+        site, thus holds what is there at random, as often as the part inside is large.
+        """
+        level = xr.DataArray(list(LEVELS), coords={"level": list(LEVELS)}, dims="level")
+        inside = abs(2 * self.data["place"] - 1) <= level
+        return inside.mean("person")
+
+    @property
+    def coverage_error(self) -> xr.DataArray:
+        """Binomial standard errors of the coverage, under a flat prior and so never 0."""
+        share = (self.coverage * self.people + 1) / (self.people + 2)
+        return (share * (1 - share) / (self.people + 3)) ** 0.5
+
+    @property
+    def rejected(self) -> list[tuple[str, int]]:
+        """Sites and numbers of rounds whose posteriors are not right."""
+        table = self.table()
+        wrong = table[table["p_value"] < self.failure_rate]
+        return list(zip(wrong["site"].tolist(), wrong["rounds"].tolist(), strict=True))
+
+    def table(self) -> pd.DataFrame:
+        """One row for each site and number of rounds.
+
+        Returns:
+            - ``site``, ``rounds``;
+            - ``p_value`` of uniform ranks, by two tests at once: twice the smaller of
+              ``p_histogram`` and ``p_ecdf``, or the latter alone where the former is NaN because
+              people are too few;
+            - ``coverage_50``, ``coverage_50_se`` and so on: :attr:`coverage` with its error;
+            - ``sharpness``: 1 where the posterior says no more than the prior, 0 where it is sure.
+              The mean width of the 90% interval, relative to the prior's; of discrete sites the
+              mean entropy, relative to the prior's;
+            - of discrete sites (else NaN) ``probability``, the posterior's of the truth, and
+              ``entropy`` in nats, both means, and ``prior_probability`` and ``prior_entropy``;
+            - ``high_pareto_k``: share of people above 0.7; NaN if there are no weights.
+        """
+        data = self.data.assign(coverage=self.coverage, error=self.coverage_error)
+        pairs = itertools.product(data["site"].values.tolist(), data["rounds"].values.tolist())
+        rows = [
+            {"site": site, "rounds": rounds} | self._row(data.sel(site=site, rounds=rounds))
+            for site, rounds in pairs
+        ]
+        return pd.DataFrame(rows)
+
+    def _row(self, own: xr.Dataset) -> dict[str, Any]:
+        rank = own["rank"].values
+        tests = {
+            "p_histogram": histogram_p_value(rank, self.draws),
+            "p_ecdf": ecdf_p_value(rank, self.draws),
+        }
+        known = [value for value in tests.values() if not np.isnan(value)]
+        row: dict[str, Any] = {"p_value": min(1.0, len(known) * min(known))} | tests
+        for level in LEVELS:
+            name = f"coverage_{round(100 * level)}"
+            row[name] = float(own["coverage"].sel(level=level))
+            row[f"{name}_se"] = float(own["error"].sel(level=level))
+        kind = "entropy" if own["discrete"] else "width"
+        before = float(own[f"prior_{kind}"])
+        # A site that is known for certain beforehand cannot get any sharper.
+        row["sharpness"] = float(own[kind].mean()) / before if before > 0 else np.nan
+        for name in ("probability", "entropy"):
+            row[name] = float(own[name].mean())
+            row[f"prior_{name}"] = float(own[f"prior_{name}"])
+        weights = own["pareto_k"].values
+        row["high_pareto_k"] = np.where(np.isnan(weights), np.nan, weights > HIGH_PARETO_K).mean()
+        return row
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write netCDF, whole or not at all.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        data = self.data.assign_attrs(failure_rate=self.failure_rate)
+        write_whole(path, lambda temporary: data.to_netcdf(temporary, engine="h5netcdf"))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Calibration:
+        """Read a file of :meth:`save`.
+
+        Raises:
+            PosteriorError: the file is missing or damaged, or holds something else.
+        """
+        if not Path(path).is_file():
+            raise PosteriorError(f"{path}: there is no such file")
+        try:
+            data = xr.load_dataset(path, engine="h5netcdf")
+            calibration = cls(data, float(data.attrs.pop("failure_rate")))
+            calibration.table()  # reads everything that has to be there
+        except Exception as error:
+            raise PosteriorError(f"{path}: cannot be read as a calibration ({error})") from error
+        return calibration
+
+
+def ranks(truth: np.ndarray, draws: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Ranks ``[P]``, from 0 to S, of truths ``[P]`` among draws ``[S, P]``.
+
+    Among the draws that equal it, the truth takes each place with the same probability. So if the
+    truth is one more draw, all S + 1 ranks are equally probable, however many ties there are.
+    """
+    below, same = (draws < truth).sum(0), (draws == truth).sum(0)
+    return below + rng.integers(same + 1)
+
+
+def judge(
+    truth: Mapping[str, np.ndarray],
+    draws: Mapping[str, np.ndarray],
+    discrete: Collection[str],
+    rng: np.random.Generator,
+    pareto_k: np.ndarray | None = None,
+) -> xr.Dataset:
+    """Compare posterior draws with the truth.
+
+    Args:
+        truth: by site, ``[P]``.
+        draws: by site, ``[S, P]``.
+        discrete: which sites are.
+        rng: source of how ties are broken.
+        pareto_k: of importance weights ``[P]``; NaN counts as infinite.
+
+    Returns:
+        Dimensions ``site`` and ``person``: ``truth``; its ``rank``; its ``place``, see
+        :attr:`Calibration.coverage`; ``width`` of the 90% interval of continuous sites;
+        ``probability`` of the truth and ``entropy`` in nats of discrete sites, of shares of draws
+        (which makes the entropy of n values too small by up to ``(n - 1) / 2S``). ``pareto_k`` has
+        the dimension ``person`` alone.
+
+    Raises:
+        ValueError: there are no draws, or more of one site than of another.
+    """
+    sizes = {len(draws[site]) for site in truth}
+    if len(sizes) != 1 or 0 in sizes:
+        raise ValueError(f"expected as many draws of each site, and some, not {sorted(sizes)}")
+    measured = []
+    for site, true in truth.items():
+        own = draws[site]
+        rank = ranks(true, own, rng)
+        place = (rank + rng.random(len(rank))) / (len(own) + 1)
+        probability = (own == true).mean(0) if site in discrete else np.full(len(true), np.nan)
+        one = {"truth": true, "rank": rank, "place": place, "probability": probability}
+        measured.append(one | _spread(own, site in discrete))
+    number = len(measured[0]["truth"])
+    weights = np.full(number, np.nan)
+    if pareto_k is not None:
+        weights = np.where(np.isnan(pareto_k), np.inf, pareto_k)
+    return xr.Dataset(
+        {
+            name: (("site", "person"), np.stack([one[name] for one in measured]))
+            for name in measured[0]
+        }
+        | {"pareto_k": ("person", weights)},
+        coords={"site": list(truth)},
+        attrs={"draws": sizes.pop()},
+    )
+
+
+def collect(
+    parts: Mapping[int, Sequence[xr.Dataset]],
+    prior: Mapping[str, np.ndarray],
+    discrete: Collection[str],
+    attributes: Mapping[str, str],
+) -> Calibration:
+    """Put together what was judged of all people and numbers of rounds.
+
+    Args:
+        parts: for each number of rounds, results of :func:`judge` of some people each; the same
+            people, in the same order.
+        prior: draws of the prior by site, ``[D]``.
+        discrete: which sites are.
+        attributes: what the file should say of itself.
+
+    Returns:
+        Variables of :func:`judge`, with the dimension ``rounds`` in between (but for ``truth``);
+        and by site ``discrete``, ``prior_width``, ``prior_entropy`` and ``prior_probability``, the
+        mean of the truth's.
+
+    Raises:
+        ValueError: numbers of draws differ.
+    """
+    sizes = {part.attrs["draws"] for judged in parts.values() for part in judged}
+    if len(sizes) != 1:
+        raise ValueError(f"expected as many draws every time, not {sorted(sizes)}")
+    joined = [xr.concat(judged, "person", **EXACTLY) for judged in parts.values()]
+    rounds = pd.Index(list(parts), name="rounds")
+    data = xr.concat(joined, rounds, **EXACTLY).transpose("site", "rounds", "person")
+    data["truth"] = data["truth"].isel(rounds=0, drop=True)
+    before = {site: _of_prior(prior[site], site in discrete) for site in prior}
+    for name in next(iter(before.values())):
+        values = [before[site][name] for site in data["site"].values.tolist()]
+        data[name] = ("site", np.asarray(values))
+    return Calibration(data.assign_attrs(attributes))
+
+
+def _of_prior(values: np.ndarray, discrete: bool) -> dict[str, float]:
+    """What :func:`collect` tells of the prior, from draws ``[D]``."""
+    _, counts = np.unique(values, return_counts=True)
+    probability = float(((counts / len(values)) ** 2).sum()) if discrete else np.nan
+    spread = {name: float(part[0]) for name, part in _spread(values[:, None], discrete).items()}
+    return {
+        "discrete": float(discrete),
+        "prior_width": spread["width"],
+        "prior_entropy": spread["entropy"],
+        "prior_probability": probability,
+    }
+
+
+def _spread(values: np.ndarray, discrete: bool) -> dict[str, np.ndarray]:
+    """Width of the 90% interval or entropy ``[P]`` of draws ``[S, P]``; the other is NaN."""
+    unknown = np.full(values.shape[1], np.nan)
+    if discrete:
+        shares = np.stack([(values == value).mean(0) for value in np.unique(values)])
+        return {"width": unknown, "entropy": np.asarray(entropy(shares))}
+    low, high = np.quantile(values, ENDS, axis=0)
+    return {"width": high - low, "entropy": unknown}
