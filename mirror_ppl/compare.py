@@ -1,0 +1,152 @@
+"""`python -m mirror_ppl.compare`: which human model predicts the same people best."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from mirror_ppl.console import run
+from mirror_ppl.errors import OptionError, OutputError
+
+if TYPE_CHECKING:
+    from mirror_ppl.evaluation.comparison import Comparison
+
+PICTURES = (".png", ".pdf", ".svg")
+WIDTH = 80
+PROGRAM = "python -m mirror_ppl.compare"
+DESCRIPTION = """Compare human models that were fitted to the same recordings by how well they
+predict rounds that they did not learn from, and print how far each is behind the best, with the
+standard error of the difference."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to compare, how, and where the results go."""
+
+    posteriors: Positional[tuple[Path, ...]] = ()
+    """Two or more posteriors of python -m mirror_ppl.fit: files, or the folders that hold them."""
+    by: str = "loo"
+    """What is predicted: loo (each round learned from, as if it had been left out) or heldout (the
+    rounds that were held out)."""
+    labels: tuple[str, ...] = ()
+    """What to call the models, in the same order; by their class and folder unless given."""
+    json: Path | None = None
+    """Write the results as data, also those of each person."""
+    figure: Path | None = None
+    """Draw the differences of each person and of all: a file that ends in .png, .pdf or .svg."""
+
+    def __post_init__(self) -> None:
+        number = len(self.posteriors)
+        if number < 2:  # noqa: PLR2004 - a comparison takes two
+            raise OptionError(f"give at least two posteriors to compare, not {number}")
+        if self.by not in ("loo", "heldout"):
+            raise OptionError(f'--by must be loo or heldout, not "{self.by}"')
+        if self.labels:
+            if len(self.labels) != number:
+                raise OptionError(
+                    f"--labels must be as many as posteriors, {number}, not {len(self.labels)}"
+                )
+            if len({label.strip() for label in self.labels} - {""}) < number:
+                raise OptionError("--labels must be different from each other and not empty")
+        if self.figure is not None and self.figure.suffix.lower() not in PICTURES:
+            raise OptionError(f"--figure must end in {', '.join(PICTURES)}, not {self.figure.name}")
+
+
+def main(options: Options) -> None:
+    """Compare, write the results, and print what was found.
+
+    Raises:
+        MirrorError: what was asked for cannot be done; nothing is written then.
+    """
+    from mirror_ppl.evaluation.comparison import compare_fits, label_models, read_fit
+    from mirror_ppl.files import prepare_output_folder, write_whole
+    from mirror_ppl.plots.comparison import save_comparison_picture
+
+    outputs = _outputs(options)
+    files = [read_fit(path, options.by) for path in options.posteriors]
+    comparison = compare_fits(files, options.labels or label_models(files), options.by)
+    for path in outputs:
+        prepare_output_folder(path.parent)
+    if options.json is not None:
+        text = json.dumps({"command": PROGRAM} | comparison.as_data(), indent=1) + "\n"
+        write_whole(options.json, lambda temporary: temporary.write_text(text))
+    if options.figure is not None:
+        save_comparison_picture(comparison, options.figure)
+    _show(comparison)
+    what = ((options.json, "the numbers, also of each person"), (options.figure, "the differences"))
+    for path, content in what:
+        if path is not None:
+            print(f"{path}: {content}")
+
+
+def _outputs(options: Options) -> list[Path]:
+    """Files to write, none of which is something else that was named."""
+    from mirror_ppl.evaluation.comparison import posterior_path
+
+    taken = {posterior_path(path).resolve(): "a posterior" for path in options.posteriors}
+    outputs = []
+    for option, path in (("--json", options.json), ("--figure", options.figure)):
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
+        if path.exists() and not path.is_file():
+            raise OutputError(f"cannot write {path}: it is not a regular file")
+        taken[path.resolve()] = option
+        outputs.append(path)
+    return outputs
+
+
+def _show(comparison: Comparison) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    left_out = comparison.by == "loo"
+    rounds, attributes = comparison.models[0].total.rounds, comparison.attributes
+    measured = f"leave-one-out, {rounds} rounds" if left_out else f"{rounds} held-out rounds"
+    caption = "nats an action, higher is better; difference: to the best, ± standard error, paired"
+    caption += " over rounds; weight: of each in the mixture that predicts best"
+    if left_out:
+        caption += "; doubtful: rounds whose estimate rests on few draws (Pareto k too high)"
+    table = Table(
+        # As text: names in square brackets are no markup.
+        title=Text(
+            f"{attributes.get('domain')}, {attributes.get('setting')}: {measured} of "
+            f"{len(comparison.people)} people"
+        ),
+        caption=Text(caption),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("", justify="right", no_wrap=True)
+    table.add_column("model", overflow="fold")
+    for name in ("elpd", "difference", *(["doubtful"] if left_out else []), "weight"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for rank, model in enumerate(comparison.models, 1):
+        score = model.total
+        error = "" if score.difference_se is None else f" ±{score.difference_se:.4f}"
+        table.add_row(
+            f"{rank}",
+            Text(model.label),
+            f"{score.elpd:z.4f}",
+            # The best has no difference to itself, nor any error of it.
+            "-" if rank == 1 else f"{score.difference:z.4f}{error}",
+            *([] if score.doubtful is None else [f"{score.doubtful} of {score.rounds}"]),
+            f"{model.weight:.2f}",
+        )
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(Options, main, prog=PROGRAM, description=DESCRIPTION))

@@ -1,0 +1,399 @@
+"""Human models compared by what their posteriors predict of the same recordings.
+
+Two measures of a round b of T actions, in nats; higher is better::
+
+    loo      log p(a_b | all other rounds)                      rounds that were learned from
+    heldout  sum_t log mean_s p(a_bt | psi_s, what came before) held-out rounds; psi_s: a draw
+
+Leave-one-out is estimated by Pareto-smoothed importance sampling, in ArviZ (Vehtari, Gelman and
+Gabry, *Practical Bayesian model evaluation using leave-one-out cross-validation and WAIC*, 2017).
+Its estimate for a round is doubtful where few draws get most of the weight. Held-out rounds need no
+such care; each of their actions is predicted by the average over draws, as in ``nll`` of
+``summary.json``.
+
+Rounds are the sample: differences are taken round by round, and the standard error of their sum is
+``sqrt(rounds * variance)``, as in ``arviz.compare``. Sums and their errors are told an action.
+
+Shapes: M models, S draws, P people, B rounds, T steps, A actions, N rounds of all people without
+padding.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mirror_ppl.data.schema import TRUTH
+from mirror_ppl.errors import PosteriorError
+from mirror_ppl.inference.export import az
+
+FILE = "posterior.nc"
+"""What a fit calls its posterior."""
+LACKS = {
+    "loo": "has no log-likelihoods of the rounds that were learned from (group log_likelihood)",
+    "heldout": "has no held-out rounds; leave some out of the fit (--train-rounds)",
+}
+"""The measures, and what is said of a file that has nothing to measure."""
+SOURCE = "recorded_"
+"""What attributes begin with that tell where recordings come from."""
+LEAST_DRAWS = 2
+"""Fewer draws cannot be weighted against each other."""
+
+
+@dataclass(frozen=True)
+class FitFile:
+    """What a posterior file holds that is compared.
+
+    Attributes:
+        path: the file.
+        attributes: what it says of itself.
+        people: names of the P people.
+        recorded: arrays that are of the recordings, not of the model, by group and variable.
+        actions: of the rounds that are compared ``[P, B, T]``; -1 in padding.
+        draws: for leave-one-out log-likelihoods of whole rounds ``[S, P, B]``; for held-out rounds
+            probabilities of what was done ``[S, P, B, T]``.
+    """
+
+    path: Path
+    attributes: Mapping[str, str]
+    people: tuple[str, ...]
+    recorded: Mapping[str, np.ndarray]
+    actions: np.ndarray
+    draws: np.ndarray
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well some rounds are predicted, in nats an action.
+
+    Attributes:
+        rounds: how many.
+        actions: how many in these rounds.
+        elpd: log predictive density.
+        elpd_se: its standard error; ``None`` of a single round.
+        difference: to that of the best model of all.
+        difference_se: standard error of the difference, paired; ``None`` of a single round.
+        doubtful: rounds whose leave-one-out estimate is not to be trusted; ``None`` if held out.
+    """
+
+    rounds: int
+    actions: int
+    elpd: float
+    elpd_se: float | None
+    difference: float
+    difference_se: float | None
+    doubtful: int | None
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a model stands among those it is compared with.
+
+    Attributes:
+        label: what it is called.
+        path: its posterior.
+        human_model: name of its class.
+        weight: by stacking; the weights of all models sum to 1.
+        good_k: Pareto k up to which leave-one-out is trusted; ``None`` if held out.
+        total: over all rounds.
+        people: over the rounds of each of the P people; ``None`` of those without any.
+    """
+
+    label: str
+    path: Path
+    human_model: str
+    weight: float
+    good_k: float | None
+    total: Score
+    people: tuple[Score | None, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models from the best to the worst.
+
+    Attributes:
+        by: the measure, a key of `LACKS`.
+        attributes: the domain, the setting and where the recordings come from.
+        people: names of the P people.
+        models: M of them.
+    """
+
+    by: str
+    attributes: Mapping[str, str]
+    people: tuple[str, ...]
+    models: tuple[Standing, ...]
+
+    def as_data(self) -> dict[str, Any]:
+        """The comparison as JSON holds it, people by name."""
+        return {
+            "by": self.by,
+            "unit": "nats an action",
+            **self.attributes,
+            "models": [
+                {"rank": rank, "label": model.label, "posterior": str(model.path)}
+                | {name: getattr(model, name) for name in ("human_model", "weight", "good_k")}
+                | asdict(model.total)
+                | {
+                    "people": [
+                        {"id": person} | ({"rounds": 0} if score is None else asdict(score))
+                        for person, score in zip(self.people, model.people, strict=True)
+                    ]
+                }
+                for rank, model in enumerate(self.models, 1)
+            ],
+        }
+
+
+@dataclass(frozen=True)
+class _Rounds:
+    """A model's N rounds: log predictive density, and whether it is to be doubted."""
+
+    values: np.ndarray
+    doubtful: np.ndarray | None = None
+    good_k: float | None = None
+
+
+def posterior_path(path: Path) -> Path:
+    """The posterior file that a file or a fit's folder stands for."""
+    return path / FILE if path.is_dir() else path
+
+
+def read_fit(path: Path, by: str = "loo") -> FitFile:
+    """Read what is compared of a posterior file.
+
+    Args:
+        path: a file that ``python -m mirror_ppl.fit`` wrote, or the folder that holds it.
+        by: the measure, a key of `LACKS`.
+
+    Raises:
+        PosteriorError: the file is missing or damaged, or lacks what is measured.
+    """
+    path = posterior_path(path)
+    if not path.is_file():
+        raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
+    try:
+        data = az.from_netcdf(str(path))
+        attributes = {str(key): str(value) for key, value in data["posterior"].attrs.items()}
+        group = "log_likelihood" if by == "loo" else "predictions"
+        file = _content(path, attributes, data, by) if group in data.groups() else None
+    except Exception as error:
+        raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
+    if file is None or not (file.actions >= 0).any():
+        raise PosteriorError(f"{path}: {LACKS[by]}")
+    if len(file.draws) < (least := LEAST_DRAWS if by == "loo" else 1):
+        raise PosteriorError(f"{path}: holds {len(file.draws)} draws, expected {least} or more")
+    return file
+
+
+def _content(path: Path, attributes: Mapping[str, str], data: az.InferenceData, by: str) -> FitFile:
+    learned = data["observed_data"]["action"].transpose("person", "round", "step")
+    recorded = {"observed_data action": learned.values} | _constants(data, "constant_data")
+    if by == "loo":
+        actions = learned.values
+        values = data["log_likelihood"]["action"].transpose("chain", "draw", "person", "round")
+        draws, rounds = _joined(values), actions.shape[:2]
+    else:
+        constants, order = data["predictions_constant_data"], ("person", "test_round", "step")
+        actions = constants["observed_action"].transpose(*order).values
+        recorded |= _constants(data, "predictions_constant_data")
+        values = data["predictions"]["action_probability"]
+        probability = _joined(values.transpose("chain", "draw", *order, "action_name"))
+        chosen = np.maximum(actions, 0)[None, ..., None].astype(int)
+        draws, rounds = np.take_along_axis(probability, chosen, -1)[..., 0], actions.shape
+    if draws.shape[1:] != rounds:
+        raise ValueError(f"rounds have shape {draws.shape[1:]}, expected {rounds}")
+    people = tuple(map(str, data["observed_data"]["person"].values))
+    return FitFile(path, attributes, people, recorded, actions, draws)
+
+
+def _joined(values: xr.DataArray) -> np.ndarray:
+    """Draws of all chains, one after the other, in double precision."""
+    return values.values.reshape(-1, *values.shape[2:]).astype(float)
+
+
+def _constants(data: az.InferenceData, group: str) -> dict[str, np.ndarray]:
+    """What there was to see, was told and was done; not what is known of simulated people."""
+    if group not in data.groups():
+        return {}
+    return {
+        f"{group} {name}": value.values
+        for name, value in data[group].data_vars.items()
+        if not str(name).startswith(TRUTH) and name != "action_entropy"
+    }
+
+
+def label_models(files: Sequence[FitFile]) -> tuple[str, ...]:
+    """Names of the models: their class, and of their path as much as tells them apart."""
+    models = [_model(file) for file in files]
+    paths = [file.path.resolve() for file in files]
+    # A fit's folder says more than the file in it, which is called the same in all of them.
+    shown = [(path.parent if path.name == FILE else path).parts[1:] for path in paths]
+    alike, labels = Counter(models), models
+    for depth in range(1, 1 + max(map(len, shown))):
+        if len(set(labels)) == len(set(paths)):
+            break
+        labels = [
+            f"{model} {'/'.join(parts[-depth:])}" if alike[model] > 1 else model
+            for model, parts in zip(models, shown, strict=True)
+        ]
+    # Only the same file, given more than once, is left without a name of its own.
+    again = Counter(labels)
+    return tuple(
+        f"{label} ({1 + labels[:place].count(label)})" if again[label] > 1 else label
+        for place, label in enumerate(labels)
+    )
+
+
+def compare_fits(files: Sequence[FitFile], labels: Sequence[str], by: str = "loo") -> Comparison:
+    """Rank models by how well they predict rounds that they did not learn from.
+
+    Args:
+        files: one of each model, read for the same measure.
+        labels: different names of the models.
+        by: the measure, a key of `LACKS`.
+
+    Raises:
+        PosteriorError: files are of different recordings, or give what was done no probability.
+    """
+    for file in files[1:]:
+        _check_same(files[0], file)
+    first = files[0]
+    steps = (first.actions >= 0).sum(-1)
+    real = steps > 0
+    person, actions = np.nonzero(real)[0], steps[real]
+    measure = _leave_one_out if by == "loo" else _held_out
+    measured = {label: measure(file, real) for label, file in zip(labels, files, strict=True)}
+    # By name where equal, so that the order of the arguments makes no difference.
+    order = sorted(measured, key=lambda label: (-measured[label].values.sum(), label))
+    weights = _stacking(np.stack([measured[label].values for label in order])).tolist()
+    best = measured[order[0]].values
+    people = [person == index for index in range(len(first.people))]
+
+    def standing(label: str, weight: float) -> Standing:
+        file, rounds = files[labels.index(label)], measured[label]
+        return Standing(
+            label,
+            file.path,
+            _model(file),
+            weight,
+            rounds.good_k,
+            _score(rounds, best, actions, np.full(len(person), True)),
+            tuple(_score(rounds, best, actions, own) if own.any() else None for own in people),
+        )
+
+    return Comparison(by, _source(first), first.people, tuple(map(standing, order, weights)))
+
+
+def _model(file: FitFile) -> str:
+    return file.attributes.get("human_model", "unknown")
+
+
+def _source(file: FitFile) -> dict[str, str]:
+    return {
+        name: value
+        for name, value in file.attributes.items()
+        if name in ("domain", "setting") or name.startswith(SOURCE)
+    }
+
+
+def _check_same(first: FitFile, other: FitFile) -> None:
+    expected, given = _source(first), _source(other)
+    # Short values say in few words what the command that recorded says in many.
+    names = sorted({*expected, *given}, key=lambda name: (len(expected.get(name, "")), name))
+    different = f"{other.path}: is of other recordings than {first.path}:"
+    for name in names:
+        if given.get(name) != expected.get(name):
+            raise PosteriorError(
+                f"{different} {name} is {given.get(name)}, expected {expected.get(name)}"
+            )
+    if other.people != first.people:
+        raise PosteriorError(
+            f"{different} people are {', '.join(other.people)}, expected {', '.join(first.people)}"
+        )
+    for name, value in first.recorded.items():
+        # What one of the files leaves out cannot contradict the other.
+        own = other.recorded.get(name, value)
+        if own.shape != value.shape:
+            raise PosteriorError(
+                f"{different} {name} has shape {own.shape}, expected {value.shape}; fit them with "
+                "the same --train-rounds"
+            )
+        if not np.array_equal(own, value, equal_nan=value.dtype.kind == "f"):
+            raise PosteriorError(f"{different} {name} differs")
+
+
+def _check_possible(file: FitFile, values: np.ndarray, real: np.ndarray) -> None:
+    """Make sure that the logs ``[N]`` or ``[S, N]`` of probabilities are numbers."""
+    wrong = ~np.isfinite(values).reshape(-1, values.shape[-1]).all(0)
+    if wrong.any():
+        person, number = np.argwhere(real)[wrong.argmax()]
+        raise PosteriorError(
+            f"{file.path}: has no finite log-probability of what {file.people[person]} did in "
+            f"round {number}, counted from 0"
+        )
+
+
+def _leave_one_out(file: FitFile, real: np.ndarray) -> _Rounds:
+    likelihood = file.draws[:, real]
+    _check_possible(file, likelihood, real)
+    draws = xr.DataArray(likelihood[None], dims=("chain", "draw", "one"))
+    data = az.InferenceData(log_likelihood=draws.to_dataset(name="action"))
+    with warnings.catch_warnings():
+        # It warns of doubtful rounds, which are counted here, and where there is but one round.
+        warnings.simplefilter("ignore")
+        # Draws are independent, so none of them counts for less.
+        loo = az.loo(data, pointwise=True, reff=1.0, scale="log")
+    # Where all draws agree there is nothing to weight, though ArviZ finds no tail and gives up. A
+    # k that is not a number is no good one.
+    doubtful = ~(loo.pareto_k.values <= loo.good_k) & (np.ptp(likelihood, axis=0) > 0)
+    return _Rounds(loo.loo_i.values, doubtful, float(loo.good_k))
+
+
+def _held_out(file: FitFile, real: np.ndarray) -> _Rounds:
+    with np.errstate(divide="ignore"):
+        predictive = np.log(file.draws.mean(0))
+    values = np.where(file.actions >= 0, predictive, 0.0).sum(-1)[real]
+    _check_possible(file, values, real)
+    return _Rounds(values)
+
+
+def _stacking(values: np.ndarray) -> np.ndarray:
+    """Weights ``[M]`` of the mixture that predicts rounds ``[M, N]`` best."""
+    # A factor for all models changes no weight, and keeps densities of long rounds above 0.
+    shifted = values - values.max(0)
+    unused = {"se": np.nan, "p_loo": np.nan, "warning": False, "scale": "log"}
+    elpd: dict[str, Any] = {
+        f"{model:03}": az.ELPDData({"elpd_loo": row.sum(), "loo_i": xr.DataArray(row)} | unused)
+        for model, row in enumerate(shifted)
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        table = az.compare(elpd, method="stacking")
+    weights = np.clip(table["weight"].sort_index().to_numpy(float), 0, 1)
+    return weights / weights.sum()
+
+
+def _score(rounds: _Rounds, best: np.ndarray, actions: np.ndarray, chosen: np.ndarray) -> Score:
+    values, number = rounds.values[chosen], int(actions[chosen].sum())
+    differences = values - best[chosen]
+    return Score(
+        rounds=len(values),
+        actions=number,
+        elpd=float(values.sum()) / number,
+        elpd_se=_error(values, number),
+        difference=float(differences.sum()) / number,
+        difference_se=_error(differences, number),
+        doubtful=None if rounds.doubtful is None else int(rounds.doubtful[chosen].sum()),
+    )
+
+
+def _error(values: np.ndarray, number: int) -> float | None:
+    return float(np.sqrt(len(values) * values.var())) / number if len(values) > 1 else None

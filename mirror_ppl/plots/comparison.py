@@ -1,0 +1,118 @@
+"""How far human models are behind the best of them, person by person."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from mirror_ppl.evaluation.comparison import Comparison, Score
+from mirror_ppl.files import write_whole
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import BLACK, BLUE, GREY
+
+WRAP = 30
+"""Characters in a line of a model's name."""
+LINE, GAP, PERSON, MOST = 0.24, 0.2, 0.13, 3.0
+"""Inches: of a line of text, between models, from person to person, and of all people at most."""
+MEASURES = {"loo": "leave-one-out", "heldout": "held-out rounds"}
+
+
+def plot_comparison(comparison: Comparison) -> Picture:
+    """Draw each model's difference to the best one: of all rounds, and of each person's.
+
+    Models are rows, the best on top. Bars are one standard error to either side; where there is
+    but one round there is no bar.
+    """
+    models, best = comparison.models, comparison.models[0]
+    step = min(PERSON, MOST / len(comparison.people))
+    below = [0.7 * LINE + step * place for place in range(len(comparison.people))]
+    names = [
+        "\n".join(textwrap.wrap(model.label, WRAP, break_on_hyphens=False)) for model in models
+    ]
+    # Down the picture in inches: a model's own line, and below it one person after the other.
+    tops, down = [], 0.0
+    for model, name in zip(models, names, strict=True):
+        tops.append(down)
+        down += max(0 if model is best else below[-1] + step, LINE * (1 + name.count("\n"))) + GAP
+    figure = Picture(figsize=(9, down + 1.9), layout="constrained")
+    ax = figure.subplots()
+    ax.axvline(0, color=BLACK, lw=0.8)
+    ax.plot([0], [0], "s", color=BLACK, ms=8, mec="white", zorder=4)
+    for model, top in zip(models[1:], tops[1:], strict=True):
+        ax.axhline(top - GAP, color=GREY, lw=0.5, alpha=0.5)
+        for distance, score in zip(below, model.people, strict=True):
+            if score is not None:
+                _dot(ax, score, top + distance, GREY, "o", 4.5)
+        _dot(ax, model.total, top, BLUE, "D", 8)
+    ax.set_yticks(tops, names, parse_math=False)
+    if step == PERSON:  # else there is no room for their names
+        places = [top + distance for top in tops[1:] for distance in below]
+        shown = [person[:WRAP] for person in comparison.people] * (len(models) - 1)
+        ax.set_yticks(places, shown, minor=True, fontsize=7, parse_math=False)
+    ax.set_ylim(down - GAP / 2, -GAP - LINE / 2)
+    for model, top in zip(models, tops, strict=True):
+        _column(ax, f"{model.total.elpd:z.4f}", top)
+    _column(ax, "elpd", -GAP - LINE / 2, weight="bold")
+    ax.set_xlabel("difference to the best in nats an action; further left is worse")
+    ax.spines[["top", "right", "left"]].set_visible(False)
+    ax.tick_params(axis="y", which="both", length=0, pad=8)
+    figure.suptitle(
+        f"How much worse than the best model: {MEASURES[comparison.by]}, "
+        f"{best.total.rounds} rounds of {len(comparison.people)} people",
+        x=0.01,
+        ha="left",
+        fontsize=12,
+        fontweight="bold",
+    )
+    handles = [
+        Line2D([], [], ls="", marker="s", color=BLACK, ms=8),
+        Line2D([], [], ls="", marker="D", color=BLUE, ms=8),
+        Line2D([], [], ls="", marker="o", color=GREY, ms=4.5),
+        Line2D([], [], color=BLACK, lw=1.4),
+    ]
+    words = ["the best", "all rounds", "a person's rounds", "± standard error, paired"]
+    figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def save_comparison_picture(comparison: Comparison, path: Path) -> None:
+    """Write :func:`plot_comparison` in the format of the path's suffix, whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    figure = plot_comparison(comparison)
+    write_whole(path, lambda temporary: figure.savefig(temporary, dpi=120))
+
+
+def _dot(ax: Axes, score: Score, y: float, colour: str, marker: str, size: float) -> None:
+    ax.errorbar(
+        [score.difference],
+        [y],
+        xerr=score.difference_se,
+        fmt=marker,
+        color=colour,
+        ms=size,
+        mec="white",
+        mew=0.6,
+        elinewidth=size / 4,
+        zorder=3,
+    )
+
+
+def _column(ax: Axes, text: str, y: float, weight: str = "normal") -> None:
+    """A number to the right of the axes."""
+    ax.annotate(
+        text,
+        (1, y),
+        (62, 0),
+        xycoords=ax.get_yaxis_transform(),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontweight=weight,
+        annotation_clip=False,
+    )
