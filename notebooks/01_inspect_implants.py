@@ -32,7 +32,7 @@
 # | `sight_front_own`, `sight_front_other` | How many cells ahead do they see, by lane? |
 # | `sight_back_own`, `sight_back_other` | How many cells behind? |
 # | `assumes_clear` | Is a car that they never saw absent to them (1), or may it be there (0)? |
-# | `assumes_closing` | Does a car that they saw once come closer (1), or may it go either way (0)? |
+# | `assumes_closing` | Does a car that they saw once come closer (1), or maybe not (0)? |
 # | `consistency` | How strictly do they choose the better action? |
 # | `lapse` | How often do they act without regard to what they believe? |
 # | `residual_...` | What else sets their choices apart? (Weights of a small network.) |
