@@ -21,13 +21,7 @@ from example_person import (
 )
 
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
-from mirror_ppl.communication.minds import (
-    CourseBeliefs,
-    Looks,
-    StepwiseBeliefs,
-    beliefs_before,
-    telling,
-)
+from mirror_ppl.communication.minds import CourseBeliefs, Looks, Standing, StepwiseBeliefs
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import assumption_sites
@@ -402,9 +396,9 @@ def test_models_of_which_nothing_is_known_are_gone_through_again(generator):
         (Vouched, StepwiseBeliefs),
     ):
         assert model.stepwise is (kind is StepwiseBeliefs)
-        beliefs, own = beliefs_before(person(3, model(self_model())), past)
-        assert isinstance(beliefs, kind), model
-        assert own.shape == (1,)
+        standing = Standing.of(person(3, model(self_model())), past)
+        assert isinstance(standing.before, kind), model
+        assert standing.own.shape == (1,)
 
 
 @pytest.mark.parametrize("time", [0, 3])
@@ -413,8 +407,8 @@ def test_a_model_that_looks_back_further_believes_as_in_whole_rounds(generator, 
     model = Averaging(self_model())
     someone = Person(model, varied_draws(4, generator, model))
     tracks = Tracks(someone, past, 4, 40, generator)
-    beliefs, before = beliefs_before(someone, past)
-    parent = before[tracks.eye]
+    standing = Standing.of(someone, past)
+    beliefs, parent = standing.before, standing.own[tracks.eye]
     for step in range(4):
         beliefs, parent = beliefs.after(tracks.looks(step, parent))
     mine = beliefs.courses[parent]
@@ -450,15 +444,17 @@ def test_items_tell_what_somebody_does_not_know_yet():
     someone = person(2, front_own=[two, 0], front_other=[two, 0])
     past = begun(0, [2, 9, -9, -30], [-1, 1, 1, -1])
     allowed = CHANNELS.join(DOMAIN.communicable(past.now))
-    assert torch.equal(telling(someone, past, allowed), allowed)
+    assert torch.equal(Standing.of(someone, past).telling(allowed), allowed)
     told = CHANNELS.split(flags(verbal=["rear-left"]))
     past = past.then(told, 0, begun(0, [1, 10, -8, -30], [-1, 1, 1, -1]).now)
     # Whoever heard of a car knows where it is; of the others they may learn more.
     left = allowed & ~flags(visual=["rear-left"], verbal=["rear-left"])
-    assert torch.equal(telling(someone, past, allowed), left)
+    assert torch.equal(Standing.of(someone, past).telling(allowed), left)
     # The first knows the car in front, having seen it twice; the second does not.
     sighted = person(1, front_own=two, front_other=two)
     left &= ~flags(["front-left"], ["front-left"])
-    assert torch.equal(telling(sighted, past, allowed), left)
+    assert torch.equal(Standing.of(sighted, past).telling(allowed), left)
     # Of a model that looks back further nothing is known.
-    assert torch.equal(telling(person(model=Averaging(self_model())), past, allowed), allowed)
+    assert torch.equal(
+        Standing.of(person(model=Averaging(self_model())), past).telling(allowed), allowed
+    )

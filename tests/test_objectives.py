@@ -25,6 +25,7 @@ from mirror_ppl.communication import (
     Person,
     SelfModelWorld,
     SimulatorWorld,
+    Standing,
     every_message,
 )
 from mirror_ppl.domains.base import total_reward
@@ -185,7 +186,9 @@ def test_utilities_are_those_of_every_course(
     else:
         real, own = Learned(past, state), SelfModelWorld(self_model())
     expected, predicted = reference(someone, past, real, candidates, horizon, discount)
-    value = ExpectedUtility(own, horizon, discount, branch=0).at(someone, past, 15 - time, 0)
+    value = ExpectedUtility(own, horizon, discount, branch=0).at(
+        Standing.of(someone, past), 15 - time, 0
+    )
     valued = value(candidates)
     torch.testing.assert_close(valued.utility, expected, rtol=0, atol=1e-4)
     torch.testing.assert_close(valued.actions, predicted, rtol=0, atol=1e-4)
@@ -217,7 +220,9 @@ def test_what_can_no_longer_be_told_at_its_step_changes_nothing_but_its_cost(
     past = begun(0, positions, speeds)
     someone = person(3, front_own=[0, 2, 4], assumes_clear=clear, assumes_closing=closing)
     told, other = flags(**{name: [car]}), flags(verbal=["rear-left"])
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 3, 0.9, branch=0).at(someone, past, 15, 0)
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 3, 0.9, branch=0).at(
+        Standing.of(someone, past), 15, 0
+    )
     candidates = [plan(None, None), plan(None, told), plan(told, None), plan(None, told | other)]
     valued = value(torch.stack([*candidates, plan(None, other)]))
     costs = CHANNELS.cost(torch.stack([told, told | other, other])) * 0.9
@@ -234,7 +239,7 @@ def test_what_can_no_longer_be_told_at_its_step_changes_nothing_but_its_cost(
 def test_silence_after_a_message_is_the_message_alone(generator):
     past, _ = random_round(2, generator)
     someone = Person(human(), varied_draws(4, generator))
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4).at(someone, past, 13, 0)
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4).at(Standing.of(someone, past), 13, 0)
     told = flags(visual=["front-left"], verbal=["rear-right"])
     short, long = value(plan(told)[None]), value(plan(told, None, None)[None])
     torch.testing.assert_close(short.utility, long.utility)
@@ -255,7 +260,9 @@ def test_keeping_some_courses_by_chance_is_right_on_average(seed, branch):
 
     def value(number, branch, seed):
         someone = person(number, consistency=0.3, lapse=0.1)
-        return ExpectedUtility(SimulatorWorld(DOMAIN), 4, 0.9, branch).at(someone, past, 15, seed)
+        return ExpectedUtility(SimulatorWorld(DOMAIN), 4, 0.9, branch).at(
+            Standing.of(someone, past), 15, seed
+        )
 
     exact, valued = value(1, 0, 0)(candidates), value(number, branch, seed)(candidates)
     gain, right = valued.utility - valued.utility[:1], exact.utility - exact.utility[:1]
@@ -276,7 +283,7 @@ def test_at_branch_one_each_draw_follows_a_single_course():
     rewards = [torch.zeros(1, 2), torch.zeros(1, 4), torch.arange(4.0).repeat_interleave(2)[None]]
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(200, consistency=0.3)
-    value = ExpectedUtility(HandSet(rewards), 3, branch=1).at(someone, past, 15, 0)
+    value = ExpectedUtility(HandSet(rewards), 3, branch=1).at(Standing.of(someone, past), 15, 0)
     followed = value(plan(None)[None]).utility[0]
     torch.testing.assert_close(followed, followed.round(), rtol=0, atol=1e-5)
     assert set(followed.round().long().tolist()) == {0, 1, 2, 3}
@@ -290,7 +297,9 @@ def test_all_candidates_have_the_same_luck():
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(20, consistency=0.0)
     candidates = every_message(torch.ones(8, dtype=torch.bool))[:, None]
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0.4).at(someone, past, 15, 0)
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0.4).at(
+        Standing.of(someone, past), 15, 0
+    )
     utility = value(candidates).utility
     assert utility[0].std() > 0.1
     gain = utility - utility[:1]
@@ -306,9 +315,9 @@ def test_steps_after_the_end_of_the_round_do_not_count(generator):
     someone = Person(human(), varied_draws(4, generator))
     candidates = candidates_of(past, generator, 4)
     world = SimulatorWorld(DOMAIN)
-    cut = ExpectedUtility(world, 6, 0.9, 0).at(someone, past, 2, 0)(candidates)
-    short = ExpectedUtility(world, 2, 0.9, 0).at(someone, past, 11, 0)(candidates)
-    longer = ExpectedUtility(world, 3, 0.9, 0).at(someone, past, 11, 0)(candidates)
+    cut = ExpectedUtility(world, 6, 0.9, 0).at(Standing.of(someone, past), 2, 0)(candidates)
+    short = ExpectedUtility(world, 2, 0.9, 0).at(Standing.of(someone, past), 11, 0)(candidates)
+    longer = ExpectedUtility(world, 3, 0.9, 0).at(Standing.of(someone, past), 11, 0)(candidates)
     assert cut.actions.shape == (5, 2, ACTIONS)
     torch.testing.assert_close(cut.utility, short.utility)
     torch.testing.assert_close(cut.actions, short.actions)
@@ -325,7 +334,9 @@ def test_messages_are_charged_at_the_step_at_which_they_are_sent(discount):
     three = flags(verbal=["front-left", "rear-left", "rear-right"])
     silence = plan(None, None, None)
     candidates = torch.stack([silence, plan(two, None, None), plan(None, two, three)])
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 5, discount).at(someone, past, 15, 0)
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 5, discount).at(
+        Standing.of(someone, past), 15, 0
+    )
     gain = value(candidates).utility - value(candidates).utility[:1]
     expected = torch.tensor([0, -0.04, -(0.04 * discount + 0.27 * discount**2)])
     torch.testing.assert_close(gain, expected[:, None].expand(3, 2), rtol=0, atol=1e-5)
@@ -335,7 +346,7 @@ def test_messages_are_charged_at_the_step_at_which_they_are_sent(discount):
 def test_rewards_are_discounted_by_step(discount, total):
     past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
     world = HandSet([torch.ones(1, ACTIONS ** (h + 1)) for h in range(4)])
-    value = ExpectedUtility(world, 4, discount, branch=0).at(person(), past, 15, 0)
+    value = ExpectedUtility(world, 4, discount, branch=0).at(Standing.of(person(), past), 15, 0)
     assert value(plan(None)[None]).utility.item() == pytest.approx(total, abs=1e-5)
 
 
@@ -343,7 +354,7 @@ def test_draws_are_dealt_out_over_draws_of_the_world():
     past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
     own = torch.tensor([1.0, 10.0, 100.0])[:, None]
     world = HandSet([own.expand(3, ACTIONS ** (h + 1)) for h in range(2)])
-    value = ExpectedUtility(world, 2, branch=0).at(person(7), past, 15, 0)
+    value = ExpectedUtility(world, 2, branch=0).at(Standing.of(person(7), past), 15, 0)
     expected = torch.tensor([[2.0, 20, 200, 2, 20, 200, 2]])
     torch.testing.assert_close(value(plan(None)[None]).utility, expected)
 
@@ -393,7 +404,7 @@ def test_divergence_is_that_of_two_gaussians(generator, time, measure, weight):
     past, _ = random_round(time, generator)
     someone = Person(human(), varied_draws(4, generator))
     candidates = candidates_of(past, generator, 2)
-    valued = Divergence(weight, measure).at(someone, past, 5, 0)(candidates)
+    valued = Divergence(weight, measure).at(Standing.of(someone, past), 5, 0)(candidates)
     assert valued.actions is None
     mine = robot(past)
     for c, candidate in enumerate(candidates):
@@ -415,7 +426,7 @@ def test_models_without_a_density_are_refused(generator):
     past, _ = random_round(1, generator)
     model = Averaging(self_model())
     with pytest.raises(HumanModelError) as error:
-        Divergence().at(Person(model, implants(2, model)), past, 5, 0)
+        Divergence().at(Standing.of(Person(model, implants(2, model)), past), 5, 0)
     assert str(error.value) == (
         "Averaging is not stepwise, and its beliefs have no density to compare; see "
         "HumanModel.stepwise"

@@ -7,7 +7,7 @@ Three layers: the person (`minds`, posterior draws of a human model carried thro
 
 from mirror_ppl.communication.communicator import Communicator, Decision, Gain
 from mirror_ppl.communication.messages import Channels, Message, every_message
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.minds import Person, Standing
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective, Valued
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, CrossEntropy, Exhaustive, Patient, Search
@@ -32,6 +32,7 @@ __all__ = [
     "Search",
     "SelfModelWorld",
     "SimulatorWorld",
+    "Standing",
     "Valued",
     "World",
     "every_message",

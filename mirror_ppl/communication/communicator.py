@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, Message
-from mirror_ppl.communication.minds import Person, telling
+from mirror_ppl.communication.minds import Person, Standing
 from mirror_ppl.communication.objectives import Objective, Value, Valued
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
@@ -250,21 +250,27 @@ class Communicator:
         now = past.now
         allowed = channels.join(domain.communicable(now))
         steps_left = domain.horizon - past.time
-        if steps_left > 0 and allowed.any():
-            allowed = telling(self.person, past, allowed)
         if steps_left < 1 or not allowed.any():
-            silence = torch.zeros_like(allowed)
-            return Decision(
-                channels.message(silence), silence, Gain(0.0, 0.0, 0.0), domain, now, None, 0
-            )
+            return self._silence(now, allowed)
+        standing = Standing.of(self.person, past)
+        allowed = standing.telling(allowed)
+        if not allowed.any():
+            return self._silence(now, allowed)
         seed = self.seed * (domain.horizon + 1) + past.time
-        value = self.objective.at(self.person, past, steps_left, seed)
+        value = self.objective.at(standing, steps_left, seed)
         found = self.search(value, allowed, seed)
         chosen = choose(found.valued, self.sure)
         found, chosen = slimmed(value, found, chosen, self.sure)
         flags = found.candidates[chosen, 0]
         gain = gain_over_silence(found.valued, chosen)
         return Decision(channels.message(flags), flags, gain, domain, now, found, chosen)
+
+    def _silence(self, now: Observation, allowed: Tensor) -> Decision:
+        """Where there is nothing to choose."""
+        none = torch.zeros_like(allowed)
+        domain = self.person.human.domain
+        message = Channels(domain).message(none)
+        return Decision(message, none, Gain(0.0, 0.0, 0.0), domain, now, None, 0)
 
 
 def choose(valued: Valued, sure: float) -> int:

@@ -140,42 +140,66 @@ class Beliefs(Protocol):
         ...
 
 
-def beliefs_before(person: Person, past: RoundSoFar) -> tuple[Beliefs, Tensor]:
-    """What may be believed before a look at the present step, and each eye's belief ``[U]``."""
-    if person.human.stepwise:
-        return StepwiseBeliefs.before(person, past)
-    return CourseBeliefs.before(person, past)
+@dataclass(frozen=True)
+class Standing:
+    """A person in the middle of a round, about to look at the present step.
 
-
-@torch.no_grad()
-def telling(person: Person, past: RoundSoFar, allowed: Tensor) -> Tensor:
-    """Which of the allowed items ``[N]`` tell anything now, in at least one posterior draw.
-
-    What everybody sees or knows already leads to the same beliefs if it is told besides, so no
-    message with it is worth its cost. Items tell something each by itself or not at all. Of models
-    that are not stepwise nothing is known: what is told now may count later.
+    Attributes:
+        person: posterior draws of the human model.
+        past: the round so far.
+        before: what may be believed before that look.
+        own: which of these beliefs each eye has, ``[U]``.
     """
-    if not person.human.stepwise:
-        return allowed
-    places = allowed.nonzero().squeeze(-1)
-    eyes, number = person.eye_count, len(places) + 1
-    messages = allowed.new_zeros(number, len(allowed))
-    messages[torch.arange(1, number), places] = True
-    before, own = beliefs_before(person, past)
-    eye = torch.arange(eyes, device=allowed.device).repeat(number)
-    last = past.actions[-1] if past.time else len(person.human.domain.actions)
-    looks = Looks(
-        parent=own[eye],
-        eye=eye,
-        action=torch.full_like(eye, int(last)),
-        row=torch.zeros_like(eye),
-        observation={name: value[None] for name, value in past.now.items()},
-        told=Channels(person.human.domain).split(messages.repeat_interleave(eyes, 0)),
-    )
-    index = before.after(looks)[1].view(number, eyes)
-    result = torch.zeros_like(allowed)
-    result[places] = (index[1:] != index[:1]).any(1)
-    return result
+
+    person: Person
+    past: RoundSoFar
+    before: Beliefs
+    own: Tensor
+
+    @classmethod
+    def of(cls, person: Person, past: RoundSoFar) -> Standing:
+        """The person at this point of a round."""
+        kind = StepwiseBeliefs if person.human.stepwise else CourseBeliefs
+        return cls(person, past, *kind.before(person, past))
+
+    @property
+    def last_action(self) -> int:
+        """What was done last; the number of actions at the start of a round."""
+        past = self.past
+        return int(past.actions[-1]) if past.time else len(self.person.human.domain.actions)
+
+    def told(self, messages: Tensor) -> tuple[Beliefs, Tensor]:
+        """Beliefs after messages ``[M, N]`` for now, and which of them each eye has ``[M, U]``."""
+        eyes, number = self.person.eye_count, len(messages)
+        eye = torch.arange(eyes, device=messages.device).repeat(number)
+        looks = Looks(
+            parent=self.own[eye],
+            eye=eye,
+            action=torch.full_like(eye, self.last_action),
+            row=torch.zeros_like(eye),
+            observation={name: value[None] for name, value in self.past.now.items()},
+            told=Channels(self.person.human.domain).split(messages.repeat_interleave(eyes, 0)),
+        )
+        beliefs, index = self.before.after(looks)
+        return beliefs, index.view(number, eyes)
+
+    @torch.no_grad()
+    def telling(self, allowed: Tensor) -> Tensor:
+        """Which of the allowed items ``[N]`` tell anything now, in at least one posterior draw.
+
+        What everybody sees or knows already leads to the same beliefs if it is told besides, so no
+        message with it is worth its cost. Items tell something each by itself or not at all. Of
+        models that are not stepwise nothing is known: what is told now may count later.
+        """
+        if not self.person.human.stepwise:
+            return allowed
+        places = allowed.nonzero().squeeze(-1)
+        messages = allowed.new_zeros(len(places) + 1, len(allowed))
+        messages[torch.arange(1, len(messages)), places] = True
+        _, index = self.told(messages)
+        result = torch.zeros_like(allowed)
+        result[places] = (index[1:] != index[:1]).any(1)
+        return result
 
 
 @dataclass(frozen=True)
@@ -199,7 +223,7 @@ class StepwiseBeliefs:
 
     @classmethod
     def before(cls, person: Person, past: RoundSoFar) -> tuple[StepwiseBeliefs, Tensor]:
-        """See :func:`beliefs_before`; eyes that saw the same so far share a belief."""
+        """Beliefs before the present step; eyes that saw the same so far share one."""
         human, eyes = person.human, torch.arange(person.eye_count, device=person.eye.device)
         knowledge = human.domain.nothing_known(1, device=eyes.device)
         if past.time == 0:
@@ -262,7 +286,7 @@ class CourseBeliefs:
 
     @classmethod
     def before(cls, person: Person, past: RoundSoFar) -> tuple[CourseBeliefs, Tensor]:
-        """See :func:`beliefs_before`."""
+        """Beliefs before the present step, of each eye its own."""
         observation, told, actions = _history(past, person.eye_count)
         nothing = next(person.human.parameters()).new_zeros(person.eye_count, 0, 0)
         beliefs = cls(person, observation, told, actions[:, : max(past.time - 1, 0)], nothing)

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels
-from mirror_ppl.communication.minds import Beliefs, Looks, Person, beliefs_before
-from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.communication.minds import Looks, Standing
 from mirror_ppl.communication.worlds import World, robot_belief
 from mirror_ppl.errors import HumanModelError
 
@@ -42,12 +41,11 @@ Value = Callable[[Tensor], Valued]
 class Objective(Protocol):
     """What a communicator wants."""
 
-    def at(self, person: Person, past: RoundSoFar, steps_left: int, seed: int) -> Value:
+    def at(self, standing: Standing, steps_left: int, seed: int) -> Value:
         """What candidates are worth at this point of a round.
 
         Args:
-            person: posterior draws of the human model.
-            past: the round so far.
+            standing: the person at this point.
             steps_left: how many actions are left, at least 1.
             seed: of the random numbers that all candidates share.
         """
@@ -84,8 +82,9 @@ class ExpectedUtility:
         if not 0 <= self.branch <= 1:
             raise ValueError(f"branch must be from 0 to 1, not {self.branch}")
 
-    def at(self, person: Person, past: RoundSoFar, steps_left: int, seed: int) -> Value:
+    def at(self, standing: Standing, steps_left: int, seed: int) -> Value:
         """See :class:`Objective`."""
+        person, past = standing.person, standing.past
         horizon = min(self.horizon, steps_left)
         device = past.actions.device
         generator = torch.Generator(device).manual_seed(seed)
@@ -95,13 +94,12 @@ class ExpectedUtility:
             torch.rand(person.number, number**step, generator=generator, device=device)
             for step in range(horizon)
         ]
-        before = beliefs_before(person, past)
         channels = Channels(person.human.domain)
         discounts = self.discount ** torch.arange(horizon, device=device)
 
         @torch.no_grad()
         def value(candidates: Tensor) -> Valued:
-            tree = _Tree(person, past, candidates, self.world.draws, before)
+            tree = _Tree(standing, candidates, self.world.draws)
             count = len(candidates)
             utility = torch.zeros(count * person.number, device=device)
             predicted = torch.zeros(count, horizon, number, device=device)
@@ -138,16 +136,9 @@ class _Tree:
         beliefs: of the last step that was looked at.
     """
 
-    def __init__(
-        self,
-        person: Person,
-        past: RoundSoFar,
-        candidates: Tensor,
-        worlds: int,
-        before: tuple[Beliefs, Tensor],
-    ) -> None:
+    def __init__(self, standing: Standing, candidates: Tensor, worlds: int) -> None:
         device = candidates.device
-        self.person = person
+        person = self.person = standing.person
         self.worlds = worlds
         self.actions = len(person.human.domain.actions)
         count = len(candidates)
@@ -155,10 +146,9 @@ class _Tree:
         self.candidate = torch.arange(count, device=device).repeat(person.number)
         self.path = torch.zeros_like(self.draw)
         self.weight = torch.ones(len(self.draw), device=device)
-        self.beliefs, belief = before
-        self.belief = belief[person.eye[self.draw]]
-        last = past.actions[-1] if past.time else self.actions
-        self.last = torch.full_like(self.draw, int(last))
+        self.beliefs = standing.before
+        self.belief = standing.own[person.eye[self.draw]]
+        self.last = torch.full_like(self.draw, standing.last_action)
         self.paths = 1
 
     def draw_of_world(self) -> Tensor:
@@ -251,40 +241,28 @@ class Divergence:
         if not self.weight > 0:
             raise ValueError(f"weight must be positive, not {self.weight}")
 
-    def at(self, person: Person, past: RoundSoFar, steps_left: int, seed: int) -> Value:
+    def at(self, standing: Standing, steps_left: int, seed: int) -> Value:
         """See :class:`Objective`; steps left and seed do not matter.
 
         Raises:
             HumanModelError: the human model is not stepwise, so its belief has no density.
         """
+        person = standing.person
         if not person.human.stepwise:
             raise HumanModelError(
                 f"{type(person.human).__name__} is not stepwise, and its beliefs have no density "
                 "to compare; see HumanModel.stepwise"
             )
         channels = Channels(person.human.domain)
-        robot = robot_belief(person.human.self_model, past)
-        before, own = beliefs_before(person, past)
-        now = {name: value[None] for name, value in past.now.items()}
-        last = int(past.actions[-1]) if past.time else len(person.human.domain.actions)
+        robot = robot_belief(person.human.self_model, standing.past)
 
         @torch.no_grad()
         def value(candidates: Tensor) -> Valued:
-            eyes = person.eye_count
-            told = candidates[:, 0].repeat_interleave(eyes, 0)
-            eye = torch.arange(eyes, device=told.device).repeat(len(candidates))
-            looks = Looks(
-                parent=own[eye],
-                eye=eye,
-                action=torch.full_like(eye, last),
-                row=torch.zeros_like(eye),
-                observation=now,
-                told=channels.split(told),
-            )
-            beliefs, index = before.after(looks)
+            message = candidates[:, 0]
+            beliefs, index = standing.told(message)
             apart = self._apart(robot, beliefs.state)[index]  # pyright: ignore
-            utility = -self.weight * apart.view(len(candidates), eyes)[:, person.eye]
-            return Valued(utility - channels.cost(candidates[:, 0])[:, None], None)
+            utility = -self.weight * apart[:, person.eye]
+            return Valued(utility - channels.cost(message)[:, None], None)
 
         return value
 
