@@ -13,7 +13,6 @@ from mirror_ppl.console import Progress, run
 from mirror_ppl.errors import (
     HumanModelError,
     OptionError,
-    OutputError,
     PosteriorError,
     UnknownNameError,
 )
@@ -199,21 +198,15 @@ def main(options: Options) -> None:
 
 
 def _outputs(options: Options) -> list[Path]:
-    """Files to write, none of which is something else that was named."""
-    taken = {options.posterior.resolve(): "--posterior"}
-    if options.self_model is not None:
-        taken[options.self_model.resolve()] = "--self-model"
-    if options.human_model is not None:
-        taken[Path(options.human_model.rpartition(":")[0]).resolve()] = "--human-model"
-    for option, path in (("--json", options.json), ("--log", options.log)):
-        if path is None:
-            continue
-        if path.resolve() in taken:
-            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
-        if path.exists() and not path.is_file():
-            raise OutputError(f"cannot write {path}: it is not a regular file")
-        taken[path.resolve()] = option
-    return [path for path in (options.json, options.log) if path is not None]
+    from mirror_ppl.files import require_files_of_their_own
+
+    source = options.human_model
+    inputs = {
+        "--posterior": [options.posterior],
+        "--self-model": [options.self_model],
+        "--human-model": [None if source is None else Path(source.rpartition(":")[0])],
+    }
+    return require_files_of_their_own({"--json": options.json, "--log": options.log}, inputs)
 
 
 def _people(options: Options):

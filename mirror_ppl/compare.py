@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from mirror_ppl.console import run
-from mirror_ppl.errors import OptionError, OutputError
+from mirror_ppl.errors import OptionError
 
 if TYPE_CHECKING:
     from mirror_ppl.evaluation.comparison import Comparison
@@ -84,21 +84,11 @@ def main(options: Options) -> None:
 
 
 def _outputs(options: Options) -> list[Path]:
-    """Files to write, none of which is something else that was named."""
     from mirror_ppl.evaluation.comparison import posterior_path
+    from mirror_ppl.files import require_files_of_their_own
 
-    taken = {posterior_path(path).resolve(): "a posterior" for path in options.posteriors}
-    outputs = []
-    for option, path in (("--json", options.json), ("--figure", options.figure)):
-        if path is None:
-            continue
-        if path.resolve() in taken:
-            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
-        if path.exists() and not path.is_file():
-            raise OutputError(f"cannot write {path}: it is not a regular file")
-        taken[path.resolve()] = option
-        outputs.append(path)
-    return outputs
+    inputs = {"a posterior": [posterior_path(path) for path in options.posteriors]}
+    return require_files_of_their_own({"--json": options.json, "--figure": options.figure}, inputs)
 
 
 def _show(comparison: Comparison) -> None:

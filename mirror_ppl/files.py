@@ -3,7 +3,7 @@
 import errno
 import os
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -74,6 +74,35 @@ def prepare_output_folder(path: str | os.PathLike[str]) -> Path:
         _remove_folders(made)
         raise OutputError(f"cannot write in the folder {folder}: {_reason(error)}") from error
     return folder
+
+
+def require_files_of_their_own(
+    outputs: Mapping[str, Path | None], inputs: Mapping[str, Sequence[Path | None]]
+) -> list[Path]:
+    """Make sure that files to write are neither something else that was named nor folders.
+
+    Args:
+        outputs: files to write, by the option that names them; ``None`` where none does.
+        inputs: files to read, by what names them.
+
+    Returns:
+        The files to write.
+
+    Raises:
+        OutputError: one is named twice, or is there and is not a regular file.
+    """
+    taken = {path.resolve(): option for option, paths in inputs.items() for path in paths if path}
+    result = []
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
+        if path.exists() and not path.is_file():
+            raise OutputError(f"cannot write {path}: it is not a regular file")
+        taken[path.resolve()] = option
+        result.append(path)
+    return result
 
 
 def _temporary_beside(target: Path) -> Path:
