@@ -13,7 +13,7 @@ from mirror_ppl.communication import (
     search,
 )
 from mirror_ppl.communication.communicator import choose
-from mirror_ppl.communication.search import CHUNK, in_chunks
+from mirror_ppl.communication.search import CHUNK, in_chunks, joined
 from mirror_ppl.cross_entropy import CrossEntropyOptions
 
 NUMBER = 8
@@ -328,3 +328,20 @@ def test_searches_find_the_same_in_chunks(monkeypatch, seed, search_):
 def test_objectives_need_not_look_at_actions(search_):
     value = HandSet(nearness(plan({1}, {2})), actions=False)
     assert search_(value, ALL, 0).valued.actions is None
+
+
+def test_only_what_is_new_is_valued_and_each_is_told_where_it_is(generator):
+    value, allowed = HandSet(table(generator)), only(0, 3)
+    found = Exhaustive()(value, allowed, 0)
+    both, other = only(0, 3)[None], only(5)[None]
+    more = torch.stack([both, other, found.candidates[0], only(6)[None], other])
+    value.asked.clear()
+    longer, place = joined(found, more, value)
+    assert value.asked == [2]
+    assert len(longer.candidates) == len(found.candidates) + 2
+    assert torch.equal(longer.candidates[: len(found.candidates)], found.candidates)
+    assert torch.equal(longer.candidates[place], more)
+    check(longer, value, only(0, 3, 5, 6))
+    same, place = joined(found, found.candidates[[2, 1]], value)
+    assert same is found
+    assert place.tolist() == [2, 1]

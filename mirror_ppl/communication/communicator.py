@@ -300,13 +300,12 @@ def slimmed(value: Value, found: Found, chosen: int, sure: float) -> tuple[Found
             return found, chosen
         less = plan.repeat(len(places), 1, 1)
         less[torch.arange(len(places)), 0, places] = False
-        first = len(found.candidates)
-        found = joined(found, less, value)
-        least = _least(found.valued.utility[chosen] - found.valued.utility[first:], sure)
+        found, place = joined(found, less, value)
+        least = _least(found.valued.utility[chosen] - found.valued.utility[place], sure)
         worst = int(least.argmin())
         if float(least[worst]) > TIE:
             return found, chosen
-        chosen = first + worst
+        chosen = int(place[worst])
 
 
 def _least(gain: Tensor, sure: float) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 from mirror_ppl.communication.messages import every_message
 from mirror_ppl.communication.objectives import Value, Valued
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
+from mirror_ppl.distinct import distinct_rows
 
 MOST_CANDIDATES = 4096
 """How many candidates are valued one by one; beyond that they are searched."""
@@ -89,7 +90,7 @@ class Patient:
                 plan[0, item], plan[1, item] = True, False
                 plans.append(plan)
         now = torch.nn.functional.pad(first.candidates, [0, 0, 0, self.steps - 1])
-        return joined(Found(now, first.valued), torch.stack(plans), value)
+        return joined(Found(now, first.valued), torch.stack(plans), value)[0]
 
 
 @dataclass(frozen=True)
@@ -158,16 +159,26 @@ class Automatic:
         return CrossEntropy(self.steps)(value, allowed, seed)
 
 
-def joined(found: Found, more: Tensor, value: Value) -> Found:
-    """What was found, and more candidates ``[C, L, N]`` with their values after it."""
-    valued = in_chunks(value, more)
+def joined(found: Found, more: Tensor, value: Value) -> tuple[Found, Tensor]:
+    """What was found with more candidates ``[C, L, N]`` after it, and where each of these is.
+
+    Those that are there already are not valued again.
+    """
+    known = len(found.candidates)
+    first, which = distinct_rows(torch.cat([found.candidates, more]).flatten(1).long())
+    # The first of equal rows: below ``known`` where a candidate is not new.
+    place = first[which[known:]]
+    new, order = place[place >= known].unique(return_inverse=True)
+    if not len(new):
+        return found, place
+    place[place >= known] = known + order
+    added = more[new - known]
+    valued = in_chunks(value, added)
     actions = None
     if found.valued.actions is not None and valued.actions is not None:
         actions = torch.cat([found.valued.actions, valued.actions])
-    return Found(
-        torch.cat([found.candidates, more]),
-        Valued(torch.cat([found.valued.utility, valued.utility]), actions),
-    )
+    utility = torch.cat([found.valued.utility, valued.utility])
+    return Found(torch.cat([found.candidates, added]), Valued(utility, actions)), place
 
 
 def in_chunks(value: Value, candidates: Tensor) -> Valued:
