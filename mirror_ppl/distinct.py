@@ -6,13 +6,15 @@ import torch
 from torch import Tensor
 
 
-def random_keys(number: int, device: torch.device) -> Tensor:
+def random_keys(number: int, device: torch.device, kind: int = 0) -> Tensor:
     """Random 62-bit keys ``[number]``: sums of different sets of them differ.
+
+    Sums of sums need keys of two kinds; with one kind, rows and columns could be exchanged.
 
     But for a chance of about one in 2**62, if what they are multiplied with is small, as masks
     and indices are. Sorting numbers is a hundred times quicker than sorting rows.
     """
-    keys = torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(0))
+    keys = torch.randint(2**62, (number,), generator=torch.Generator().manual_seed(kind))
     return keys.to(device)
 
 

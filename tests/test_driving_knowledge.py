@@ -390,7 +390,7 @@ def test_a_model_that_overrides_sees_is_stepwise_and_notices_what_it_misses(gene
     states, messages = random_rounds(40, generator, rate=0.1)
     observation, heard = stacked(states, messages)
     index, _ = random_reaches(40, generator)
-    found = model.perceive(implants(index), observation, heard).rows()
+    found = model.perceive(implants(index), observation, heard).numbers()
     alike = index[:, [SIGHTS.index(name.replace("back", "front")) for name in SIGHTS]]
-    assert torch.equal(found, human().perceive(implants(alike), observation, heard).rows())
-    assert not torch.equal(found, human().perceive(implants(index), observation, heard).rows())
+    assert torch.equal(found, human().perceive(implants(alike), observation, heard).numbers())
+    assert not torch.equal(found, human().perceive(implants(index), observation, heard).numbers())

@@ -129,7 +129,7 @@ def test_many_people_perceive_at_once_as_they_do_alone(human, recordings):
     for row in range(7):
         own = {site: value[row : row + 1] for site, value in implants.items()}
         alone = human.perceive(own, observation, told)
-        assert torch.equal(together.rows()[row], alone.rows()[0])
+        assert torch.equal(together.numbers()[row], alone.numbers()[0])
         for name in told:
             assert torch.equal(together.visible[name][row], alone.visible[name][0])
             assert torch.equal(together.taken[name][row], alone.taken[name][0])
@@ -219,28 +219,28 @@ def test_each_car_is_taken_as_what_is_known_of_it_allows(human):
         ]
 
 
-def test_rows_of_views_are_equal_where_views_are(human, recordings):
+def test_numbers_of_views_are_equal_where_views_are(human, recordings):
     observation, _ = first_round(recordings)
     told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
     view = human.perceive(sight(1, 1, front_own=3, back_other=2), observation, told)
-    rows = view.rows()
+    numbers = view.numbers()
     for name, mask in view.taken.items():
         assert mask.any() and not mask.all()
         value = view.imagined[name]
         # Of what is not taken, and of the ego, it does not matter what was imagined.
         other = torch.where(mask[..., None], value, value + 1)
         imagined = view.imagined | {name: other, "ego": 1 - view.imagined["ego"]}
-        assert torch.equal(View(view.visible, view.taken, imagined).rows(), rows)
+        assert torch.equal(View(view.visible, view.taken, imagined).numbers(), numbers)
         for feature in range(value.shape[-1]):
             other = value.clone()
             other[..., feature] += 0.5
             changed = View(view.visible, view.taken, view.imagined | {name: other})
-            assert torch.equal((changed.rows() != rows).any(-1), mask.any(-1))
+            assert torch.equal(changed.numbers() != numbers, mask.any(-1))
     for group in ("visible", "taken"):
         masks = getattr(view, group)
         for name, mask in masks.items():
             changed = replace(view, **{group: {**masks, name: ~mask}})
-            assert (changed.rows() != rows).any(-1).all()
+            assert (changed.numbers() != numbers).all()
 
 
 def test_steps_by_hand_are_those_of_the_round(human, recordings):
@@ -250,13 +250,13 @@ def test_steps_by_hand_are_those_of_the_round(human, recordings):
     told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
     view = human.perceive(implants, observation, told)
     assert torch.equal(view.imagined["ego"], observation["ego"])
-    whole = view.rows()
+    whole = view.numbers()
     knowledge = DRIVING.nothing_known(1)
     for step in range(STEPS):
         now = {name: value[:, step] for name, value in observation.items()}
         heard = {name: mask[:, step] for name, mask in told.items()}
         view, knowledge = human.look(implants, knowledge, now, heard)
-        assert torch.equal(view.rows(), whole[:, step])
+        assert torch.equal(view.numbers(), whole[:, step])
 
 
 def test_a_model_may_say_what_is_visible_and_no_more(human, recordings):

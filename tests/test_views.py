@@ -12,11 +12,11 @@ from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.courses import _beginnings
 from mirror_ppl.inference.experience import roll_out
 from mirror_ppl.inference.views import (
     MAX_COMBINATIONS,
     Screening,
-    _prefixes,
     build_view_table,
     combination_scores,
     restricted,
@@ -227,14 +227,12 @@ def test_values_of_shared_beginnings_are_those_of_the_belief(self_model, recordi
     assert close[real].all()
 
 
-def test_prefixes_number_beginnings():
-    bits = torch.randint(2, (40, 6, 2))
+def test_beginnings_are_numbered():
+    bits = torch.randint(4, (40, 6))
     bits[:5] = 0
     bits[5:10, 3:] = 0
-    numbers = _prefixes(bits)
-    keys = [
-        tuple(bits[row, : step + 1].flatten().tolist()) for row in range(40) for step in range(6)
-    ]
+    numbers = _beginnings(bits)
+    keys = [tuple(bits[row, : step + 1].tolist()) for row in range(40) for step in range(6)]
     distinct = {key: number for key, number in zip(keys, numbers.flatten().tolist(), strict=True)}
     assert [distinct[key] for key in keys] == numbers.flatten().tolist()
     assert len(set(distinct.values())) == len(distinct)

@@ -238,7 +238,7 @@ class StepwiseBeliefs:
             views.append(view)
         view = View.stack(views)
         known = torch.cat(_whole_numbers(knowledge), -1)
-        first, which = distinct_rows(torch.cat([view.rows().flatten(1), known], -1))
+        first, which = distinct_rows(torch.cat([view.numbers(), known], -1))
         observation, _, actions = _history(past, len(first))
         mean = human.believe(view.map(lambda part: part[first]), observation, actions)[:, -1]
         state = Gaussian(mean, torch.ones_like(mean))
@@ -250,7 +250,7 @@ class StepwiseBeliefs:
         seen = {name: value[looks.row] for name, value in looks.observation.items()}
         before = _rows(self.knowledge, looks.parent)
         view, knowledge = self.person.look(looks.eye, before, seen, looks.told)
-        told_by, which = distinct_rows(torch.cat([looks.row[:, None], view.rows()], -1))
+        told_by, which = distinct_rows(torch.stack([looks.row, view.numbers()], -1))
         rows = looks.row[told_by]
         evidence = human.evidence(
             view.map(lambda part: part[told_by]),

@@ -17,16 +17,15 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.distinct import distinct_rows, random_keys
+from mirror_ppl.distinct import distinct_rows
 from mirror_ppl.domains import Observation
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.courses import beliefs_and_values
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
 
 MAX_COMBINATIONS = 100_000
-CHUNK = 4096
-"""Views whose beliefs are computed at once; bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -228,22 +227,14 @@ def _views(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Distinct views of one round, and which of them each combination has."""
     view = view.map(lambda part: part.expand(combinations, *part.shape[1:]))
-    bits = view.rows() * real[:, None]
-    first, inverse = distinct_rows(bits.flatten(1))
-    beliefs = []
-    for rows in first.split(CHUNK):
-        some = view.map(lambda part: part[rows])  # noqa: B023 - used at once
-        beliefs.append(human.believe(some, observation, actions))
-    belief = torch.cat(beliefs)
-    # Views that agree up to a step agree in the belief at that step.
-    node, same = distinct_rows(_prefixes(bits[first]).flatten()[:, None])
-    values = torch.cat(
-        [human.self_model.action_values(part) for part in belief.flatten(0, 1)[node].split(CHUNK)]
-    )
-    values = values[same].unflatten(0, belief.shape[:2])
+    numbers = view.numbers() * real
+    first, inverse = distinct_rows(numbers)
+    some = view.map(lambda part: part[first])
+    belief, values, node = beliefs_and_values(human, some, numbers[first], observation, actions)
     if resolution > 0:
-        merged, cluster = _alike(values, real, resolution)
-        belief, values, inverse = belief[merged], values[merged], cluster[inverse]
+        merged, cluster = _alike(values[node], real, resolution)
+        node, inverse = node[merged], cluster[inverse]
+    belief, values = belief[node], values[node]
     return {
         "belief": belief,
         "values": values,
@@ -292,14 +283,6 @@ class _Screen:
         if self.sites is None:
             self.sites = latent_values(trace.trace)
         return log_probabilities
-
-
-def _prefixes(bits: Tensor) -> Tensor:
-    """A number ``[M, T]`` for each beginning of rows ``[M, T, N]``, the same for the same ones."""
-    # A key of its own tells steps apart: seeing nothing now differs from having seen nothing.
-    step_key, keys = random_keys(1 + bits[0].numel(), bits.device).split([1, bits[0].numel()])
-    steps = torch.arange(bits.shape[1], device=bits.device) * step_key
-    return (bits * keys.reshape(bits.shape[1:])).sum(-1).cumsum(-1) + steps
 
 
 def _pad(value: Tensor, length: int) -> Tensor:

@@ -31,7 +31,7 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from mirror_ppl.distinct import as_whole_numbers
+from mirror_ppl.distinct import as_whole_numbers, random_keys
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.networks import Gaussian
@@ -82,14 +82,21 @@ class View:
             stacked([step.imagined for step in steps], 2),
         )
 
-    def rows(self) -> Tensor:
-        """Everything that counts, as whole numbers ``[..., N]``, equal where views are equal."""
-        parts = [mask.long() for mask in (*self.visible.values(), *self.taken.values())]
+    def numbers(self) -> Tensor:
+        """Everything that counts as one whole number ``[...]``, equal where views are equal."""
+        masks = {**self.visible, **{f"{name}, taken": mask for name, mask in self.taken.items()}}
+        sizes = [mask.shape[-1] for mask in masks.values()]
+        sizes += [self.imagined[name].shape[-2:].numel() for name in self.taken]
+        device = next(iter(masks.values())).device
+        (*keys,) = random_keys(sum(sizes), device, kind=1).split(sizes)
+        total = torch.zeros((), dtype=torch.long, device=device)
+        for mask in masks.values():
+            total = total + torch.where(mask, keys.pop(0), 0).sum(-1)
         for name, mask in self.taken.items():
-            value = torch.where(mask[..., None], self.imagined[name], 0.0)
-            parts.append(as_whole_numbers(value).flatten(-2))
-        shape = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        return torch.cat([part.expand(*shape, -1) for part in parts], -1)
+            value = as_whole_numbers(self.imagined[name])
+            value = (value * keys.pop(0).view(value.shape[-2:])).sum(-1)
+            total = total + torch.where(mask, value, 0).sum(-1)
+        return total
 
 
 class HumanModel(nn.Module):
