@@ -173,7 +173,7 @@ def test_table_agrees_with_perceive_believe_act(self_model, recordings, kind):
     # What is not looked at is out of the question, wherever there is a round to tell.
     others = torch.ones(number, dtype=torch.bool)
     others[some] = False
-    assert (found[0, others] == 2 * IMPOSSIBLE).all()
+    assert (found[0, others] == IMPOSSIBLE).all()
     assert (found[1] == 0).all()
 
 
@@ -345,7 +345,7 @@ def test_restricted_keeps_what_is_alive_and_forgets_the_rest(self_model, recordi
             part, human.act(policy, part.belief, part.values)
         )
     assert torch.equal(log_probabilities["some"][alive], log_probabilities["all"][alive])
-    assert (log_probabilities["some"][0][~alive[0]] == 2 * IMPOSSIBLE).all()
+    assert (log_probabilities["some"][0][~alive[0]] == IMPOSSIBLE).all()
     for person in range(3):
         used = small.index[person][small.index[person] != NO_VIEW].unique()
         assert used.tolist() == list(range(int(small.view_counts[person])))

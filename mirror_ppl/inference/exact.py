@@ -17,6 +17,9 @@ from mirror_ppl.inference.views import combination_scores, discrete_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
+CHUNK = 2**22
+"""Steps of views, of all draws together, that are worked out at once; bounds memory."""
+
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
     """Values ``[M]`` of the discrete sites of a table, one for each combination."""
@@ -37,21 +40,7 @@ def log_prior(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor])
         policy: values of all other sites, ``[P, 1, ...]`` or ``[1, 1, ...]``, on which the prior
             of the discrete ones may depend.
     """
-    values = {
-        site: value[:, None, None] for site, value in combination_values(human, table).items()
-    }
-    with (
-        torch.random.fork_rng(devices=[]),
-        poutine.trace() as trace,
-        poutine.condition(data={**policy, **values}),
-        pyro.plate("person", table.people, dim=-2),
-    ):
-        human.prior()
-    total = torch.zeros(table.index.shape[-1], table.people, device=table.index.device)
-    for site in table.sites:
-        node = trace.trace.nodes[site]
-        total = total + node["fn"].log_prob(node["value"]).squeeze(-1)
-    return total.T
+    return log_priors(human, table, {name: value[None] for name, value in policy.items()})[0]
 
 
 @torch.no_grad()
@@ -63,14 +52,76 @@ def log_joint(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor])
         table: the recorded rounds.
         policy: values of all other sites, ``[P, 1, ...]`` or ``[1, 1, ...]``.
     """
+    return log_joints(human, table, {name: value[None] for name, value in policy.items()})[0]
+
+
+@torch.no_grad()
+def log_priors(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
+    """As :func:`log_prior` for each of S draws ``[S, P, 1, ...]``: ``[S, P, M]``."""
+    values = {
+        site: value[:, None, None, None] for site, value in combination_values(human, table).items()
+    }
+    number = len(next(iter(draws.values()))) if draws else 1
     with (
         torch.random.fork_rng(devices=[]),
-        poutine.block(),
-        poutine.condition(data=dict(policy)),
+        poutine.trace() as trace,
+        poutine.condition(data={**draws, **values}),
+        pyro.plate("draw", number, dim=-3),
         pyro.plate("person", table.people, dim=-2),
     ):
-        log_probabilities = human.act(human.prior(), table.belief, table.values)
-    return log_prior(human, table, policy) + combination_scores(table, log_probabilities)
+        human.prior()
+    total = torch.zeros(number, table.people, table.index.shape[-1], device=table.index.device)
+    for site in table.sites:
+        node = trace.trace.nodes[site]
+        # Sites whose prior is the same for everybody come without those dimensions.
+        each = node["fn"].log_prob(node["value"]).expand(-1, number, table.people, 1)
+        total = total + each.squeeze(-1).permute(1, 2, 0)
+    return total
+
+
+@torch.no_grad()
+def log_joints(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
+    """As :func:`log_joint` for each of S draws ``[S, P, 1, ...]``: ``[S, P, M]``.
+
+    Right for models in which :func:`acts_on_beliefs`.
+    """
+    number = len(next(iter(draws.values()))) if draws else 1
+    size = max(1, CHUNK // max(1, table.view_steps.numel()))
+    parts = []
+    for begin in range(0, number, size):
+        some = {name: value[begin : begin + size] for name, value in draws.items()}
+        with (
+            torch.random.fork_rng(devices=[]),
+            poutine.block(),
+            poutine.condition(data=some),
+            pyro.plate("draw", min(size, number - begin), dim=-3),
+            pyro.plate("person", table.people, dim=-2),
+        ):
+            log_probabilities = human.act(human.prior(), table.belief, table.values)
+        scores = combination_scores(table, log_probabilities)
+        parts.append(log_priors(human, table, some) + scores)
+    return torch.cat(parts)
+
+
+@torch.no_grad()
+def acts_on_beliefs(human: HumanModel, table: ViewTable) -> bool:
+    """Whether what a person sees reaches their actions through beliefs alone.
+
+    If ``act`` reads a site that ``perceive`` reads, too, likelihoods of views are not enough.
+    """
+    found = []
+    for place in (0, -1):
+        ends = {site: value[place] for site, value in combination_values(human, table).items()}
+        with (
+            torch.random.fork_rng(devices=[]),
+            poutine.block(),
+            pyro.plate("person", table.people, dim=-2),
+        ):
+            torch.manual_seed(0)
+            implants = human.prior()
+            ends = {site: value.expand_as(implants[site]) for site, value in ends.items()}
+            found.append(human.act({**implants, **ends}, table.belief[:, :1], table.values[:, :1]))
+    return torch.equal(*found)
 
 
 def marginals(table: ViewTable, log_weights: Tensor) -> dict[str, Tensor]:

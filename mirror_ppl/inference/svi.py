@@ -24,7 +24,7 @@ from torch.distributions import biject_to
 
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.exact import draw_combinations, log_joint
+from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.inference.views import combination_scores, discrete_sites, restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import discrete_names, latent_sites
@@ -251,7 +251,8 @@ def draw_implants(
     Draws are independent of each other.
     """
     only_views = set(discrete_sites(human)) == set(table.sites) == _enumerated(human, table)
-    draw = _draw_by_table if only_views else _draw_by_enumeration
+    by_table = only_views and acts_on_beliefs(human, table)
+    draw = _draw_by_table if by_table else _draw_by_enumeration
     drawn: list[Draws] = []
     for done in range(number):
         report("draw", done, number, "")

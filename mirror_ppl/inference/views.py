@@ -95,9 +95,15 @@ def combination_scores(table: ViewTable, log_probabilities: Tensor) -> Tensor:
     likelihood = table.log_likelihoods(log_probabilities)
     scores = []
     for person, index in enumerate(table.index):
-        found = likelihood[..., person, :][..., index.clamp(min=0)]
-        found = torch.where(index == NO_VIEW, IMPOSSIBLE, found)
-        scores.append(torch.where(table.real[person, :, None], found, 0.0).sum(-2))
+        index = index[table.real[person]]
+        possible = (index != NO_VIEW).all(0)
+        own = likelihood[..., person, :]
+        found = own.new_full((*own.shape[:-1], index.shape[-1]), IMPOSSIBLE)
+        total = own.new_zeros(*own.shape[:-1], int(possible.sum()))
+        for views in index[:, possible]:
+            total = total + own[..., views]
+        found[..., possible] = total
+        scores.append(found)
     return torch.stack(scores, -2)
 
 
