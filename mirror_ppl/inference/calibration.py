@@ -21,20 +21,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pyro
 import torch
 import xarray as xr
-from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
+from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.ranks import Calibration, collect, judge
 from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.svi import Draws, Report, silent
+from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.sites import latent_sites
 from mirror_ppl.models.weights import fingerprint
 
 PRIOR_PEOPLE = 4000
@@ -184,21 +182,11 @@ def _seed(generator: torch.Generator) -> int:
     return int(torch.randint(2**31, (), generator=generator, device=generator.device))
 
 
-@torch.no_grad()
 def _prior_sites(human: HumanModel, people: int, seed: int) -> dict[str, Any]:
     """Nodes of all sites, sampled for P people."""
-    with (
-        torch.random.fork_rng(devices=[]),
-        poutine.block(),
-        pyro.plate("person", people, dim=-2),
-        poutine.trace() as trace,
-    ):
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        implants = human.prior()
-        # One made-up belief is enough for the sites that act() may add.
-        belief = next(human.parameters()).new_zeros(people, 1, 1, human.self_model.latent)
-        human.act(implants, belief, human.self_model.action_values(belief))
-    return latent_sites(trace.trace)
+        return sample_sites(human, people)
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.inference.prior import Draws
 from mirror_ppl.inference.summary import summarize
 from mirror_ppl.inference.svi import (
-    Draws,
     FitOptions,
     ImplantPosterior,
     Report,

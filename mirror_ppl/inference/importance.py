@@ -15,21 +15,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 from torch.distributions import MultivariateNormal, biject_to
 
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.exact import acts_on_beliefs, combination_values, log_joints
+from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import restricted
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.sites import discrete_names, latent_sites
-from mirror_ppl.models.view_table import ViewTable
-
-Draws = dict[str, Tensor]
+from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 TRUSTED_PARETO_K = 0.7
 """Above this, the weights of so many draws cannot be relied on (the paper's threshold)."""
@@ -101,69 +98,125 @@ class Weighted:
         return {name: value[place] for name, value in self.policy.items()} | discrete
 
 
-Propose = Callable[[int], tuple[Draws, Tensor]]
-"""Draws ``[S, 1, 1, ...]`` of some sites, and the log density ``[S]`` that they have."""
+class Proposal(Protocol):
+    """A density over the scalar sites in unconstrained space; torch distributions are such."""
+
+    def sample(self, sample_shape: torch.Size) -> Tensor:
+        """Draws ``[S, D]``."""
+        ...
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log density ``[S]``."""
+        ...
 
 
-def weigh_person(
-    human: HumanModel, table: ViewTable, propose: Propose, number: int, margin: float
-) -> Weighted:
-    """Weighted draws of one person, of a single proposal.
+class Sampler:
+    """Draws of one person from several proposals, the first of which is the prior.
+
+    Every draw is weighted by the mixture of all that was proposed (Veach and Guibas, *Optimally
+    combining sampling techniques for Monte Carlo rendering*, 1995), so that weights are bounded.
+    Proposals are of the scalar sites; all others are drawn from the prior given those.
 
     Args:
         human: the model of people.
         table: views of one person's rounds.
-        propose: what some of the sites are drawn from; the others are drawn from the prior.
-        number: of draws S.
-        margin: see ``ImportanceOptions.prune_margin``.
+
+    Attributes:
+        combinations: those of the discrete sites that are still possible, ``[C]``.
+        place: the scalar sites of all draws, in unconstrained space ``[S, D]``.
     """
-    given, log_proposed = propose(number)
-    policy, log_prior = complete(human, table, given, number)
-    combinations, joint = _joints(human, table, policy, margin)
-    log_weights, pareto_k = _smoothed(joint.logsumexp(-1) + log_prior - log_proposed)
-    return Weighted(policy, combinations, joint, log_weights, pareto_k)
+
+    def __init__(self, human: HumanModel, table: ViewTable) -> None:
+        self.human = human
+        self.table = table
+        self.sites = scalar_sites(human)
+        possible = (table.index[0] != NO_VIEW).all(0) | ~table.real.any()
+        self.combinations = possible.nonzero().squeeze(-1)
+        self.place = torch.zeros(0, len(self.sites), device=table.index.device)
+        self._proposals: list[tuple[int, Proposal]] = []
+        self._policies: list[Draws] = []
+        self._joints: list[Tensor] = []
+        self._log_prior = torch.zeros(0, device=table.index.device)
+
+    def start(self, number: int) -> None:
+        """Draw from the prior."""
+        policy, _ = complete(self.human, self.table, {}, number)
+        self.start_from(policy, self._joint(policy))
+
+    def start_from(self, policy: Draws, joint: Tensor) -> None:
+        """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, C]``."""
+        self.place = places(self.sites, policy)
+        number = len(joint)
+        given = {name: policy[name] for name in self.sites}
+        _, log_prior = complete(self.human, self.table, given, number)
+        self._log_prior = log_prior + _stretch(self.sites, self.place)
+        self._policies, self._joints = [policy], [joint]
+        self._first = number
+
+    def prune(self, margin: float) -> None:
+        """Give up combinations that are behind the best by more than that under every draw."""
+        joint = torch.cat(self._joints)
+        keep = (joint - joint.max()).amax(0) >= -margin
+        self.combinations = self.combinations[keep]
+        self._joints = [joint[:, keep] for joint in self._joints]
+        if self.table.real.any():
+            alive = torch.zeros_like(self.table.index[:, 0], dtype=torch.bool)
+            alive[0, self.combinations] = True
+            self.table = restricted(self.table, alive)
+
+    def propose(self, proposal: Proposal, number: int) -> None:
+        """Draw some more."""
+        place = proposal.sample(torch.Size([number]))
+        given = {
+            name: site(place[:, column]).view(number, 1, 1)
+            for column, (name, site) in enumerate(self.sites.items())
+        }
+        policy, log_prior = complete(self.human, self.table, given, number)
+        self._policies.append(policy)
+        self._joints.append(self._joint(policy))
+        self._proposals.append((number, proposal))
+        self.place = torch.cat([self.place, place])
+        self._log_prior = torch.cat([self._log_prior, log_prior + _stretch(self.sites, place)])
+
+    def weighted(self) -> Weighted:
+        """All draws, with their weights."""
+        joint = torch.cat(self._joints)
+        parts = [self._log_prior + math.log(self._first / len(joint))]
+        for number, proposal in self._proposals:
+            parts.append(proposal.log_prob(self.place) + math.log(number / len(joint)))
+        mixture = torch.logsumexp(torch.stack(parts), 0)
+        log_weights, pareto_k = _smoothed(joint.logsumexp(-1) + self._log_prior - mixture)
+        policy = {
+            name: torch.cat([one[name] for one in self._policies]) for name in self._policies[0]
+        }
+        return Weighted(policy, self.combinations, joint, log_weights, pareto_k)
+
+    def _joint(self, policy: Draws) -> Tensor:
+        return log_joints(self.human, self.table, policy)[:, 0, self.combinations]
 
 
+@torch.no_grad()
 def sample_exactly(human: HumanModel, table: ViewTable, options: ImportanceOptions) -> Weighted:
-    """Weighted draws of one person by adaptive importance sampling from the prior on.
+    """Weighted draws of one person by adaptive importance sampling.
 
-    The first stage draws from the prior. Each that follows draws the scalar sites from a Gaussian,
-    in unconstrained space, that has the moments of the weighted draws so far, and the rest from the
-    prior given those. All draws are weighted by the mixture of everything that was proposed (Veach
-    and Guibas, *Optimally combining sampling techniques*, 1995).
+    The first stage draws from the prior; each that follows draws the scalar sites from a Gaussian,
+    in unconstrained space, that has the moments of the weighted draws so far.
 
     Args:
         human: the model of people.
         table: views of one person's rounds.
         options: settings.
     """
-    sites = _scalars(human, table)
-    stages = [_Stage(*_prior_stage(human, table, sites, options.proposals))]
-    margin = options.prune_margin
-    combinations, joint = _joints(human, table, stages[0].policy, math.inf)
-    keep = (joint - joint.max()).amax(0) >= -margin
-    combinations, joint = combinations[keep], joint[:, keep]
-    table = _only(table, combinations)
-    joints, proposals = [joint], []
-    while True:
-        policy = {
-            name: torch.cat([stage.policy[name] for stage in stages]) for name in stages[0].policy
-        }
-        joint = torch.cat(joints)
-        log_prior = torch.cat([stage.log_prior for stage in stages])
-        place = torch.cat([stage.place for stage in stages])
-        # The prior is one of the proposals, and so weights are bounded.
-        proposed = [log_prior, *(proposal.log_prob(place) for proposal in proposals)]
-        mixture = torch.logsumexp(torch.stack(proposed), 0) - math.log(len(proposed))
-        raw = joint.logsumexp(-1) + log_prior - mixture
-        log_weights, pareto_k = _smoothed(raw)
-        found = Weighted(policy, combinations, joint, log_weights, pareto_k)
-        enough = found.effective >= options.enough or len(stages) == options.stages
-        if enough or not sites:
+    sampler = Sampler(human, table)
+    sampler.start(options.proposals)
+    sampler.prune(options.prune_margin)
+    for _ in range(options.stages if sampler.sites else 0):
+        found = sampler.weighted()
+        if found.effective >= options.enough:
             return found
-        proposals.append(_gaussian(place, log_weights, options.wider))
-        stages.append(_Stage(*_next_stage(human, table, sites, proposals[-1], options.proposals)))
-        joints.append(_joints(human, table, stages[-1].policy, math.inf)[1])
+        gaussian = _gaussian(sampler.place, found.log_weights, options.wider)
+        sampler.propose(gaussian, options.proposals)
+    return sampler.weighted()
 
 
 def draw_by_importance(
@@ -227,80 +280,33 @@ def complete(
         The draws, those that are not given from the prior; and the log prior density ``[S]`` of
         those that are given.
     """
-    with (
-        poutine.trace() as trace,
-        poutine.condition(data=dict(given)),
-        pyro.plate("draw", number, dim=-3),
-        pyro.plate("person", 1, dim=-2),
-    ):
-        human.act(human.prior(), table.belief[:, :1], table.values[:, :1])
+    nodes = sample_sites(human, 1, number, given)
+    values = values_of(nodes)
     log_prior = torch.zeros(number, device=table.index.device)
     for name in given:
-        node = trace.trace.nodes[name]
-        log_prior = log_prior + node["fn"].log_prob(node["value"]).expand(number, 1, 1).flatten()
-    policy = dict(given)
-    for name, node in latent_sites(trace.trace).items():
-        if name not in table.sites:
-            shape = (number, 1, 1, *node["fn"].event_shape)
-            policy[name] = node["value"].expand(shape).clone()
+        log_prior = log_prior + nodes[name]["fn"].log_prob(values[name]).view(number)
+    policy = {name: value for name, value in values.items() if name not in table.sites}
     return policy, log_prior
 
 
-@dataclass(frozen=True)
-class _Stage:
-    """Draws of one proposal.
-
-    Attributes:
-        policy: ``[S, 1, 1, ...]``.
-        place: the scalar sites in unconstrained space ``[S, D]``.
-        log_prior: density of the scalar sites there under the prior, ``[S]``.
-    """
-
-    policy: Draws
-    place: Tensor
-    log_prior: Tensor
-
-
-def _scalars(human: HumanModel, table: ViewTable) -> dict[str, object]:
+def scalar_sites(human: HumanModel) -> dict[str, Any]:
     """Continuous sites of one number a person, with the map from unconstrained space."""
-    with (
-        torch.random.fork_rng(devices=[]),
-        poutine.trace() as trace,
-        pyro.plate("draw", 1, dim=-3),
-        pyro.plate("person", 1, dim=-2),
-    ):
-        human.act(human.prior(), table.belief[:, :1], table.values[:, :1])
-    discrete = discrete_names(trace.trace)
-    return {
-        name: biject_to(node["fn"].support)
-        for name, node in latent_sites(trace.trace).items()
-        if name not in discrete and node["fn"].event_dim == 0
-    }
+    with torch.random.fork_rng(devices=[]):
+        return {
+            name: biject_to(node["fn"].support)
+            for name, node in sample_sites(human, 1).items()
+            if not node["fn"].has_enumerate_support and node["fn"].event_dim == 0
+        }
 
 
-def _prior_stage(human: HumanModel, table: ViewTable, sites, number: int):
-    policy, _ = complete(human, table, {}, number)
-    place = _place(sites, policy)
-    _, log_prior = complete(human, table, {name: policy[name] for name in sites}, number)
-    return policy, place, log_prior + _stretch(sites, place)
+def places(sites: Mapping[str, Any], policy: Mapping[str, Tensor]) -> Tensor:
+    """The scalar sites of draws in unconstrained space, ``[S, D]``."""
+    if not sites:
+        return torch.zeros(len(next(iter(policy.values()))) if policy else 0, 0)
+    return torch.stack([site.inv(policy[name].flatten()) for name, site in sites.items()], -1)
 
 
-def _next_stage(human: HumanModel, table: ViewTable, sites, proposal, number: int):
-    place = proposal.sample((number,))
-    given = {
-        name: site(place[:, column]).view(number, 1, 1)
-        for column, (name, site) in enumerate(sites.items())
-    }
-    policy, log_prior = complete(human, table, given, number)
-    return policy, place, log_prior + _stretch(sites, place)
-
-
-def _place(sites, policy: Mapping[str, Tensor]) -> Tensor:
-    columns = [site.inv(policy[name].flatten()) for name, site in sites.items()]
-    return torch.stack(columns, -1) if columns else torch.zeros(0)
-
-
-def _stretch(sites, place: Tensor) -> Tensor:
+def _stretch(sites: Mapping[str, Any], place: Tensor) -> Tensor:
     """Log of by how much space is stretched on the way from unconstrained space, ``[S]``."""
     total = place.new_zeros(len(place))
     for column, site in enumerate(sites.values()):
@@ -316,25 +322,6 @@ def _gaussian(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateN
     # Where few draws have all the weight, their spread says nothing.
     floor = 1e-3 * place.var(0) + 1e-8
     return MultivariateNormal(mean, covariance + torch.diag(floor))
-
-
-def _joints(
-    human: HumanModel, table: ViewTable, policy: Draws, margin: float
-) -> tuple[Tensor, Tensor]:
-    """Combinations ``[C]`` that are possible, and their log joint ``[S, C]`` under each draw."""
-    possible = (table.index[0] >= 0).all(0) | ~table.real.any()
-    joint = log_joints(human, table, policy)[:, 0, possible]
-    combinations = possible.nonzero().squeeze(-1)
-    if math.isfinite(margin):
-        keep = (joint - joint.max()).amax(0) >= -margin
-        combinations, joint = combinations[keep], joint[:, keep]
-    return combinations, joint
-
-
-def _only(table: ViewTable, combinations: Tensor) -> ViewTable:
-    alive = torch.zeros(1, table.index.shape[-1], dtype=torch.bool, device=table.index.device)
-    alive[0, combinations] = True
-    return restricted(table, alive) if table.real.any() else table
 
 
 def _smoothed(raw: Tensor) -> tuple[Tensor, float]:

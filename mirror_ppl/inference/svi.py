@@ -25,6 +25,7 @@ from torch.distributions import biject_to
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
+from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import combination_scores, discrete_sites, restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import discrete_names, latent_sites
@@ -37,9 +38,6 @@ Report = Callable[[str, int, int, str], None]
 def silent(name: str, done: int, total: int, message: str) -> None:
     """Report nothing."""
 
-
-Draws = dict[str, Tensor]
-"""Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100
@@ -279,30 +277,15 @@ def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) 
         first_available_dim=-1 - PLATES,
     )
     trace = poutine.trace(sampled).get_trace(table)
-    return {**continuous, **_whole_values(trace)}
+    return {**continuous, **values_of(latent_sites(trace))}
 
 
 @torch.no_grad()
 def draw_prior(human: HumanModel, table: ViewTable, number: int, seed: int) -> Draws:
     """Draws ``[S, P, 1, ...]`` of the prior of all implants, in the order of the program."""
-    with (
-        torch.random.fork_rng(devices=[]),
-        pyro.plate("draw", number, dim=-1 - PLATES),
-        pyro.plate("person", table.people, dim=-PLATES),
-        poutine.trace() as trace,
-    ):
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        # A single view is enough for the sites that act() may add.
-        human.act(human.prior(), table.belief[:, :1], table.values[:, :1])
-    return _whole_values(trace.trace)
-
-
-def _whole_values(trace: poutine.Trace) -> Draws:
-    """Values of the sites that were sampled, with dimensions of size one where Pyro spares them."""
-    return {
-        name: site["value"].expand(site["fn"].batch_shape + site["fn"].event_shape)
-        for name, site in latent_sites(trace).items()
-    }
+        return values_of(sample_sites(human, table.people, number))
 
 
 @torch.no_grad()
