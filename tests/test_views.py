@@ -12,10 +12,10 @@ from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.combinations import MAX_COMBINATIONS
 from mirror_ppl.inference.courses import _beginnings
 from mirror_ppl.inference.experience import roll_out
 from mirror_ppl.inference.views import (
-    MAX_COMBINATIONS,
     Screening,
     build_view_table,
     combination_scores,

@@ -13,7 +13,8 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from mirror_ppl.inference.views import combination_scores, discrete_sites
+from mirror_ppl.inference.combinations import discrete_sites, grid_of, log_priors
+from mirror_ppl.inference.views import combination_scores
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
@@ -23,11 +24,8 @@ CHUNK = 2**22
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
     """Values ``[M]`` of the discrete sites of a table, one for each combination."""
-    if not table.sites:
-        return {}
     supports = discrete_sites(human)
-    axes = torch.meshgrid(*(supports[site] for site in table.sites), indexing="ij")
-    return {site: axis.flatten() for site, axis in zip(table.sites, axes, strict=True)}
+    return grid_of({site: supports[site] for site in table.sites})
 
 
 @torch.no_grad()
@@ -40,7 +38,8 @@ def log_prior(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor])
         policy: values of all other sites, ``[P, 1, ...]`` or ``[1, 1, ...]``, on which the prior
             of the discrete ones may depend.
     """
-    return log_priors(human, table, {name: value[None] for name, value in policy.items()})[0]
+    draws = {name: value[None] for name, value in policy.items()}
+    return log_priors(human, combination_values(human, table), draws, table.people)[0]
 
 
 @torch.no_grad()
@@ -56,36 +55,13 @@ def log_joint(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor])
 
 
 @torch.no_grad()
-def log_priors(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
-    """As :func:`log_prior` for each of S draws ``[S, P, 1, ...]``: ``[S, P, M]``."""
-    values = {
-        site: value[:, None, None, None] for site, value in combination_values(human, table).items()
-    }
-    number = len(next(iter(draws.values()))) if draws else 1
-    with (
-        torch.random.fork_rng(devices=[]),
-        poutine.trace() as trace,
-        poutine.condition(data={**draws, **values}),
-        pyro.plate("draw", number, dim=-3),
-        pyro.plate("person", table.people, dim=-2),
-    ):
-        human.prior()
-    total = torch.zeros(number, table.people, table.index.shape[-1], device=table.index.device)
-    for site in table.sites:
-        node = trace.trace.nodes[site]
-        # Sites whose prior is the same for everybody come without those dimensions.
-        each = node["fn"].log_prob(node["value"]).expand(-1, number, table.people, 1)
-        total = total + each.squeeze(-1).permute(1, 2, 0)
-    return total
-
-
-@torch.no_grad()
 def log_joints(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
     """As :func:`log_joint` for each of S draws ``[S, P, 1, ...]``: ``[S, P, M]``.
 
     Right for models in which :func:`acts_on_beliefs`.
     """
     number = len(next(iter(draws.values()))) if draws else 1
+    grid = combination_values(human, table)
     size = max(1, CHUNK // max(1, table.view_steps.numel()))
     parts = []
     for begin in range(0, number, size):
@@ -99,7 +75,7 @@ def log_joints(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor])
         ):
             log_probabilities = human.act(human.prior(), table.belief, table.values)
         scores = combination_scores(table, log_probabilities)
-        parts.append(log_priors(human, table, some) + scores)
+        parts.append(log_priors(human, grid, some, table.people) + scores)
     return torch.cat(parts)
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from math import prod
 
 import pyro
 import torch
@@ -17,9 +19,10 @@ from torch import Tensor
 
 from mirror_ppl.distinct import distinct_rows
 from mirror_ppl.domains import Observation, Visibility
+from mirror_ppl.inference.combinations import grid_of, log_priors, perceived_sites
 from mirror_ppl.inference.courses import beliefs_and_values
+from mirror_ppl.inference.prior import sample_sites, values_of
 from mirror_ppl.models.human import HumanModel, View
-from mirror_ppl.models.sites import latent_values
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 
@@ -48,31 +51,38 @@ class Sightings:
 
     Args:
         human: whose ``perceive`` and ``believe`` are called (and ``act`` for screening).
-        grid: values ``[M]`` of the discrete sites for each of their combinations.
-        candidates: numbers of the combinations that are considered at all.
         screening: when to give up combinations on the way; never if ``None``.
+        candidates: numbers of the combinations that are considered at all (see
+            :meth:`ViewTable.combination`); all of them unless given.
+
+    Raises:
+        HumanModelError: see :func:`perceived_sites`.
 
     Attributes:
+        grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
+        sizes: number of values of each of these sites.
         alive: numbers of the combinations that are left.
         score: log-likelihood ``[ways, M]`` of each of them under each way to decide.
-        ways: these ways, draws ``[ways, 1, 1, ...]`` of all sites from the prior; empty before the
-            first round.
+        ways: these ways, see :meth:`draw_ways`.
     """
 
     def __init__(
         self,
         human: HumanModel,
-        grid: Mapping[str, Tensor],
-        candidates: Tensor,
         screening: Screening | None,
+        candidates: Tensor | None = None,
     ) -> None:
+        device = next(human.parameters()).device
         self.human = human
-        self.grid = grid
-        self.alive = candidates
         self.screening = screening
-        self.combinations = max([len(values) for values in grid.values()], default=1)
+        supports = perceived_sites(human)
+        self.grid = grid_of(supports)
+        self.sizes = tuple(len(support) for support in supports.values())
+        self.alive = torch.arange(prod(self.sizes), device=device)
+        if candidates is not None:
+            self.alive = candidates
         ways = 0 if screening is None else screening.ways
-        self.score = torch.zeros(ways, self.combinations, device=candidates.device)
+        self.score = torch.zeros(ways, prod(self.sizes), device=device)
         self.ways: dict[str, Tensor] = {}
         self._rounds: list[dict[str, Tensor]] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
@@ -107,7 +117,7 @@ class Sightings:
     def table(self) -> ViewTable:
         """The views that are left, as a table of one person; there was at least one round."""
         rounds = len(self._seen)
-        index = torch.full((rounds, self.combinations), NO_VIEW, device=self.alive.device)
+        index = torch.full((rounds, prod(self.sizes)), NO_VIEW, device=self.alive.device)
         for row, (combination, view) in zip(index, self._seen, strict=True):
             row[combination] = view
         # Only what somebody who was never given up has seen is worth keeping.
@@ -121,7 +131,7 @@ class Sightings:
 
         return ViewTable(
             sites=tuple(self.grid),
-            sizes=tuple(len(values.unique()) for values in self.grid.values()),
+            sizes=self.sizes,
             index=kept[None],
             belief=part("belief"),
             values=part("values"),
@@ -132,6 +142,12 @@ class Sightings:
             view_counts=torch.tensor([len(needed)]),
         )
 
+    @cached_property
+    def log_prior(self) -> Tensor:
+        """Log prior probability of each combination under each way, ``[ways, M]``."""
+        others = {name: way for name, way in self.draw_ways().items() if name not in self.grid}
+        return log_priors(self.human, self.grid, others, 1)[:, 0]
+
     def _log_likelihoods(self, part: Mapping[str, Tensor]) -> Tensor:
         """Of a round's actions under each way and view, ``[ways, U]``."""
         log_probabilities = self._act(part["belief"][None], part["values"][None])[:, 0]
@@ -139,20 +155,23 @@ class Sightings:
         chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
         return torch.where(part["steps"], chosen, 0.0).sum(-1)
 
+    def draw_ways(self) -> dict[str, Tensor]:
+        """The ways to decide, ``[ways, 1, 1, ...]``; always the same."""
+        if not self.ways and self.screening is not None:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(self.screening.seed)
+                self.ways = values_of(sample_sites(self.human, 1, self.screening.ways))
+        return self.ways
+
     def _act(self, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities ``[ways, 1, U, T, A]`` under the same drawn ways every time."""
-        assert self.screening is not None
+        """Log-probabilities ``[ways, 1, U, T, A]``."""
         with (
-            torch.random.fork_rng(devices=[]),
-            pyro.plate("way", self.screening.ways, dim=-3),
+            poutine.block(),
+            poutine.condition(data=self.draw_ways()),
+            pyro.plate("way", len(self.score), dim=-3),
             pyro.plate("person", 1, dim=-2),
-            poutine.condition(data=self.ways),
-            poutine.trace() as trace,
         ):
-            torch.manual_seed(self.screening.seed)
-            log_probabilities = self.human.act(self.human.prior(), belief, values)
-        self.ways |= latent_values(trace.trace)
-        return log_probabilities
+            return self.human.act(self.human.prior(), belief, values)
 
 
 def _views(

@@ -24,9 +24,10 @@ from torch.distributions import biject_to
 
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.files import write_whole
+from mirror_ppl.inference.combinations import discrete_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
-from mirror_ppl.inference.views import combination_scores, discrete_sites, restricted
+from mirror_ppl.inference.views import combination_scores, restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import discrete_names, latent_sites
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable

@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from math import prod
 
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains import Observation
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
-
-MAX_COMBINATIONS = 100_000
-
-
-def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
-    """Supports ``[n]`` of the discrete sites of a human model's prior, by name."""
-    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
-        trace = poutine.trace(human.prior).get_trace()
-    sites = latent_sites(trace)
-    return {
-        name: sites[name]["fn"].enumerate_support(expand=False).flatten()
-        for name in sites
-        if name in discrete_names(trace)
-    }
 
 
 def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
@@ -103,27 +84,11 @@ def build_view_table(
         HumanModelError: ``perceive`` reads a site that cannot be enumerated, or there are too many
             combinations of values.
     """
-    supports = discrete_sites(human)
-    used = _sites_read(human, demonstrations, supports)
-    supports = {name: support for name, support in supports.items() if name in used}
-    sizes = tuple(len(support) for support in supports.values())
-    if prod(sizes) > MAX_COMBINATIONS:
-        raise HumanModelError(
-            f"perceive() depends on {prod(sizes)} combinations of discrete values; "
-            f"at most {MAX_COMBINATIONS} can be marginalized"
-        )
-    axes = torch.meshgrid(*supports.values(), indexing="ij") if supports else ()
-    grid = {name: axis.flatten() for name, axis in zip(supports, axes, strict=True)}
-    observation = demonstrations.observation()
-    everything = torch.arange(prod(sizes), device=demonstrations.actions.device)
     tables = []
     for person in range(demonstrations.num_people):
-        alive = everything if candidates is None else candidates[person]
-        sightings = Sightings(human, grid, alive, screening)
-        # Somebody without rounds still needs one view, of padding, to be looked up.
-        for number in range(max(int(demonstrations.round_counts[person]), 1)):
-            one_round = _round(demonstrations, observation, person, number)
-            sightings.add(*one_round, demonstrations.mask[person, number])
+        sightings = Sightings(human, screening, None if candidates is None else candidates[person])
+        for one_round in rounds_of(demonstrations, person):
+            sightings.add(*one_round)
         tables.append(sightings.table())
         report(person + 1)
     return _joined(tables, demonstrations)
@@ -151,23 +116,22 @@ def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> View
     )
 
 
-def _sites_read(
-    human: HumanModel, demonstrations: Demonstrations, supports: Mapping[str, Tensor]
-) -> set[str]:
-    observation, told, _ = _round(demonstrations, demonstrations.observation(), 0, 0)
-    implants = Readable({name: support[:1] for name, support in supports.items()})
-    human.perceive(implants, observation, told)
-    return implants.read
+def rounds_of(
+    demonstrations: Demonstrations, person: int
+) -> Iterator[tuple[Observation, Visibility, Tensor, Tensor]]:
+    """A person's rounds, as :meth:`Sightings.add` takes them.
 
-
-def _round(
-    demonstrations: Demonstrations, observation: Observation, person: int, number: int
-) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
-    """Observation ``[1, T, ...]``, told ``[1, T, K]`` and actions ``[1, T]`` of one round."""
+    Of somebody without rounds there is one of padding, so that there is something to look up.
+    """
     steps = demonstrations.shape[2]
-    seen = {name: value[person, number, :steps][None] for name, value in observation.items()}
-    told = {name: value[person, number][None] for name, value in demonstrations.told.items()}
-    return seen, told, demonstrations.actions[person, number].clamp(min=0)[None]
+    observation = demonstrations.observation()
+    for number in range(max(int(demonstrations.round_counts[person]), 1)):
+        yield (
+            {name: value[person, number, :steps][None] for name, value in observation.items()},
+            {name: value[person, number][None] for name, value in demonstrations.told.items()},
+            demonstrations.actions[person, number].clamp(min=0)[None],
+            demonstrations.mask[person, number],
+        )
 
 
 def _pad(value: Tensor, length: int, fill: int = 0) -> Tensor:

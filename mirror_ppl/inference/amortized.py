@@ -1,0 +1,191 @@
+"""The amortized guide: a person's posterior at once, from any number of rounds in any order.
+
+What a network reads of a person is what the human model says about their rounds: for a few ways to
+decide, drawn from the prior once and for all, the log-evidence of the recorded actions, with what
+the person sees marginalized exactly. Evidence adds up over rounds, so their order does not matter
+and a new round is one more term. From it the network proposes how this person decides::
+
+    e_w   = log sum_m p(m | psi_w) p(actions | m, psi_w)     for ways psi_w ~ prior
+    psi   ~ q(. | e_1 .. e_W, number of steps)               scalar sites, a mixture of Gaussians
+    m     ~ p(m | psi, actions)                              exact
+
+and importance weights take care of what it gets wrong (:mod:`mirror_ppl.inference.importance`).
+
+The network is trained on people drawn from the prior and simulated in the true domain (inference
+compilation: Le, Baydin and Wood, 2017), see :mod:`mirror_ppl.inference.guide_training`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor, nn
+
+from mirror_ppl.inference.importance import Sampler, Weighted, places, scalar_sites
+from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.networks import layers
+from mirror_ppl.models.view_table import ViewTable
+
+WAYS = 64
+COMPONENTS = 4
+HIDDEN = 128
+TEMPERATURES = (1.0, 2.0, 4.0, 8.0)
+LEAST_EVIDENCE = -30.0
+
+
+def guide_screening() -> Screening:
+    """The screening that an amortized guide needs: its ways are what the network reads."""
+    return Screening(ways=WAYS)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the rounds of one person say about ways to decide.
+
+    Attributes:
+        log_evidence: of each way ``[W]``.
+        joint: log joint of combinations under each way, ``[W, C]``.
+        ways: the ways, draws ``[W, 1, 1, ...]`` of the sites that perception does not read.
+        table: views of the rounds.
+        steps: number of recorded actions.
+    """
+
+    log_evidence: Tensor
+    joint: Tensor
+    ways: dict[str, Tensor]
+    table: ViewTable
+    steps: int
+
+
+def log_evidence(sightings: Sightings) -> Tensor:
+    """Log-evidence ``[W]`` of a person's rounds so far under each way to decide."""
+    return _joint(sightings).logsumexp(-1)
+
+
+def _joint(sightings: Sightings) -> Tensor:
+    """Log joint ``[W, C]`` of the combinations that are left, in increasing order."""
+    alive = sightings.alive.sort().values
+    return sightings.score[:, alive] + sightings.log_prior[:, alive]
+
+
+def evidence_of(sightings: Sightings) -> Evidence:
+    """What a person's rounds so far say."""
+    table, joint = sightings.table(), _joint(sightings)
+    ways = {name: way for name, way in sightings.ways.items() if name not in table.sites}
+    return Evidence(joint.logsumexp(-1), joint, ways, table, int(table.steps.sum()))
+
+
+class AmortizedGuide(nn.Module):
+    """``q(psi | rounds)`` of the scalar sites of a human model, in unconstrained space.
+
+    Args:
+        places: of the ways that evidence is about, ``[W, D]``.
+
+    Attributes:
+        ways: their places in units of the prior's standard deviation, ``[W, D]``.
+        centre, width: of the prior in unconstrained space, ``[D]``.
+    """
+
+    ways: Tensor
+    centre: Tensor
+    width: Tensor
+
+    def __init__(self, places: Tensor) -> None:
+        super().__init__()
+        number, self.dimensions = places.shape
+        self.register_buffer("centre", places.mean(0))
+        self.register_buffer("width", places.std(0).clamp(min=1e-6))
+        self.register_buffer("ways", (places - self.centre) / self.width)
+        moments = 2 * self.dimensions + 1
+        triangle = self.dimensions * (self.dimensions + 1) // 2
+        self.body = layers((number + len(TEMPERATURES) * moments + 1, HIDDEN, HIDDEN))
+        self.head = nn.Linear(HIDDEN, COMPONENTS * (1 + self.dimensions + triangle))
+
+    def features(self, log_evidence: Tensor, steps: Tensor) -> Tensor:
+        """What the network reads ``[..., F]`` of evidence ``[..., W]`` of so many steps ``[...]``.
+
+        Besides the evidence itself: what importance sampling from the prior would give for mean
+        and spread, also with evidence toned down, where few ways have all the weight.
+        """
+        relative = log_evidence - log_evidence.amax(-1, keepdim=True)
+        parts = [relative.clamp(min=LEAST_EVIDENCE) / 10.0]
+        for temperature in TEMPERATURES:
+            weights = torch.softmax(relative / temperature, -1)
+            mean = weights @ self.ways
+            spread = (weights @ self.ways.square() - mean.square()).clamp(min=0).sqrt()
+            effective = 1 / weights.square().sum(-1, keepdim=True)
+            parts += [mean, spread, effective / len(self.ways)]
+        parts.append(torch.log1p(steps.to(relative))[..., None] / 5.0)
+        return torch.cat(parts, -1)
+
+    def density(self, log_evidence: Tensor, steps: Tensor) -> dist.TorchDistribution:
+        """``q`` over places ``[..., D]`` in unconstrained space."""
+        size = self.dimensions
+        features = self.features(log_evidence, steps)
+        out = self.head(self.body(features)).unflatten(-1, (COMPONENTS, -1))
+        logits, mean, triangle = out.split([1, size, size * (size + 1) // 2], -1)
+        # A component starts where importance sampling says that the posterior is.
+        weights = torch.softmax(log_evidence - log_evidence.amax(-1, keepdim=True), -1)
+        mean = mean + (weights @ self.ways)[..., None, :]
+        rows, columns = torch.tril_indices(size, size)
+        lower = mean.new_zeros(*triangle.shape[:-1], size, size)
+        lower[..., rows, columns] = triangle
+        diagonal = nn.functional.softplus(lower.diagonal(dim1=-2, dim2=-1)) + 1e-3
+        lower = torch.tril(lower, -1) + torch.diag_embed(diagonal)
+        scale = self.width[:, None] * lower
+        return dist.MixtureSameFamily(
+            dist.Categorical(logits=logits.squeeze(-1)),
+            dist.MultivariateNormal(self.centre + self.width * mean, scale_tril=scale),
+        )
+
+    def forward(
+        self, sites: Mapping[str, dist.transforms.Transform], log_evidence: Tensor, steps: Tensor
+    ) -> None:
+        """The guide as a Pyro program over the scalar sites of P people, ``[P, W]`` and ``[P]``."""
+        with pyro.plate("person", len(log_evidence), dim=-2):
+            place = pyro.sample(
+                "place",
+                self.density(log_evidence[:, None], steps[:, None]),
+                infer={"is_auxiliary": True},
+            )
+            for column, (name, site) in enumerate(sites.items()):
+                value = site(place[..., column])
+                stretch = site.log_abs_det_jacobian(place[..., column], value)
+                pyro.sample(name, dist.Delta(value, log_density=-stretch))
+
+
+def reference_places(human: HumanModel) -> Tensor:
+    """Places ``[W, D]`` of the ways that evidence is about; always the same of a human model."""
+    sightings = Sightings(human, guide_screening())
+    return places(scalar_sites(human), sightings.draw_ways())
+
+
+@torch.no_grad()
+def sample_amortized(
+    human: HumanModel,
+    guide: AmortizedGuide,
+    sightings: Sightings,
+    proposals: int = 192,
+    prune_margin: float = 12.0,
+) -> Weighted:
+    """Weighted draws of one person: the guide's, and the ways that evidence is about.
+
+    Args:
+        human: the model of people that the guide was trained for.
+        guide: the trained network.
+        sightings: the person's rounds so far.
+        proposals: draws from the guide.
+        prune_margin: see :class:`ImportanceOptions`.
+    """
+    evidence = evidence_of(sightings)
+    sampler = Sampler(human, evidence.table)
+    sampler.start_from(evidence.ways, evidence.joint)
+    sampler.prune(prune_margin)
+    steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
+    sampler.propose(guide.density(evidence.log_evidence, steps), proposals)
+    return sampler.weighted()

@@ -1,0 +1,98 @@
+"""Combinations of the discrete implants that perception reads, and their prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import prod
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
+
+MAX_COMBINATIONS = 100_000
+
+
+def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
+    """Supports ``[n]`` of the discrete sites of a human model's prior, by name."""
+    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
+        trace = poutine.trace(human.prior).get_trace()
+    sites = latent_sites(trace)
+    return {
+        name: sites[name]["fn"].enumerate_support(expand=False).flatten()
+        for name in sites
+        if name in discrete_names(trace)
+    }
+
+
+def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
+    """Supports ``[n]`` of those discrete sites that ``perceive`` reads, in the program's order.
+
+    Raises:
+        HumanModelError: ``perceive`` reads a site that cannot be enumerated, or there are too many
+            combinations of values.
+    """
+    supports = discrete_sites(human)
+    domain = human.domain
+    device = next(human.parameters()).device
+    state = domain.initial(1, torch.Generator(device).manual_seed(0))
+    steps = domain.horizon
+    observation = {
+        name: value[:, None].expand(1, steps, *value.shape[1:])
+        for name, value in domain.observe(state).items()
+    }
+    told = {
+        m.name: torch.zeros(1, steps, len(m.items), dtype=torch.bool, device=device)
+        for m in domain.modalities
+    }
+    implants = Readable({name: support[:1] for name, support in supports.items()})
+    human.perceive(implants, observation, told)
+    supports = {name: support for name, support in supports.items() if name in implants.read}
+    number = prod(len(support) for support in supports.values())
+    if number > MAX_COMBINATIONS:
+        raise HumanModelError(
+            f"perceive() depends on {number} combinations of discrete values; "
+            f"at most {MAX_COMBINATIONS} can be marginalized"
+        )
+    return supports
+
+
+def grid_of(supports: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Values ``[M]`` of sites, one for each combination, row-major."""
+    axes = torch.meshgrid(*supports.values(), indexing="ij") if supports else ()
+    return {site: axis.flatten() for site, axis in zip(supports, axes, strict=True)}
+
+
+@torch.no_grad()
+def log_priors(
+    human: HumanModel, grid: Mapping[str, Tensor], draws: Mapping[str, Tensor], people: int
+) -> Tensor:
+    """Log prior probability ``[S, P, M]`` of each combination.
+
+    Args:
+        human: the model of people.
+        grid: values ``[M]`` of the discrete sites; others are not looked at.
+        draws: values of all other sites ``[S, P, 1, ...]``, on which the prior may depend.
+        people: number of people P.
+    """
+    values = {site: value[:, None, None, None] for site, value in grid.items()}
+    number = len(next(iter(draws.values()))) if draws else 1
+    with (
+        torch.random.fork_rng(devices=[]),
+        poutine.block(),
+        poutine.trace() as trace,
+        poutine.condition(data={**draws, **values}),
+        pyro.plate("draw", number, dim=-3),
+        pyro.plate("person", people, dim=-2),
+    ):
+        human.prior()
+    total = next(human.parameters()).new_zeros(1, 1, 1, 1)
+    for site in grid:
+        node = trace.trace.nodes[site]
+        total = total + node["fn"].log_prob(node["value"])
+    size = max([len(value) for value in grid.values()], default=1)
+    return total.expand(size, number, people, 1).squeeze(-1).permute(1, 2, 0)

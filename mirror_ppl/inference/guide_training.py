@@ -1,0 +1,244 @@
+"""Training of the amortized guide by inference compilation.
+
+People are drawn from the prior, play rounds in the true domain, and the guide learns to find the
+implants that made them play so, from the first rounds, from more of them, and from all::
+
+    psi_p ~ prior;   rounds_p ~ program(psi_p);   minimize  - E log q(psi_p | first n rounds_p)
+
+(Le, Baydin and Wood, *Inference compilation and universal probabilistic programming*, 2017). At its
+minimum the guide is the posterior of everybody at once, as far as it can express it.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.errors import CheckpointError
+from mirror_ppl.files import write_whole
+from mirror_ppl.inference.amortized import (
+    AmortizedGuide,
+    guide_screening,
+    log_evidence,
+    reference_places,
+)
+from mirror_ppl.inference.calibration import prior_people
+from mirror_ppl.inference.importance import places, scalar_sites
+from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.inference.sightings import Sightings
+from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.svi import Report, silent
+from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.weights import fingerprint
+
+
+@dataclass(frozen=True)
+class GuideOptions:
+    """Settings of training a guide.
+
+    Attributes:
+        people: number of people drawn from the prior.
+        rounds: numbers of rounds after which evidence is looked at, increasing.
+        steps: gradient steps.
+        batch: examples in a gradient step, of a person and a number of rounds each.
+        learning_rate: of Adam at the start; it falls to nothing on a cosine.
+        held_out: share of the people who only tell when to stop.
+        together: people who are simulated at once.
+    """
+
+    people: int = 1500
+    rounds: tuple[int, ...] = (1, 2, 3, 5, 8, 13, 20, 40)
+    steps: int = 4000
+    batch: int = 256
+    learning_rate: float = 1e-3
+    held_out: float = 0.1
+    together: int = 20
+
+    def __post_init__(self) -> None:
+        for name, least in (("people", 10), ("steps", 1), ("batch", 1), ("together", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
+            raise ValueError(f"rounds must be positive and increase, not {self.rounds}")
+
+
+@dataclass(frozen=True)
+class Examples:
+    """What there is to learn from, of N people and n numbers of rounds.
+
+    Attributes:
+        place: true implants in unconstrained space, ``[N, D]``.
+        log_evidence: ``[N, n, W]``.
+        steps: recorded actions so far, ``[N, n]``.
+    """
+
+    place: Tensor
+    log_evidence: Tensor
+    steps: Tensor
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+
+def train_guide(
+    human: HumanModel,
+    options: GuideOptions,
+    seed: int,
+    report: Report = silent,
+    checkpoint: Path | None = None,
+) -> tuple[AmortizedGuide, dict[str, float]]:
+    """A guide for a human model, and how good it is on people whom it did not learn from.
+
+    Args:
+        human: the model of people.
+        options: settings.
+        seed: of everything random.
+        report: told of people simulated and of gradient steps.
+        checkpoint: file to continue the simulation of people from; written on the way.
+
+    Returns:
+        The guide; and in nats a person its mean loss on held-out people, that of the prior, and
+        their difference: what the guide learns from rounds.
+
+    Raises:
+        CheckpointError: the checkpoint is damaged or of another run.
+    """
+    examples = simulate_examples(human, options, seed, report, checkpoint)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return _optimize(human, examples, options, report)
+
+
+def simulate_examples(
+    human: HumanModel,
+    options: GuideOptions,
+    seed: int,
+    report: Report = silent,
+    checkpoint: Path | None = None,
+) -> Examples:
+    """People from the prior, and what their rounds say, more and more of them."""
+    run = {
+        "self_model": fingerprint(human.self_model),
+        "human_model": type(human).__name__,
+        "seed": seed,
+        "people": options.people,
+        "rounds": list(options.rounds),
+        "together": options.together,
+    }
+    parts = _restored(checkpoint, run)
+    done = sum(len(part) for part in parts)
+    while done < options.people:
+        report("simulate", done, options.people, "people")
+        # Of each group its own luck, so that a run that goes on is the same as one never stopped.
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + done)
+        number = min(options.together, options.people - done)
+        implants = prior_people(human, number, generator)
+        recordings = play_rounds(
+            human, implants, options.rounds[-1], human.domain.settings[-1], generator
+        )
+        evidence, steps = zip(
+            *(_evidence(human, recordings, person, options) for person in range(number)),
+            strict=True,
+        )
+        place = places(scalar_sites(human), implants)
+        parts.append(Examples(place, torch.stack(evidence), torch.stack(steps)))
+        done += number
+        if checkpoint is not None:
+            content = {"run": run, "parts": [vars(part) for part in parts]}
+            write_whole(checkpoint, lambda path, what=content: torch.save(what, path))
+    report("simulate", done, options.people, "people")
+    return Examples(*(torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])))
+
+
+def _evidence(
+    human: HumanModel, recordings: Demonstrations, person: int, options: GuideOptions
+) -> tuple[Tensor, Tensor]:
+    sightings = Sightings(human, guide_screening())
+    evidence, steps, total = [], [], 0
+    for number, one_round in enumerate(rounds_of(recordings, person), 1):
+        sightings.add(*one_round)
+        total += int(one_round[-1].sum())
+        if number in options.rounds:
+            evidence.append(log_evidence(sightings))
+            steps.append(total)
+    return torch.stack(evidence), torch.tensor(steps)
+
+
+def _restored(checkpoint: Path | None, run: dict[str, Any]) -> list[Examples]:
+    if checkpoint is None or not checkpoint.exists():
+        return []
+    try:
+        content = torch.load(checkpoint, weights_only=True)
+        own, parts = content["run"], [Examples(**part) for part in content["parts"]]
+    except Exception as error:
+        raise CheckpointError(
+            f"{checkpoint} is not a checkpoint of this program; remove it"
+        ) from error
+    if own != run:
+        raise CheckpointError(
+            f"{checkpoint} belongs to a training with other options; remove it to start anew"
+        )
+    return parts
+
+
+def _optimize(
+    human: HumanModel, examples: Examples, options: GuideOptions, report: Report
+) -> tuple[AmortizedGuide, dict[str, float]]:
+    sites = scalar_sites(human)
+    guide = AmortizedGuide(reference_places(human))
+    held_out = max(1, round(options.held_out * len(examples)))
+    learned = len(examples) - held_out
+    numbers = examples.steps.shape[1]
+
+    def loss(person: Tensor, number: Tensor) -> Tensor:
+        """Mean negative log density of the truth, by the guide as a program."""
+        place = examples.place[person][:, None]
+        program = poutine.condition(guide, data={"place": place})
+        evidence, steps = examples.log_evidence[person, number], examples.steps[person, number]
+        trace = poutine.trace(program).get_trace(sites, evidence, steps)
+        return -torch.as_tensor(trace.log_prob_sum()) / len(person)
+
+    test = torch.cartesian_prod(torch.arange(learned, len(examples)), torch.arange(numbers)).T
+    optimizer = torch.optim.Adam(guide.parameters(), options.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.steps)
+    best, kept = float("inf"), copy.deepcopy(guide.state_dict())
+    for step in range(options.steps):
+        optimizer.zero_grad()
+        value = loss(
+            torch.randint(learned, (options.batch,)), torch.randint(numbers, (options.batch,))
+        )
+        value.backward()
+        torch.nn.utils.clip_grad_norm_(guide.parameters(), 10.0)
+        optimizer.step()
+        schedule.step()
+        if step % 50 == 49 or step == options.steps - 1:
+            with torch.no_grad():
+                found = float(loss(*test))
+            if found < best:
+                best, kept = found, copy.deepcopy(guide.state_dict())
+            report("train", step + 1, options.steps, f"held-out loss {found:.3f}")
+    guide.load_state_dict(kept)
+    prior = _prior_loss(human, examples, learned)
+    quality = {"loss": best, "prior_loss": prior, "learned": prior - best}
+    return guide.eval(), quality
+
+
+def _prior_loss(human: HumanModel, examples: Examples, learned: int) -> float:
+    """What the loss would be if the guide were the prior."""
+    given = {
+        name: site(examples.place[learned:, column]).view(-1, 1, 1)
+        for column, (name, site) in enumerate(scalar_sites(human).items())
+    }
+    number = len(examples) - learned
+    with torch.random.fork_rng(devices=[]):
+        nodes = sample_sites(human, 1, number, given)
+    total = sum(nodes[name]["fn"].log_prob(value).sum() for name, value in given.items())
+    return -float(total) / number
