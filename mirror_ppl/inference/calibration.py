@@ -28,6 +28,7 @@ from torch import Tensor
 from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
+from mirror_ppl.inference.guides import Inferred
 from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.ranks import Calibration, collect, judge
 from mirror_ppl.inference.simulation import play_rounds
@@ -39,19 +40,6 @@ PRIOR_PEOPLE = 4000
 """Drawn to know the prior's widths and entropies to a few percent."""
 PEOPLE_AT_ONCE = 500
 """Drawn from the prior at once; bounds memory."""
-
-
-@dataclass(frozen=True)
-class Inferred:
-    """What was inferred of P people.
-
-    Attributes:
-        draws: posterior draws by site, ``[S, P, 1, ...]``, as the human model samples them.
-        pareto_k: of importance weights ``[P]``, if there are any.
-    """
-
-    draws: Mapping[str, Tensor]
-    pareto_k: Tensor | None = None
 
 
 Infer = Callable[[Demonstrations, int], Inferred]

@@ -13,8 +13,8 @@ Simpson, Gelman, Yao and Gabry, *Pareto smoothed importance sampling*, 2015).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal, biject_to
 
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.exact import acts_on_beliefs, combination_values, log_joints
+from mirror_ppl.inference.exact import acts_on_beliefs, log_joints
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import restricted
 from mirror_ppl.models.human import HumanModel
@@ -121,12 +121,19 @@ class Sampler:
         human: the model of people.
         table: views of one person's rounds.
 
+    Raises:
+        HumanModelError: actions depend on what is seen otherwise than through beliefs.
+
     Attributes:
         combinations: those of the discrete sites that are still possible, ``[C]``.
         place: the scalar sites of all draws, in unconstrained space ``[S, D]``.
     """
 
     def __init__(self, human: HumanModel, table: ViewTable) -> None:
+        if not acts_on_beliefs(human, table):
+            raise HumanModelError(
+                "act() reads a site that perceive() reads, too; only the guide svi can fit this"
+            )
         self.human = human
         self.table = table
         self.sites = scalar_sites(human)
@@ -217,57 +224,6 @@ def sample_exactly(human: HumanModel, table: ViewTable, options: ImportanceOptio
         gaussian = _gaussian(sampler.place, found.log_weights, options.wider)
         sampler.propose(gaussian, options.proposals)
     return sampler.weighted()
-
-
-def draw_by_importance(
-    human: HumanModel, table: ViewTable, number: int, seed: int, weigh: Callable[..., Weighted]
-) -> tuple[Draws, Tensor]:
-    """Joint draws ``[number, P, 1, ...]`` of all sites of P people, and Pareto k ``[P]``.
-
-    Args:
-        human: the model of people.
-        table: views of everybody's rounds.
-        number: of draws of each person.
-        seed: of everything random.
-        weigh: makes weighted draws of a table of one person, given that and the person's number.
-
-    Raises:
-        HumanModelError: actions depend on what is seen otherwise than through beliefs.
-    """
-    if not acts_on_beliefs(human, table):
-        raise HumanModelError(
-            "act() reads a site that perceive() reads, too; only --guide svi can fit such a model"
-        )
-    values = combination_values(human, table)
-    draws, pareto_k = [], []
-    with torch.random.fork_rng(devices=[]):
-        for person in range(table.people):
-            torch.manual_seed((seed + 1) * 10_000 + person)
-            found = weigh(of_person(table, person), person)
-            draws.append(found.sample(number, values))
-            pareto_k.append(found.pareto_k)
-    return (
-        {name: torch.cat([own[name] for own in draws], 1) for name in draws[0]},
-        torch.tensor(pareto_k),
-    )
-
-
-def of_person(table: ViewTable, person: int) -> ViewTable:
-    """The part of a table that is one person's, without padding."""
-    one = slice(person, person + 1)
-    rounds = max(int(table.real[person].sum()), 1)
-    views = max(int(table.view_counts[person]), 1)
-    return replace(
-        table,
-        index=table.index[one, :rounds],
-        belief=table.belief[one, :views],
-        values=table.values[one, :views],
-        view_actions=table.view_actions[one, :views],
-        view_steps=table.view_steps[one, :views],
-        recorded=table.recorded[one, :rounds],
-        steps=table.steps[one, :rounds],
-        view_counts=table.view_counts[one],
-    )
 
 
 @torch.no_grad()

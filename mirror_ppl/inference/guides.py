@@ -1,0 +1,149 @@
+"""The ways to infer a person's implants, one interface for all.
+
+=============  ==================================================================================
+``amortized``  a trained network proposes, importance weights correct; at once
+``exact``      the same without a network: adaptive importance sampling from the prior on
+``svi``        variational inference, one optimization for the people at hand
+``nuts``       Hamiltonian Monte Carlo; slow, to compare with on small problems
+=============  ==================================================================================
+
+All marginalize the discrete sites that perception reads exactly, and all return the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
+from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.nuts import sample_nuts
+from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
+from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.models.human import HumanModel
+
+GUIDES = ("amortized", "exact", "svi", "nuts")
+
+
+@dataclass(frozen=True)
+class Inferred:
+    """What was inferred of P people.
+
+    Attributes:
+        draws: joint posterior draws by site, ``[S, P, 1, ...]``, as the human model samples them.
+        pareto_k: of importance weights ``[P]``, if there are any.
+        losses: negative ELBO at each step in nats, if one was optimized.
+    """
+
+    draws: Mapping[str, Tensor]
+    pareto_k: Tensor | None = None
+    losses: tuple[float, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class InferenceOptions:
+    """How to infer.
+
+    Attributes:
+        guide: one of ``GUIDES``.
+        draws: posterior draws S of each person.
+        svi: settings of ``svi``; its number of draws is not used.
+        exact: settings of ``exact``.
+        screening: when to give up combinations of discrete sites; ``None`` for never. That of the
+            amortized guide is its own.
+    """
+
+    guide: str = "exact"
+    draws: int = 200
+    svi: FitOptions = FitOptions()
+    exact: ImportanceOptions = ImportanceOptions()
+    screening: Screening | None = Screening()
+
+    def __post_init__(self) -> None:
+        if self.guide not in GUIDES:
+            raise UnknownNameError.of("guide", self.guide, GUIDES)
+        if self.draws < 1:
+            raise ValueError(f"draws must be at least 1, not {self.draws}")
+
+
+def infer(
+    human: HumanModel,
+    demonstrations: Demonstrations,
+    options: InferenceOptions,
+    seed: int,
+    network: AmortizedGuide | None = None,
+    report: Report = silent,
+    checkpoint: tuple[Path, str] | None = None,
+) -> Inferred:
+    """Posterior draws of the implants of P people.
+
+    Args:
+        human: the model of people.
+        demonstrations: rounds of P people.
+        options: how to infer.
+        seed: of everything random.
+        network: of the amortized guide.
+        report: told of progress.
+        checkpoint: of ``svi``, see :func:`fit_implants`.
+
+    Raises:
+        HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
+        CheckpointError: the checkpoint is damaged or of another run.
+    """
+    if options.guide in ("amortized", "exact"):
+        if options.guide == "exact":
+            network = None
+        elif network is None:
+            raise ValueError("the amortized guide needs its network")
+        return _by_importance(human, demonstrations, options, seed, network, report)
+    people = demonstrations.num_people
+    table = build_view_table(
+        human,
+        demonstrations,
+        screening=options.screening,
+        report=lambda done: report("views", done, people, "people"),
+    )
+    if options.guide == "nuts":
+        return Inferred(sample_nuts(human, table, options.draws, seed, report))
+    svi = replace(options.svi, draws=options.draws)
+    posterior = fit_implants(human, table, svi, seed, report, checkpoint)
+    return Inferred(posterior.draws, losses=posterior.losses)
+
+
+def _by_importance(
+    human: HumanModel,
+    demonstrations: Demonstrations,
+    options: InferenceOptions,
+    seed: int,
+    network: AmortizedGuide | None,
+    report: Report,
+) -> Inferred:
+    screening = options.screening if network is None else guide_screening()
+    people = demonstrations.num_people
+    drawn, pareto_k = [], []
+    with torch.random.fork_rng(devices=[]):
+        for person in range(people):
+            report("infer", person, people, "people")
+            sightings = Sightings(human, screening)
+            for one_round in rounds_of(demonstrations, person):
+                sightings.add(*one_round)
+            # People do not depend on each other: the same whoever else is there.
+            torch.manual_seed((seed + 1) * 1_000_003 + person)
+            if network is None:
+                found = sample_exactly(human, sightings.table(), options.exact)
+            else:
+                found = sample_amortized(human, network, sightings)
+            drawn.append(found.sample(options.draws, sightings.grid))
+            pareto_k.append(found.pareto_k)
+    report("infer", people, people, "people")
+    order = sample_sites(human, 1)
+    draws = {name: torch.cat([own[name] for own in drawn], 1) for name in order}
+    return Inferred(draws, torch.tensor(pareto_k))
