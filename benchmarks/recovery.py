@@ -16,7 +16,7 @@ import torch
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.guides import InferenceOptions
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -67,7 +67,7 @@ def main() -> None:
             for seed in options.seeds:
                 began = monotonic()
                 recordings = simulate("driving", options.setting, population, 10, 40, seed)
-                fit = fit_people(human, recordings, FitOptions(), seed, rounds)
+                fit = fit_people(human, recordings, InferenceOptions(), seed, rounds)
                 line = row(fit.summary, domain.reach_bins, sight_sites(domain))
                 name = f"{population:8s} {rounds:2d} rounds, seed {seed}"
                 print(f"{name}: {line}  {monotonic() - began:.0f} s", flush=True)

@@ -13,7 +13,7 @@ import torch
 from benchmarks.recovery import row
 from mirror_ppl.domains import get_domain
 from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.guides import InferenceOptions
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import perceptual_implants, policy_implants, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -67,7 +67,7 @@ def main() -> None:
         for seed in options.seeds:
             recordings = simulate("driving", "fog", population, 10, 40, seed)
             for model in (Ablated, NoLapse, NothingTaken, Neither):
-                fit = fit_people(model(self_model), recordings, FitOptions(), seed)
+                fit = fit_people(model(self_model), recordings, InferenceOptions(), seed)
                 line = row(fit.summary, domain.reach_bins, sight_sites(domain))
                 print(f"{population:8s} seed {seed} {model.__name__:16s}: {line}", flush=True)
 

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.inference.fitting import Fit, fit_people
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.importance import ImportanceOptions
 from mirror_ppl.inference.views import Screening
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
@@ -39,15 +40,18 @@ def main() -> None:
     self_model, _ = load_self_model(shipped_weights("driving"))
     human = HumanModel(self_model)
     bins = len(get_domain("driving").reach_bins)
-    usual = FitOptions(draws=800)
-    careful = FitOptions(draws=800, prune_margin=40.0)
-    wide = Screening(margin=40.0, resolution=0.0)
+    usual = InferenceOptions(draws=800)
+    careful = InferenceOptions(
+        draws=800,
+        exact=ImportanceOptions(prune_margin=40.0),
+        screening=Screening(margin=40.0, resolution=0.0),
+    )
     for population in options.populations:
         recordings = simulate("driving", "fog", population, options.people, 40, 0)
 
         default = fit_people(human, recordings, usual, 0, options.rounds)
         other = fit_people(human, recordings, usual, 1, options.rounds)
-        strict = fit_people(human, recordings, careful, 0, options.rounds, screening=wide)
+        strict = fit_people(human, recordings, careful, 0, options.rounds)
         print(population)
         for site in sight_sites(human.domain):
             reference = marginal(default, site, bins)

@@ -41,8 +41,11 @@ class Options:
     """A human model of your own: path/to/file.py:Class (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
+    guide: str = "exact"
+    """How to infer: exact (what people see marginalized, how they decide by importance sampling),
+    svi (variational) or nuts (Hamiltonian Monte Carlo, slow)."""
     steps: int = 300
-    """Gradient steps of variational inference."""
+    """Gradient steps of svi."""
     draws: int = 200
     """Posterior draws."""
     seed: int = 0
@@ -69,6 +72,7 @@ def main(options: Options) -> None:
     from mirror_ppl.files import prepare_output_folder, write_whole
     from mirror_ppl.inference.export import save_inference_data
     from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
+    from mirror_ppl.inference.guides import InferenceOptions
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -88,7 +92,7 @@ def main(options: Options) -> None:
         result = fit_people(
             human,
             demonstrations.to(device),
-            FitOptions(steps=options.steps, draws=options.draws),
+            InferenceOptions(options.guide, options.draws, FitOptions(steps=options.steps)),
             options.seed,
             options.train_rounds,
             stages.report,

@@ -49,7 +49,7 @@ warnings.filterwarnings("ignore", message="IProgress not found")
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.guides import InferenceOptions
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -82,7 +82,7 @@ recordings
 # %%
 self_model, card = load_self_model(shipped_weights("driving"))
 human = HumanModel(self_model)
-options = FitOptions(steps=5, draws=20) if quick else FitOptions()
+options = InferenceOptions(draws=20) if quick else InferenceOptions()
 
 fit = fit_people(human, recordings, options, seed=0, train_rounds=4 if quick else None)
 data = fit.data

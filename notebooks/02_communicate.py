@@ -49,7 +49,7 @@ from mirror_ppl.communication import (
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.guides import InferenceOptions
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -73,7 +73,7 @@ domain = get_domain("driving")
 self_model, card = load_self_model(shipped_weights("driving"))
 human = HumanModel(self_model)
 recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people(["person-01"])
-options = FitOptions(steps=30, draws=16) if quick else FitOptions(draws=64)
+options = InferenceOptions(draws=16 if quick else 64)
 fit = fit_people(human, recordings, options, seed=0, train_rounds=10 if quick else None)
 person = Person(human, fit.posterior.draws)
 

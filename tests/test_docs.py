@@ -22,6 +22,7 @@ from mirror_ppl.domains.driving import Driving
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.fitting import fit_people
+from mirror_ppl.inference.guides import InferenceOptions
 from mirror_ppl.inference.self_model_training import SelfModelOptions
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import PLATES, FitOptions, continuous_guide
@@ -411,7 +412,7 @@ def test_a_late_person_is_told_from_a_prompt_one(self_model, generator):
 
     # So half divides the posteriors of the fit too, which does not know the other implants.
     with torch.enable_grad():
-        fit = fit_people(human, recordings, FitOptions(draws=100), 0, 20)
+        fit = fit_people(human, recordings, InferenceOptions(draws=100), 0, 20)
     late, prompt = (person["implants"]["late"] for person in fit.summary["people"])
     assert late["median"] > 0.5 > prompt["q95"]
     assert late["q05"] > prompt["q95"]

@@ -17,6 +17,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.inference.exact import draw_combinations, log_joint, log_prior, marginals
 from mirror_ppl.inference.fitting import fit_people
+from mirror_ppl.inference.guides import InferenceOptions
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import (
     FitOptions,
@@ -285,9 +286,9 @@ def test_prior_draws_are_those_of_the_program(self_model, rounds):
     human = Moody(self_model)
     table = build_view_table(human, rounds)
     torch.manual_seed(1)
-    draws = draw_prior(human, table, 2000, seed=4)
+    draws = draw_prior(human, table.people, 2000, seed=4)
     torch.manual_seed(2)
-    again = draw_prior(human, table, 2000, seed=4)
+    again = draw_prior(human, table.people, 2000, seed=4)
     assert all(torch.equal(value, again[name]) for name, value in draws.items())
     assert list(draws)[:3] == ["mood", *SITES]
     assert draws["residual_out"].shape == (2000, 3, 1, 9, 2)
@@ -329,6 +330,7 @@ def test_predictions_agree_with_perceive_believe_act(few, rounds):
 
 
 TINY = FitOptions(steps=6, draws=9, checkpoint_every=2, prune_every=2, prune_margin=1.0)
+TINY_SVI = InferenceOptions("svi", TINY.draws, TINY)
 
 
 def assert_same(one, other):
@@ -400,7 +402,7 @@ def test_checkpoint_of_another_fit_is_refused(few, recordings, tmp_path):
     path = tmp_path / "fit.checkpoint"
     some = recordings.select_people([0]).select_rounds(range(2))
 
-    def fit(human=few, demonstrations=some, options=TINY, seed=0, report=lambda *done: None):
+    def fit(human=few, demonstrations=some, options=TINY_SVI, seed=0, report=lambda *done: None):
         fit_people(human, demonstrations, options, seed, 2, report, path)
 
     with pytest.raises(KeyboardInterrupt):
@@ -408,7 +410,7 @@ def test_checkpoint_of_another_fit_is_refused(few, recordings, tmp_path):
     content = path.read_bytes()
     for other in (
         {"seed": 1},
-        {"options": replace(TINY, draws=10)},
+        {"options": replace(TINY_SVI, draws=10)},
         {"human": Sure(few.self_model)},
         {"demonstrations": recordings.select_people([1]).select_rounds(range(2))},
     ):
@@ -452,7 +454,7 @@ def test_fit_tells_who_is_consistent_and_how_far_they_see(few, generator):
 def test_people_without_discrete_implants_can_be_fitted(self_model, recordings):
     human = Sure(self_model)
     some = recordings.select_people([0, 1]).select_rounds(range(3))
-    fit = fit_people(human, some, TINY, seed=0, train_rounds=2)
+    fit = fit_people(human, some, TINY_SVI, seed=0, train_rounds=2)
     assert set(fit.posterior.draws) == {"consistency", "lapse", "residual_in", "residual_out"}
     assert [list(person["implants"]) for person in fit.summary["people"]] == [
         ["consistency", "lapse"]

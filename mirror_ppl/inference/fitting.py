@@ -6,6 +6,7 @@ import hashlib
 import inspect
 import json
 from dataclasses import asdict, dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,19 +17,15 @@ from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
-from mirror_ppl.inference.prior import Draws
+from mirror_ppl.inference.amortized import AmortizedGuide
+from mirror_ppl.inference.combinations import perceived_sites
+from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer
+from mirror_ppl.inference.prior import Draws, draw_prior
 from mirror_ppl.inference.summary import summarize
-from mirror_ppl.inference.svi import (
-    FitOptions,
-    ImplantPosterior,
-    Report,
-    draw_prior,
-    fit_implants,
-    predict_actions,
-    silent,
-)
-from mirror_ppl.inference.views import Screening, build_view_table
+from mirror_ppl.inference.svi import Report, predict_actions, silent
+from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.view_table import combination_number
 from mirror_ppl.models.weights import fingerprint
 
 if TYPE_CHECKING:
@@ -44,12 +41,12 @@ class Fit:
     """Everything that came out of fitting P people.
 
     Attributes:
-        posterior: guide, draws and losses.
+        posterior: draws, and how they came about.
         data: the posterior and predictions as ArviZ ``InferenceData``.
         summary: what ``summary.json`` holds.
     """
 
-    posterior: ImplantPosterior
+    posterior: Inferred
     data: az.InferenceData
     summary: dict[str, Any]
 
@@ -107,64 +104,59 @@ def check_world(demonstrations: Demonstrations) -> None:
 def fit_people(
     human: HumanModel,
     demonstrations: Demonstrations,
-    options: FitOptions,
-    seed: int,
+    options: InferenceOptions = InferenceOptions(),  # noqa: B008 - frozen
+    seed: int = 0,
     train_rounds: int | None = None,
     report: Report = silent,
     checkpoint: Path | None = None,
-    screening: Screening | None = Screening(),  # noqa: B008 - frozen
+    network: AmortizedGuide | None = None,
 ) -> Fit:
     """Infer the implants of everybody in recordings, and predict their held-out actions.
 
     Args:
         human: the model of people.
         demonstrations: rounds of P people; see :func:`check_world`.
-        options: settings of inference.
+        options: how to infer.
         seed: seed of everything random.
         train_rounds: see :func:`split_rounds`.
         report: told of progress.
-        checkpoint: file to continue from; written on the way, removed by nobody.
-        screening: when to give up combinations of discrete implants; ``None`` for never.
+        checkpoint: file that ``svi`` continues from; written on the way, removed by nobody.
+        network: of the guide ``amortized``.
 
     Raises:
         DemonstrationsError: too few rounds.
-        HumanModelError: the human model breaks its contract.
+        HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
         CheckpointError: the checkpoint is damaged or of another run.
     """
     train, test = split_rounds(demonstrations, train_rounds)
     people = train.num_people
-    table = build_view_table(
+    posterior = infer(
         human,
         train,
-        screening=screening,
-        report=lambda done: report("views", done, people, "people"),
-    )
-    run = _identity(human, train, options, screening, seed)
-    posterior = fit_implants(
-        human,
-        table,
         options,
         seed,
+        network,
         report,
-        None if checkpoint is None else (checkpoint, run),
+        None if checkpoint is None else (checkpoint, _identity(human, train, options, seed)),
     )
-    prior = draw_prior(human, table, PRIOR_DRAWS, seed)
+    prior = draw_prior(human, people, PRIOR_DRAWS, seed)
+    sizes = {site: len(support) for site, support in perceived_sites(human).items()}
 
     def predicted(rounds: Demonstrations, draws: Draws) -> Tensor:
         # Only what some draw sees is looked at: exact views, without screening or merging.
         candidates = [
-            table.combination({site: draws[site][:, person, 0] for site in table.sites}).unique()
+            combination_number({site: draws[site][:, person, 0] for site in sizes}, sizes).unique()
             for person in range(people)
         ]
         return predict_actions(human, build_view_table(human, rounds, candidates), draws).cpu()
 
     report("predict", 0, 3, "")
-    log_probabilities = {"posterior": predicted(train, posterior.draws)}
+    log_probabilities = {"posterior": predicted(train, dict(posterior.draws))}
     report("predict", 1, 3, "")
     log_probabilities["prior"] = predicted(train, prior)
     report("predict", 2, 3, "")
     if test is not None:
-        log_probabilities["test"] = predicted(test, posterior.draws)
+        log_probabilities["test"] = predicted(test, dict(posterior.draws))
     report("predict", 3, 3, "")
 
     # Results live where everybody can read them.
@@ -182,15 +174,17 @@ def fit_people(
         "setting": train.setting,
         "human_model": type(human).__name__,
         "self_model": fingerprint(human.self_model),
+        "guide": options.guide,
         "version": __version__,
         "seed": seed,
     } | {f"recorded_{name}": value for name, value in train.provenance.items()}
     generator = torch.Generator().manual_seed(seed)
     data = to_inference_data(train, test, drawn, prior, log_probabilities, attributes, generator)
-    summary = attributes | {
-        "options": asdict(options),
-        "people": summarize(in_units(domain, drawn), train, test, log_probabilities),
-    }
+    found = summarize(in_units(domain, drawn), train, test, log_probabilities)
+    if posterior.pareto_k is not None:
+        for person, value in zip(found, posterior.pareto_k.tolist(), strict=True):
+            person["pareto_k"] = value if isfinite(value) else None
+    summary = attributes | {"options": asdict(options), "people": found}
     return Fit(posterior, data, summary)
 
 
@@ -203,11 +197,7 @@ def _source(kind: type) -> str:
 
 
 def _identity(
-    human: HumanModel,
-    train: Demonstrations,
-    options: FitOptions,
-    screening: Screening | None,
-    seed: int,
+    human: HumanModel, train: Demonstrations, options: InferenceOptions, seed: int
 ) -> str:
     """What a checkpoint belongs to: recordings, model and options, as a hash."""
     digest = hashlib.sha256()
@@ -216,7 +206,6 @@ def _identity(
         digest.update(name.encode())
         digest.update(parts[name].detach().cpu().numpy().tobytes())
     source = [_source(kind) for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
-    screened = None if screening is None else asdict(screening)
-    description = [source, __version__, seed, asdict(options), screened]
+    description = [source, __version__, seed, asdict(options)]
     digest.update(json.dumps(description, sort_keys=True).encode())
     return digest.hexdigest()

@@ -56,3 +56,10 @@ def values_of(nodes: Mapping[str, Any]) -> Draws:
         name: node["value"].expand(node["fn"].batch_shape + node["fn"].event_shape)
         for name, node in nodes.items()
     }
+
+
+def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
+    """Draws ``[S, P, 1, ...]`` of the prior of all sites, in the order of the program."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return values_of(sample_sites(human, people, number))

@@ -21,7 +21,7 @@ from mirror_ppl.distinct import distinct_rows
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.inference.combinations import grid_of, log_priors, perceived_sites
 from mirror_ppl.inference.courses import beliefs_and_values
-from mirror_ppl.inference.prior import sample_sites, values_of
+from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
@@ -158,9 +158,7 @@ class Sightings:
     def draw_ways(self) -> dict[str, Tensor]:
         """The ways to decide, ``[ways, 1, 1, ...]``; always the same."""
         if not self.ways and self.screening is not None:
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(self.screening.seed)
-                self.ways = values_of(sample_sites(self.human, 1, self.screening.ways))
+            self.ways = draw_prior(self.human, 1, self.screening.ways, self.screening.seed)
         return self.ways
 
     def _act(self, belief: Tensor, values: Tensor) -> Tensor:

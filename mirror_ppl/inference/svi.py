@@ -145,7 +145,7 @@ def fit_implants(
         guide = continuous_guide(human, table)
         table, losses = _optimize(human, table, guide, options, report, checkpoint)
         draws = draw_implants(human, table, guide, options.draws, report)
-        draws = {name: draws[name] for name in draw_prior(human, table, 1, seed)}
+        draws = {name: draws[name] for name in sample_sites(human, 1)}
     return ImplantPosterior(guide, draws, tuple(losses))
 
 
@@ -279,14 +279,6 @@ def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) 
     )
     trace = poutine.trace(sampled).get_trace(table)
     return {**continuous, **values_of(latent_sites(trace))}
-
-
-@torch.no_grad()
-def draw_prior(human: HumanModel, table: ViewTable, number: int, seed: int) -> Draws:
-    """Draws ``[S, P, 1, ...]`` of the prior of all implants, in the order of the program."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return values_of(sample_sites(human, table.people, number))
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ view of a round and kept; the program then looks up the view that its implants l
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,15 @@ NO_VIEW = -1
 """Index of a combination of implants that was given up."""
 IMPOSSIBLE = -1e6
 """Log-likelihood in nats of such a combination; finite, so that gradients are numbers."""
+
+
+def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
+    """Number of the combination that implants ``[...]`` are, row-major over these sites."""
+    number = torch.zeros((), dtype=torch.long)
+    for site, size in sizes.items():
+        value = implants[site].long()
+        number = number.to(value.device) * size + value
+    return number
 
 
 @dataclass(frozen=True)
@@ -78,10 +88,7 @@ class ViewTable:
 
     def combination(self, implants: Implants) -> Tensor:
         """Number of the combination that implants ``[...]`` are, row-major over ``sizes``."""
-        combination = torch.zeros((), dtype=torch.long, device=self.index.device)
-        for site, size in zip(self.sites, self.sizes, strict=True):
-            combination = combination * size + implants[site].long()
-        return combination
+        return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
 
     def log_likelihoods(self, log_probabilities: Tensor) -> Tensor:
         """Log-likelihood of the recorded actions under each view.
