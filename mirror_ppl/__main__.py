@@ -10,6 +10,7 @@ PROGRAM = "python -m mirror_ppl"
 COMMANDS = {
     "fit": "infer what people see and how they decide from their recorded rounds",
     "assist": "pair communicators with people, and see who helps how much",
+    "calibrate": "see whether posteriors are as sure as they have a right to be",
     "compare": "compare human models by how well they predict what people do",
     "train": "train a domain's self-model",
     "simulate": "record rounds of simulated people",

@@ -6,8 +6,9 @@ import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from mirror_ppl.errors import OutputError
+from mirror_ppl.errors import CheckpointError, OutputError
 
 
 def write_whole(path: str | os.PathLike[str], writer: Callable[[Path], object]) -> Path:
@@ -74,6 +75,26 @@ def prepare_output_folder(path: str | os.PathLike[str]) -> Path:
         _remove_folders(made)
         raise OutputError(f"cannot write in the folder {folder}: {_reason(error)}") from error
     return folder
+
+
+def read_checkpoint(path: Path, run: Any) -> dict[str, Any]:
+    """What a checkpoint of a run holds, written by ``torch.save`` with the run under ``"run"``.
+
+    Raises:
+        CheckpointError: the file is damaged or of another run.
+    """
+    import torch
+
+    try:
+        content = torch.load(path, weights_only=True)
+        own = content["run"]
+    except Exception as error:
+        raise CheckpointError(f"{path} is not a checkpoint of this program; remove it") from error
+    if own != run:
+        raise CheckpointError(
+            f"{path} belongs to a run with other recordings or options; remove it to start anew"
+        )
+    return content
 
 
 def require_files_of_their_own(

@@ -414,7 +414,7 @@ def test_checkpoint_of_another_fit_is_refused(few, recordings, tmp_path):
         {"human": Sure(few.self_model)},
         {"demonstrations": recordings.select_people([1]).select_rounds(range(2))},
     ):
-        with pytest.raises(CheckpointError, match="belongs to a fit with other"):
+        with pytest.raises(CheckpointError, match="belongs to a run with other"):
             fit(**other)
         assert path.read_bytes() == content
     for damaged in (content[: len(content) // 2], b"", b"nonsense"):

@@ -184,7 +184,7 @@ def sample_amortized(
     """
     evidence = evidence_of(sightings)
     sampler = Sampler(human, evidence.table)
-    sampler.start_from(evidence.ways, evidence.joint)
+    sampler.take(evidence.ways, evidence.joint)
     sampler.prune(prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
     sampler.propose(guide.density(evidence.log_evidence, steps), proposals)

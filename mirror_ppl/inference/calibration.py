@@ -16,9 +16,11 @@ is tested, in two ways (:mod:`mirror_ppl.inference.uniformity`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -28,6 +30,7 @@ from torch import Tensor
 from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
+from mirror_ppl.files import write_whole
 from mirror_ppl.inference.guides import Inferred
 from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.ranks import Calibration, collect, judge
@@ -106,54 +109,36 @@ def calibrate(
     setting: str,
     seed: int,
     report: Report = silent,
+    jobs: int = 1,
+    parts: tuple[Path, str] | None = None,
 ) -> Calibration:
     """Hold posteriors against people of whom everything is known, because the model drew them.
 
     Args:
         human: the model of people, from which people and rounds are drawn.
-        infer: what is to be tested.
+        infer: what is to be tested; if there are several processes, it has to be picklable.
         options: settings.
         setting: name under which the rounds are recorded.
         seed: of everything random; people and rounds are the same whatever ``infer`` is.
-        report: told how many inferences, of one person and number of rounds each, are done.
+        report: told how many people are done.
+        jobs: processes.
+        parts: folder in which finished batches are kept and looked for, and what identifies this
+            run (batches of another run are done anew).
 
     Raises:
         UnknownNameError: there is no such setting.
         ValueError: ``infer`` or a summary returned something else than it should.
     """
     require_known(setting, "setting", human.domain.settings)
-    generator = torch.Generator(next(human.parameters()).device).manual_seed(seed)
-    rng = np.random.default_rng(seed)
-    sites = {
-        name: site["fn"].support.is_discrete
-        for name, site in _prior_sites(human, 1, seed).items()
-        if site["fn"].event_dim == 0
-    }
-    scalars = _Scalars(tuple(sites), options.summaries)
-    drawn = prior_people(human, PRIOR_PEOPLE, generator)
-    prior = scalars.of(drawn, (PRIOR_PEOPLE,), "the prior")
-    discrete = [name for name in sites if sites[name]]
-    for name, summary in options.summaries.items():
-        discrete += [] if summary(drawn).is_floating_point() else [name]
-    parts: dict[int, list[xr.Dataset]] = {number: [] for number in options.rounds}
-    total, done = options.people * len(parts), 0
-    for begin in range(0, options.people, options.batch):
-        people = min(options.batch, options.people - begin)
-        implants = prior_people(human, people, generator)
-        truth = scalars.of(implants, (people,), "the prior")
-        recordings = play_rounds(human, implants, options.rounds[-1], setting, generator)
-        for number, judged in parts.items():
-            report("calibrate", done, total, f"{number} rounds")
-            inferred = infer(recordings.select_rounds(range(number)), _seed(generator))
-            number_of_draws = len(next(iter(inferred.draws.values()), ()))
-            source = f"infer() of {number} rounds"
-            draws = scalars.of(inferred.draws, (number_of_draws, people), source)
-            pareto_k = None
-            if inferred.pareto_k is not None:
-                pareto_k = inferred.pareto_k.detach().double().cpu().numpy()
-            judged.append(judge(truth, draws, discrete, rng, pareto_k))
-            done += people
-    report("calibrate", done, total, "")
+    trial = _Trial(human, options, setting, seed)
+    begins = range(0, options.people, options.batch)
+    report("calibrate", 0, options.people, "people")
+    found: dict[int, dict[int, xr.Dataset]] = {}
+    done = 0
+    for begin, judged in _each_batch(trial, infer, begins, jobs, parts):
+        found[begin] = judged
+        done += judged[options.rounds[0]].sizes["person"]
+        report("calibrate", done, options.people, "people")
     attributes = {
         "domain": human.domain.name,
         "domain_version": human.domain.version,
@@ -163,7 +148,106 @@ def calibrate(
         "version": __version__,
         "seed": str(seed),
     }
-    return collect(parts, prior, discrete, attributes)
+    ordered = {number: [found[begin][number] for begin in begins] for number in options.rounds}
+    return collect(ordered, trial.prior, trial.discrete, attributes)
+
+
+class _Trial:
+    """People of whom everything is known, batch by batch."""
+
+    def __init__(
+        self, human: HumanModel, options: CalibrationOptions, setting: str, seed: int
+    ) -> None:
+        self.human = human
+        self.options = options
+        self.setting = setting
+        self.seed = seed
+        sites = {
+            name: site["fn"].support.is_discrete
+            for name, site in _prior_sites(human, 1, seed).items()
+            if site["fn"].event_dim == 0
+        }
+        self.scalars = _Scalars(tuple(sites), options.summaries)
+        drawn = prior_people(human, PRIOR_PEOPLE, self._generator(-1))
+        self.prior = self.scalars.of(drawn, (PRIOR_PEOPLE,), "the prior")
+        self.discrete = [name for name in sites if sites[name]]
+        for name, summary in options.summaries.items():
+            self.discrete += [] if summary(drawn).is_floating_point() else [name]
+
+    def batch(self, infer: Infer, begin: int) -> dict[int, xr.Dataset]:
+        """The people from this number on, judged after each number of rounds."""
+        options, generator = self.options, self._generator(begin)
+        people = min(options.batch, options.people - begin)
+        rng = np.random.default_rng([self.seed, begin])
+        implants = prior_people(self.human, people, generator)
+        truth = self.scalars.of(implants, (people,), "the prior")
+        recordings = play_rounds(self.human, implants, options.rounds[-1], self.setting, generator)
+        judged = {}
+        for number in options.rounds:
+            inferred = infer(recordings.select_rounds(range(number)), _seed(generator))
+            number_of_draws = len(next(iter(inferred.draws.values()), ()))
+            source = f"infer() of {number} rounds"
+            draws = self.scalars.of(inferred.draws, (number_of_draws, people), source)
+            pareto_k = None
+            if inferred.pareto_k is not None:
+                pareto_k = inferred.pareto_k.detach().double().cpu().numpy()
+            judged[number] = judge(truth, draws, self.discrete, rng, pareto_k)
+        return judged
+
+    def _generator(self, begin: int) -> torch.Generator:
+        device = next(self.human.parameters()).device
+        return torch.Generator(device).manual_seed(self.seed * 1_000_003 + begin + 1)
+
+
+def _each_batch(
+    trial: _Trial, infer: Infer, begins: range, jobs: int, parts: tuple[Path, str] | None
+) -> Iterator[tuple[int, dict[int, xr.Dataset]]]:
+    if jobs == 1:
+        for begin in begins:
+            yield begin, _batch(trial, infer, begin, parts)
+        return
+    from joblib import Parallel, delayed
+
+    def numbered(begin: int) -> tuple[int, dict[int, xr.Dataset]]:
+        # One thread a process: the cores are shared by processes.
+        torch.set_num_threads(1)
+        return begin, _batch(trial, infer, begin, parts)
+
+    with warnings.catch_warnings():
+        # Processes that have used much memory are replaced by new ones; nothing is lost.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
+        finished = Parallel(n_jobs=jobs, return_as="generator_unordered")(
+            delayed(numbered)(begin) for begin in begins
+        )
+        yield from cast(Iterator[tuple[int, dict[int, xr.Dataset]]], finished)
+
+
+def _batch(
+    trial: _Trial, infer: Infer, begin: int, parts: tuple[Path, str] | None
+) -> dict[int, xr.Dataset]:
+    """Judged batches by number of rounds, from their files if these are there."""
+    if parts is None:
+        return trial.batch(infer, begin)
+    folder, run = parts
+    paths = {number: folder / f"{begin}-{number}.nc" for number in trial.options.rounds}
+    kept = {number: _kept(path, run) for number, path in paths.items()}
+    judged = {number: one for number, one in kept.items() if one is not None}
+    if len(judged) == len(paths):
+        return judged
+    judged = trial.batch(infer, begin)
+    for number, path in paths.items():
+        data = judged[number].assign_attrs(run=run)
+        write_whole(path, lambda file, data=data: data.to_netcdf(file, engine="h5netcdf"))
+    return judged
+
+
+def _kept(path: Path, run: str) -> xr.Dataset | None:
+    """What an earlier run left, if it was a run of the same thing."""
+    try:
+        data = xr.load_dataset(path, engine="h5netcdf")
+        return data if data.attrs.pop("run") == run else None
+    except (OSError, ValueError, KeyError):
+        return None
 
 
 def _seed(generator: torch.Generator) -> int:

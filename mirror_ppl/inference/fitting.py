@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
-import json
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
@@ -19,7 +17,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.amortized import AmortizedGuide
 from mirror_ppl.inference.combinations import perceived_sites
-from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer
+from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.prior import Draws, draw_prior
 from mirror_ppl.inference.summary import summarize
 from mirror_ppl.inference.svi import Report, predict_actions, silent
@@ -130,15 +128,10 @@ def fit_people(
     """
     train, test = split_rounds(demonstrations, train_rounds)
     people = train.num_people
-    posterior = infer(
-        human,
-        train,
-        options,
-        seed,
-        network,
-        report,
-        None if checkpoint is None else (checkpoint, _identity(human, train, options, seed)),
-    )
+    run = None
+    if checkpoint is not None:
+        run = checkpoint, run_identity(human, options, [_recorded(train), seed])
+    posterior = infer(human, train, options, seed, network, report, run)
     prior = draw_prior(human, people, PRIOR_DRAWS, seed)
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
 
@@ -188,24 +181,10 @@ def fit_people(
     return Fit(posterior, data, summary)
 
 
-def _source(kind: type) -> str:
-    """The whole file of a class, which may lean on anything in it."""
-    try:
-        return Path(inspect.getfile(kind)).read_text()
-    except (OSError, TypeError):  # a class made in a notebook has no file
-        return kind.__qualname__
-
-
-def _identity(
-    human: HumanModel, train: Demonstrations, options: InferenceOptions, seed: int
-) -> str:
-    """What a checkpoint belongs to: recordings, model and options, as a hash."""
+def _recorded(train: Demonstrations) -> str:
+    """The recordings, as a hash."""
     digest = hashlib.sha256()
-    parts = {**train.variables(), **human.state_dict()}
-    for name in sorted(parts):
+    for name, value in sorted(train.variables().items()):
         digest.update(name.encode())
-        digest.update(parts[name].detach().cpu().numpy().tobytes())
-    source = [_source(kind) for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
-    description = [source, __version__, seed, asdict(options)]
-    digest.update(json.dumps(description, sort_keys=True).encode())
+        digest.update(value.detach().cpu().numpy().tobytes())
     return digest.hexdigest()

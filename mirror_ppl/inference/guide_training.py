@@ -12,17 +12,16 @@ minimum the guide is the posterior of everybody at once, as far as it can expres
 from __future__ import annotations
 
 import copy
+import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.errors import CheckpointError
-from mirror_ppl.files import write_whole
+from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
     guide_screening,
@@ -125,7 +124,7 @@ def simulate_examples(
     checkpoint: Path | None = None,
 ) -> Examples:
     """People from the prior, and what their rounds say, more and more of them."""
-    run = {
+    description = {
         "self_model": fingerprint(human.self_model),
         "human_model": type(human).__name__,
         "seed": seed,
@@ -133,6 +132,7 @@ def simulate_examples(
         "rounds": list(options.rounds),
         "together": options.together,
     }
+    run = json.dumps(description, sort_keys=True)
     parts = _restored(checkpoint, run)
     done = sum(len(part) for part in parts)
     while done < options.people:
@@ -172,21 +172,11 @@ def _evidence(
     return torch.stack(evidence), torch.tensor(steps)
 
 
-def _restored(checkpoint: Path | None, run: dict[str, Any]) -> list[Examples]:
+def _restored(checkpoint: Path | None, run: str) -> list[Examples]:
     if checkpoint is None or not checkpoint.exists():
         return []
-    try:
-        content = torch.load(checkpoint, weights_only=True)
-        own, parts = content["run"], [Examples(**part) for part in content["parts"]]
-    except Exception as error:
-        raise CheckpointError(
-            f"{checkpoint} is not a checkpoint of this program; remove it"
-        ) from error
-    if own != run:
-        raise CheckpointError(
-            f"{checkpoint} belongs to a training with other options; remove it to start anew"
-        )
-    return parts
+    content = read_checkpoint(checkpoint, run)
+    return [Examples(**part) for part in content["parts"]]
 
 
 def _optimize(

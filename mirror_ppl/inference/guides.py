@@ -12,24 +12,31 @@ All marginalize the discrete sites that perception reads exactly, and all return
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import hashlib
+import inspect
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from time import monotonic
 
 import torch
 from torch import Tensor
 
+from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.nuts import sample_nuts
-from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
 from mirror_ppl.inference.views import build_view_table, rounds_of
 from mirror_ppl.models.human import HumanModel
 
+SECONDS_BETWEEN_CHECKPOINTS = 10.0
 GUIDES = ("amortized", "exact", "svi", "nuts")
 
 
@@ -92,7 +99,8 @@ def infer(
         seed: of everything random.
         network: of the amortized guide.
         report: told of progress.
-        checkpoint: of ``svi``, see :func:`fit_implants`.
+        checkpoint: a file that is written now and then and continued from if it exists, and what
+            identifies this run (a checkpoint of another run is refused); not of ``nuts``.
 
     Raises:
         HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
@@ -103,7 +111,7 @@ def infer(
             network = None
         elif network is None:
             raise ValueError("the amortized guide needs its network")
-        return _by_importance(human, demonstrations, options, seed, network, report)
+        return _by_importance(human, demonstrations, options, seed, network, report, checkpoint)
     people = demonstrations.num_people
     table = build_view_table(
         human,
@@ -125,12 +133,14 @@ def _by_importance(
     seed: int,
     network: AmortizedGuide | None,
     report: Report,
+    checkpoint: tuple[Path, str] | None,
 ) -> Inferred:
     screening = options.screening if network is None else guide_screening()
     people = demonstrations.num_people
-    drawn, pareto_k = [], []
+    done = _People() if checkpoint is None else _People.restored(*checkpoint)
+    saved = monotonic()
     with torch.random.fork_rng(devices=[]):
-        for person in range(people):
+        for person in range(len(done), people):
             report("infer", person, people, "people")
             sightings = Sightings(human, screening)
             for one_round in rounds_of(demonstrations, person):
@@ -141,9 +151,53 @@ def _by_importance(
                 found = sample_exactly(human, sightings.table(), options.exact)
             else:
                 found = sample_amortized(human, network, sightings)
-            drawn.append(found.sample(options.draws, sightings.grid))
-            pareto_k.append(found.pareto_k)
+            done.draws.append(found.sample(options.draws, sightings.grid))
+            done.pareto_k.append(found.pareto_k)
+            if checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
+                done.save(*checkpoint)
+                saved = monotonic()
     report("infer", people, people, "people")
     order = sample_sites(human, 1)
-    draws = {name: torch.cat([own[name] for own in drawn], 1) for name in order}
-    return Inferred(draws, torch.tensor(pareto_k))
+    draws = {name: torch.cat([own[name] for own in done.draws], 1) for name in order}
+    return Inferred(draws, torch.tensor(done.pareto_k))
+
+
+@dataclass(frozen=True)
+class _People:
+    """Those who are done."""
+
+    draws: list[Draws] = field(default_factory=list)
+    pareto_k: list[float] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.draws)
+
+    def save(self, path: Path, run: str) -> None:
+        write_whole(path, lambda temporary: torch.save({"run": run, **vars(self)}, temporary))
+
+    @classmethod
+    def restored(cls, path: Path, run: str) -> _People:
+        if not path.exists():
+            return cls()
+        content = read_checkpoint(path, run)
+        return cls(content["draws"], content["pareto_k"])
+
+
+def run_identity(human: HumanModel, options: InferenceOptions, more: Sequence[object]) -> str:
+    """What results belong to, as a hash: the human model with its source, the options, and more."""
+    digest = hashlib.sha256()
+    for name, value in sorted(human.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().numpy().tobytes())
+    source = [_source(kind) for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
+    description = [source, __version__, asdict(options), [str(part) for part in more]]
+    digest.update(json.dumps(description, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def _source(kind: type) -> str:
+    """The whole file of a class, which may lean on anything in it."""
+    try:
+        return Path(inspect.getfile(kind)).read_text()
+    except (OSError, TypeError):  # a class made in a notebook has no file
+        return kind.__qualname__

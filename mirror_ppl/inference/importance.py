@@ -28,6 +28,8 @@ from mirror_ppl.inference.views import restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
+PRUNING_DRAWS = 64
+"""Draws from the prior after which combinations of discrete sites are given up."""
 TRUSTED_PARETO_K = 0.7
 """Above this, the weights of so many draws cannot be relied on (the paper's threshold)."""
 
@@ -41,8 +43,8 @@ class ImportanceOptions:
         enough: effective draws at which no stage is added.
         stages: the largest number of stages.
         wider: factor on the covariance of what is proposed after the first stage.
-        prune_margin: nats below the best by which a combination of discrete sites, under every draw
-            of the first stage, is given up.
+        prune_margin: nats below the best by which a combination of discrete sites, under each of
+            the first draws, is given up.
     """
 
     proposals: int = 512
@@ -140,25 +142,24 @@ class Sampler:
         possible = (table.index[0] != NO_VIEW).all(0) | ~table.real.any()
         self.combinations = possible.nonzero().squeeze(-1)
         self.place = torch.zeros(0, len(self.sites), device=table.index.device)
+        self._from_prior = 0
         self._proposals: list[tuple[int, Proposal]] = []
         self._policies: list[Draws] = []
         self._joints: list[Tensor] = []
         self._log_prior = torch.zeros(0, device=table.index.device)
 
-    def start(self, number: int) -> None:
+    def draw(self, number: int) -> None:
         """Draw from the prior."""
         policy, _ = complete(self.human, self.table, {}, number)
-        self.start_from(policy, self._joint(policy))
+        self.take(policy, self._joint(policy))
 
-    def start_from(self, policy: Draws, joint: Tensor) -> None:
+    def take(self, policy: Draws, joint: Tensor) -> None:
         """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, C]``."""
-        self.place = places(self.sites, policy)
-        number = len(joint)
+        place = places(self.sites, policy)
         given = {name: policy[name] for name in self.sites}
-        _, log_prior = complete(self.human, self.table, given, number)
-        self._log_prior = log_prior + _stretch(self.sites, self.place)
-        self._policies, self._joints = [policy], [joint]
-        self._first = number
+        _, log_prior = complete(self.human, self.table, given, len(joint))
+        self._add(policy, joint, place, log_prior)
+        self._from_prior += len(joint)
 
     def prune(self, margin: float) -> None:
         """Give up combinations that are behind the best by more than that under every draw."""
@@ -179,16 +180,19 @@ class Sampler:
             for column, (name, site) in enumerate(self.sites.items())
         }
         policy, log_prior = complete(self.human, self.table, given, number)
-        self._policies.append(policy)
-        self._joints.append(self._joint(policy))
+        self._add(policy, self._joint(policy), place, log_prior)
         self._proposals.append((number, proposal))
+
+    def _add(self, policy: Draws, joint: Tensor, place: Tensor, log_prior: Tensor) -> None:
+        self._policies.append(policy)
+        self._joints.append(joint)
         self.place = torch.cat([self.place, place])
         self._log_prior = torch.cat([self._log_prior, log_prior + _stretch(self.sites, place)])
 
     def weighted(self) -> Weighted:
         """All draws, with their weights."""
         joint = torch.cat(self._joints)
-        parts = [self._log_prior + math.log(self._first / len(joint))]
+        parts = [self._log_prior + math.log(self._from_prior / len(joint))]
         for number, proposal in self._proposals:
             parts.append(proposal.log_prob(self.place) + math.log(number / len(joint)))
         mixture = torch.logsumexp(torch.stack(parts), 0)
@@ -215,8 +219,11 @@ def sample_exactly(human: HumanModel, table: ViewTable, options: ImportanceOptio
         options: settings.
     """
     sampler = Sampler(human, table)
-    sampler.start(options.proposals)
+    few = min(PRUNING_DRAWS, options.proposals)
+    sampler.draw(few)
     sampler.prune(options.prune_margin)
+    if options.proposals > few:
+        sampler.draw(options.proposals - few)
     for _ in range(options.stages if sampler.sites else 0):
         found = sampler.weighted()
         if found.effective >= options.enough:

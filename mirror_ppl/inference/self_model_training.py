@@ -23,8 +23,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Domain
-from mirror_ppl.errors import CheckpointError
-from mirror_ppl.files import write_whole
+from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.experience import Experience, drive, experience, map_state
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.views import draw_views
@@ -214,17 +213,7 @@ class _Trainer:
         write_whole(path, lambda temporary: torch.save(content, temporary))
 
     def _restore(self, path: Path) -> None:
-        try:
-            content = torch.load(path, weights_only=True)
-            own = content["run"]
-        except Exception as error:
-            raise CheckpointError(
-                f"{path} is not a checkpoint of this program; remove it"
-            ) from error
-        if own != self.run_id:
-            raise CheckpointError(
-                f"{path} belongs to a run with other options or seed; remove it to start anew"
-            )
+        content = read_checkpoint(path, self.run_id)
         self.self_model.load_state_dict(content["self_model"])
         self.target.load_state_dict(content["target"])
         self.optimizer.load_state_dict(content["optimizer"])

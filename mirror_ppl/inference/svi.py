@@ -22,8 +22,7 @@ from pyro.nn import PyroParam
 from torch import Tensor
 from torch.distributions import biject_to
 
-from mirror_ppl.errors import CheckpointError
-from mirror_ppl.files import write_whole
+from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.combinations import discrete_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
@@ -221,15 +220,7 @@ def _save(
 
 
 def _restore(path: Path, run: str, guide, optimizer, schedule) -> tuple[list[float], Tensor]:
-    try:
-        content = torch.load(path, weights_only=True)
-        own = content["run"]
-    except Exception as error:
-        raise CheckpointError(f"{path} is not a checkpoint of this program; remove it") from error
-    if own != run:
-        raise CheckpointError(
-            f"{path} belongs to a fit with other recordings or options; remove it to start anew"
-        )
+    content = read_checkpoint(path, run)
     guide.load_state_dict(content["guide"])
     optimizer.load_state_dict(content["optimizer"])
     schedule.load_state_dict(content["schedule"])

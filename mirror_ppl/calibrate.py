@@ -1,0 +1,169 @@
+"""`python -m mirror_ppl.calibrate`: are posteriors as sure of people as they have a right to be?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mirror_ppl.console import Progress, run
+from mirror_ppl.errors import OptionError, UnknownNameError
+
+if TYPE_CHECKING:
+    from mirror_ppl.data import Demonstrations
+    from mirror_ppl.inference.guides import InferenceOptions, Inferred
+    from mirror_ppl.inference.ranks import Calibration
+    from mirror_ppl.models.human import HumanModel
+
+PROGRAM = "python -m mirror_ppl.calibrate"
+DESCRIPTION = """Simulation-based calibration: people are drawn from the human model's prior, play
+rounds, and their implants are inferred. Where inference is right, the truth is as likely to be at
+any place among the posterior draws. Prints a table for each implant and number of rounds, and
+writes ranks.png, coverage.png and calibration.nc. The exit status is 1 if calibration is rejected.
+A run that is stopped goes on where it was when the same command is given again."""
+REJECTED = 1
+WIDTH = 80
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to calibrate, and where the results go."""
+
+    domain: str = "driving"
+    """The world."""
+    setting: str = "fog"
+    """The setting under which rounds are recorded; what people see is up to their implants."""
+    guide: str = "exact"
+    """What to test: amortized, exact, svi or nuts."""
+    people: int = 500
+    """People drawn from the prior."""
+    rounds: tuple[int, ...] = (1, 5, 20)
+    """Numbers of rounds to infer from, increasing."""
+    draws: int = 100
+    """Posterior draws of each person."""
+    out: Path = Path("runs/calibration")
+    """Folder for the results; made if it is not there."""
+    human_model: str | None = None
+    """A human model of your own: path/to/file.py:Class (see docs/extending.md)."""
+    self_model: Path | None = None
+    """Weights of the robot's self-model; those that ship unless given."""
+    jobs: int = -1
+    """Processes; -1 for one a core."""
+    seed: int = 0
+    """Seed of everything random."""
+
+    def __post_init__(self) -> None:
+        for name in ("people", "draws"):
+            if (number := getattr(self, name)) < 1:
+                raise OptionError(f"--{name} must be at least 1, not {number}")
+        if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
+            numbers = " ".join(map(str, self.rounds))
+            raise OptionError(f"--rounds must be positive and increase, not {numbers or 'none'}")
+        if self.jobs == 0 or self.jobs < -1:
+            raise OptionError(f"--jobs must be at least 1, or -1 for all, not {self.jobs}")
+
+
+def main(options: Options) -> int:
+    """Calibrate, write the results, print what was found.
+
+    Returns:
+        The exit status: 1 if calibration is rejected.
+
+    Raises:
+        MirrorError: what was asked for cannot be done; nothing is written then.
+    """
+    from mirror_ppl.domains import get_domain, require_known
+    from mirror_ppl.files import prepare_output_folder
+    from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
+    from mirror_ppl.inference.guides import GUIDES, InferenceOptions, run_identity
+    from mirror_ppl.models.loading import check_contract, load_human_model
+    from mirror_ppl.models.weights import load_self_model, shipped_weights
+    from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
+
+    if options.guide not in GUIDES:
+        raise UnknownNameError.of("guide", options.guide, GUIDES)
+    require_known(options.setting, "setting", get_domain(options.domain).settings)
+    weights = options.self_model or shipped_weights(options.domain)
+    self_model, _ = load_self_model(weights, options.domain)
+    human = load_human_model(options.human_model, self_model)
+    check_contract(human)
+    folder = prepare_output_folder(options.out)
+    settings = InferenceOptions(options.guide, options.draws)
+    trial = CalibrationOptions(options.people, options.rounds, batch=5)
+    parts = folder / "parts"
+    identity = run_identity(human, settings, [options.setting, options.seed, str(trial)])
+    with Progress("calibrate", options.people) as progress:
+        calibration = calibrate(
+            human,
+            partial(_infer, human, settings),
+            trial,
+            options.setting,
+            options.seed,
+            lambda name, done, total, message: progress.update(done, message),
+            options.jobs,
+            (parts, identity),
+        )
+    calibration.save(folder / "calibration.nc")
+    pictures = {"ranks": plot_ranks, "ecdf": plot_ecdf, "coverage": plot_coverage}
+    for name, plot in pictures.items():
+        plot(calibration).save(folder / f"{name}.png")
+    for file in parts.glob("*.nc"):
+        file.unlink()
+    parts.rmdir()
+    _show(calibration, options.guide)
+    print(f"{folder / 'calibration.nc'}: ranks of every person")
+    for name in pictures:
+        print(f"{folder / f'{name}.png'}")
+    return REJECTED if calibration.rejected else 0
+
+
+def _infer(
+    human: HumanModel, options: InferenceOptions, recordings: Demonstrations, seed: int
+) -> Inferred:
+    from mirror_ppl.inference.guides import infer
+
+    return infer(human, recordings, options, seed)
+
+
+def _show(calibration: Calibration, guide: str) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        title=f"Calibration of {guide}: {calibration.people} people drawn from the prior",
+        caption="p: of uniform ranks; 50 to 90%: share of people whose interval holds the truth; "
+        "sharpness: 1 says no more than the prior, 0 is sure; k: share of people whose importance "
+        "weights are not to be trusted",
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("implant", no_wrap=True)
+    for name in ("rounds", "p", "50%", "80%", "90%", "sharpness", "k"):
+        table.add_column(name, justify="right", no_wrap=True)
+    rejected = set(calibration.rejected)
+    for row in calibration.table().to_dict("records"):
+        wrong = (row["site"], row["rounds"]) in rejected
+        weights = row["high_pareto_k"]
+        table.add_row(
+            str(row["site"]).replace("_", " "),
+            f"{row['rounds']}",
+            f"{row['p_value']:.3f}" + (" rejected" if wrong else ""),
+            *(f"{100 * row[f'coverage_{level}']:.1f}" for level in (50, 80, 90)),
+            f"{row['sharpness']:.2f}",
+            "-" if weights != weights else f"{100 * weights:.0f}%",
+        )
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    console.print(table)
+    rate = calibration.failure_rate
+    verdict = f"rejected for {len(rejected)}" if rejected else "not rejected for any"
+    print(f"Calibration is {verdict} of {len(calibration.table())} (a right one: {rate} of each)")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(Options, main, prog=PROGRAM, description=DESCRIPTION))
