@@ -92,7 +92,8 @@ def read_checkpoint(path: Path, run: Any) -> dict[str, Any]:
         raise CheckpointError(f"{path} is not a checkpoint of this program; remove it") from error
     if own != run:
         raise CheckpointError(
-            f"{path} belongs to a run with other recordings or options; remove it to start anew"
+            f"{path} belongs to a run with other options, seed or recordings; remove it, or "
+            "write elsewhere"
         )
     return content
 

@@ -67,7 +67,8 @@ def folder(some, tmp_path_factory):
 
 
 def short_fit(folder, out, steps=4):
-    return "--demos", folder / "some.nc", "--out", folder / out, "--steps", steps, "--draws", 10
+    some = "--demos", folder / "some.nc", "--out", folder / out
+    return *some, "--guide", "svi", "--steps", steps, "--draws", 10
 
 
 def summary_of(folder):

@@ -18,6 +18,7 @@ from mirror_ppl.errors import CheckpointError
 from mirror_ppl.inference.exact import draw_combinations, log_joint, log_prior, marginals
 from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import (
     FitOptions,
@@ -26,7 +27,6 @@ from mirror_ppl.inference.svi import (
     _prune,
     continuous_guide,
     draw_implants,
-    draw_prior,
     fit_implants,
     predict_actions,
 )

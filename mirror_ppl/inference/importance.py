@@ -278,7 +278,7 @@ def _stretch(sites: Mapping[str, Any], place: Tensor) -> Tensor:
 
 
 def _gaussian(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateNormal:
-    weights = log_weights.exp()[:, None]
+    weights = log_weights.exp().to(place)[:, None]
     mean = (weights * place).sum(0)
     centred = place - mean
     covariance = wider * (weights * centred).T @ centred
@@ -292,7 +292,7 @@ def _smoothed(raw: Tensor) -> tuple[Tensor, float]:
     raw = raw.double()
     if float(raw.max() - raw.min()) < 1e-9:
         return torch.log_softmax(raw, 0), -math.inf
-    import arviz as az
+    from mirror_ppl.inference.export import az
 
     smooth, pareto_k = az.psislw(raw.cpu().numpy())
     return torch.log_softmax(torch.as_tensor(smooth, device=raw.device), 0), float(pareto_k)
