@@ -35,7 +35,7 @@ class Options:
     setting: str = "fog"
     """The setting under which rounds are recorded; what people see is up to their implants."""
     guide: str = "exact"
-    """What to test: amortized, exact, svi or nuts."""
+    """What to test: exact, svi or nuts."""
     people: int = 500
     """People drawn from the prior."""
     rounds: tuple[int, ...] = (1, 5, 20)
@@ -76,13 +76,14 @@ def main(options: Options) -> int:
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.files import prepare_output_folder
     from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
-    from mirror_ppl.inference.guides import GUIDES, InferenceOptions, run_identity
+    from mirror_ppl.inference.guides import GUIDES, InferenceOptions, require_shipped, run_identity
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
 
     if options.guide not in GUIDES:
         raise UnknownNameError.of("guide", options.guide, GUIDES)
+    require_shipped(options.guide)
     require_known(options.setting, "setting", get_domain(options.domain).settings)
     weights = options.self_model or shipped_weights(options.domain)
     self_model, _ = load_self_model(weights, options.domain)

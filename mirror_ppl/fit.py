@@ -72,13 +72,15 @@ def main(options: Options) -> None:
     from mirror_ppl.files import prepare_output_folder, write_whole
     from mirror_ppl.inference.export import save_inference_data
     from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
-    from mirror_ppl.inference.guides import InferenceOptions
+    from mirror_ppl.inference.guides import InferenceOptions, require_shipped
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.driving import has_sight, save_sight_picture
 
     device = usable_device(options.device)
+    settings = InferenceOptions(options.guide, options.draws, FitOptions(steps=options.steps))
+    require_shipped(options.guide)
     weights = options.self_model or shipped_weights(demonstrations.domain)
     self_model, _ = load_self_model(weights, demonstrations.domain)
     human = load_human_model(options.human_model, self_model.to(device))
@@ -92,7 +94,7 @@ def main(options: Options) -> None:
         result = fit_people(
             human,
             demonstrations.to(device),
-            InferenceOptions(options.guide, options.draws, FitOptions(steps=options.steps)),
+            settings,
             options.seed,
             options.train_rounds,
             stages.report,

@@ -23,6 +23,7 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.importance import PRUNING_DRAWS, ImportanceOptions
 from mirror_ppl.inference.self_model_training import SelfModelOptions
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import PLATES, FitOptions, continuous_guide
@@ -156,7 +157,8 @@ def test_every_page_is_listed_in_the_readme():
     ("name", "heading", "options"),
     [
         ("docs/self_model.md", "Setting", SelfModelOptions()),
-        ("docs/human_model.md", "Setting (`FitOptions`)", FitOptions()),
+        ("docs/human_model.md", "Setting of `svi` (`FitOptions`)", FitOptions()),
+        ("docs/human_model.md", "Setting of `exact` (`ImportanceOptions`)", ImportanceOptions()),
     ],
 )
 def test_tables_of_settings_are_the_defaults(name, heading, options):
@@ -218,6 +220,8 @@ def test_shortcuts_are_told_with_their_tolerances():
     assert f"of {Screening().ways} ways" in text
     assert f"a grid of {Screening().resolution} units" in text
     assert f"the same at {FitOptions().prune_margin:.0f} nats" in text
+    assert FitOptions().prune_margin == ImportanceOptions().prune_margin
+    assert f"under {PRUNING_DRAWS} draws of the prior" in text
 
 
 def test_quality_of_the_self_model_is_that_of_the_card():

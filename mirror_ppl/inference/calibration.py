@@ -16,6 +16,7 @@ is tested, in two ways (:mod:`mirror_ppl.inference.uniformity`).
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -206,7 +207,13 @@ def _each_batch(
         for begin in begins:
             yield begin, _batch(trial, infer, begin, parts)
         return
+    import cloudpickle
     from joblib import Parallel, delayed
+
+    for kind in type(trial.human).__mro__:
+        if kind.__module__.split(".")[0] not in ("mirror_ppl", "torch", "builtins"):
+            # The model of somebody's file, which other processes cannot import by its name.
+            cloudpickle.register_pickle_by_value(sys.modules[kind.__module__])
 
     def numbered(begin: int) -> tuple[int, dict[int, xr.Dataset]]:
         # One thread a process: the cores are shared by processes.

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.errors import OptionError, UnknownNameError
 from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
@@ -79,6 +79,16 @@ class InferenceOptions:
             raise UnknownNameError.of("guide", self.guide, GUIDES)
         if self.draws < 1:
             raise ValueError(f"draws must be at least 1, not {self.draws}")
+
+
+def require_shipped(guide: str) -> None:
+    """Make sure that commands can use a guide.
+
+    Raises:
+        OptionError: they cannot.
+    """
+    if guide == "amortized":
+        raise OptionError("the amortized guide is so far in Python only; use exact")
 
 
 def infer(
