@@ -12,6 +12,7 @@ from mirror_ppl.errors import OptionError, UnknownNameError
 
 if TYPE_CHECKING:
     from mirror_ppl.data import Demonstrations
+    from mirror_ppl.inference.amortized import AmortizedGuide
     from mirror_ppl.inference.guides import InferenceOptions, Inferred
     from mirror_ppl.inference.ranks import Calibration
     from mirror_ppl.models.human import HumanModel
@@ -35,7 +36,9 @@ class Options:
     setting: str = "fog"
     """The setting under which rounds are recorded; what people see is up to their implants."""
     guide: str = "exact"
-    """What to test: exact, svi or nuts."""
+    """What to test: amortized, exact, svi or nuts."""
+    guide_file: Path | None = None
+    """Network of the guide amortized (see `python -m mirror_ppl.train --what guide`)."""
     people: int = 500
     """People drawn from the prior."""
     rounds: tuple[int, ...] = (1, 5, 20)
@@ -76,28 +79,31 @@ def main(options: Options) -> int:
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.files import prepare_output_folder
     from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
-    from mirror_ppl.inference.guides import GUIDES, InferenceOptions, require_shipped, run_identity
+    from mirror_ppl.inference.guide_file import network_for
+    from mirror_ppl.inference.guides import GUIDES, InferenceOptions, run_identity
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
 
     if options.guide not in GUIDES:
         raise UnknownNameError.of("guide", options.guide, GUIDES)
-    require_shipped(options.guide)
     require_known(options.setting, "setting", get_domain(options.domain).settings)
     weights = options.self_model or shipped_weights(options.domain)
     self_model, _ = load_self_model(weights, options.domain)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
+    network = network_for(options.guide, options.guide_file, human)
     folder = prepare_output_folder(options.out)
     settings = InferenceOptions(options.guide, options.draws)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     parts = folder / "parts"
-    identity = run_identity(human, settings, [options.setting, options.seed, str(trial)])
+    identity = run_identity(
+        human, settings, [options.setting, options.seed, trial, _content(options)]
+    )
     with Progress("calibrate", options.people) as progress:
         calibration = calibrate(
             human,
-            partial(_infer, human, settings),
+            partial(_infer, human, settings, network),
             trial,
             options.setting,
             options.seed,
@@ -120,11 +126,15 @@ def main(options: Options) -> int:
 
 
 def _infer(
-    human: HumanModel, options: InferenceOptions, recordings: Demonstrations, seed: int
+    human: HumanModel,
+    options: InferenceOptions,
+    network: AmortizedGuide | None,
+    recordings: Demonstrations,
+    seed: int,
 ) -> Inferred:
     from mirror_ppl.inference.guides import infer
 
-    return infer(human, recordings, options, seed)
+    return infer(human, recordings, options, seed, network)
 
 
 def _show(calibration: Calibration, guide: str) -> None:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from time import monotonic
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, Self, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, Self, TextIO, TypeVar
 
 from mirror_ppl.errors import MirrorError, UnknownNameError
 
@@ -172,6 +172,28 @@ class Progress:
     def advance(self, message: str = "") -> None:
         """Tell that one more step is done."""
         self.update(self.done + 1, message)
+
+
+class Stages:
+    """Progress of one stage of work after the other; a context manager."""
+
+    def __init__(self) -> None:
+        self.progress: Progress | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self.progress is not None:
+            self.progress.__exit__(*(error or (None, None, None)))
+            self.progress = None
+
+    def report(self, name: str, done: int, total: int, message: str) -> None:
+        """Tell how far a stage is; the one before it is over when the name changes."""
+        if self.progress is None or self.progress.name != name:
+            self.__exit__(None, None, None)
+            self.progress = Progress(name, total).__enter__()
+        self.progress.update(done, message)
 
 
 class _Display(Protocol):

@@ -8,7 +8,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from mirror_ppl.console import Progress, run, usable_device
+from mirror_ppl.console import Stages, run, usable_device
 from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.fit"
@@ -43,7 +43,10 @@ class Options:
     """Weights of the robot's self-model; those that ship unless given."""
     guide: str = "exact"
     """How to infer: exact (what people see marginalized, how they decide by importance sampling),
-    svi (variational) or nuts (Hamiltonian Monte Carlo, slow)."""
+    amortized (the same, proposed at once by a trained network), svi (variational) or nuts
+    (Hamiltonian Monte Carlo, slow)."""
+    guide_file: Path | None = None
+    """Network of the guide amortized (see `python -m mirror_ppl.train --what guide`)."""
     steps: int = 300
     """Gradient steps of svi."""
     draws: int = 200
@@ -72,7 +75,8 @@ def main(options: Options) -> None:
     from mirror_ppl.files import prepare_output_folder, write_whole
     from mirror_ppl.inference.export import save_inference_data
     from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
-    from mirror_ppl.inference.guides import InferenceOptions, require_shipped
+    from mirror_ppl.inference.guide_file import network_for
+    from mirror_ppl.inference.guides import InferenceOptions
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -80,17 +84,17 @@ def main(options: Options) -> None:
 
     device = usable_device(options.device)
     settings = InferenceOptions(options.guide, options.draws, FitOptions(steps=options.steps))
-    require_shipped(options.guide)
     weights = options.self_model or shipped_weights(demonstrations.domain)
     self_model, _ = load_self_model(weights, demonstrations.domain)
     human = load_human_model(options.human_model, self_model.to(device))
     check_contract(human)
+    network = network_for(options.guide, options.guide_file, human)
     # Faults of the recordings come to light before anything is written.
     check_world(demonstrations)
     split_rounds(demonstrations, options.train_rounds)
     folder = prepare_output_folder(options.out)
     checkpoint = folder / "fit.checkpoint"
-    with _Stages() as stages:
+    with Stages() as stages:
         result = fit_people(
             human,
             demonstrations.to(device),
@@ -99,6 +103,7 @@ def main(options: Options) -> None:
             options.train_rounds,
             stages.report,
             checkpoint,
+            network,
         )
     summary = result.summary | {"seconds": round(monotonic() - began, 1)}
     text = json.dumps(summary, indent=1) + "\n"
@@ -126,27 +131,6 @@ def _recordings(options: Options):
     require_known(options.population, "population", ("paper", "diverse"))
     name = f"{options.domain}_{options.setting}_{options.population}.nc"
     return load_demonstrations(asset_path(name))
-
-
-class _Stages:
-    """Progress of one stage of work after the other."""
-
-    def __init__(self) -> None:
-        self.progress: Progress | None = None
-
-    def __enter__(self) -> _Stages:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        if self.progress is not None:
-            self.progress.__exit__(*(error or (None, None, None)))
-            self.progress = None
-
-    def report(self, name: str, done: int, total: int, message: str) -> None:
-        if self.progress is None or self.progress.name != name:
-            self.__exit__(None, None, None)
-            self.progress = Progress(name, total).__enter__()
-        self.progress.update(done, message)
 
 
 def _show(summary: dict[str, Any], unit: str) -> None:

@@ -1,32 +1,48 @@
-"""`python -m mirror_ppl.train`: train a domain's self-model."""
+"""`python -m mirror_ppl.train`: train a self-model or a guide."""
 
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
-from mirror_ppl.console import Progress, run, usable_device
+from mirror_ppl.console import Progress, Stages, run, usable_device
 from mirror_ppl.errors import OptionError
 
+LEAST_PEOPLE = 10
 PROGRAM = "python -m mirror_ppl.train"
-DESCRIPTION = """Train the robot's self-model from nothing, measure it against the exact planner,
-and write its weights with a card that tells both. Takes about ten minutes on two cores. A run that
-is stopped goes on from its last finished phase when the same command is given again."""
+DESCRIPTION = """Train the robot's self-model from nothing, or a guide that infers people at once,
+measure it, and write its weights with a card that tells both. A self-model is measured against the
+exact planner; it takes about ten minutes. A guide learns from people who are drawn from the human
+model's prior; it takes about half an hour. A run that is stopped goes on when the same command is
+given again."""
+SELF_MODEL, GUIDE = "self-model", "guide"
+OF_SELF_MODEL = ("phases", "steps", "learning_rate", "device")
+OF_GUIDE = ("people", "human_model", "self_model")
 
 
 @dataclass(frozen=True)
 class Options:
     """What to train, and where to."""
 
-    out: Path = Path("runs/driving_self_model.safetensors")
-    """The weights file to write; its card can be read with `python -m mirror_ppl.train --card`."""
+    what: str = SELF_MODEL
+    """What to train: self-model or guide."""
+    out: Path | None = None
+    """The weights file to write; its card can be read with `python -m mirror_ppl.train --card`.
+    Default: runs/driving_self_model.safetensors or runs/driving_guide.safetensors."""
     domain: str = "driving"
     """The world to learn. So far there is driving: two lanes, four cars that never yield."""
     phases: int = 40
-    """Phases of driving and learning; 2 are enough to try it out, 40 to be good."""
+    """Of a self-model: phases of driving and learning; 2 to try it out, 40 to be good."""
     steps: int = 300
-    """Gradient steps of a phase."""
+    """Of a self-model: gradient steps of a phase."""
     learning_rate: float = 1e-3
-    """Learning rate at the start; it falls to a hundredth."""
+    """Of a self-model: learning rate at the start; it falls to a hundredth."""
+    people: int = 600
+    """Of a guide: people to learn from, simulated in the true domain."""
+    human_model: str | None = None
+    """Of a guide: a human model of your own, path/to/file.py:Class (see docs/extending.md)."""
+    self_model: Path | None = None
+    """Of a guide: weights of the robot's self-model; those that ship unless given."""
     seed: int = 0
     """Seed of everything random."""
     device: str = "cpu"
@@ -35,6 +51,10 @@ class Options:
     """Do not train: print the card of this weights file."""
 
     def __post_init__(self) -> None:
+        if self.what not in (SELF_MODEL, GUIDE):
+            raise OptionError(f"--what must be {SELF_MODEL} or {GUIDE}, not {self.what}")
+        if self.people < LEAST_PEOPLE:
+            raise OptionError(f"--people must be at least {LEAST_PEOPLE}, not {self.people}")
         for name in ("phases", "steps"):
             if (number := getattr(self, name)) < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")
@@ -49,48 +69,100 @@ def main(options: Options) -> None:
 
     Raises:
         UnknownNameError: there is no such domain or device.
-        AssetError: the file whose card was asked for cannot be read.
+        AssetError: a file that was named cannot be read.
+        HumanModelError: the human model breaks its contract.
         OutputError: the file cannot be written.
         CheckpointError: a checkpoint of a run with other options is in the way.
     """
-    import torch
-
-    from mirror_ppl import __version__
     from mirror_ppl.domains import get_domain
-    from mirror_ppl.evaluation.self_model import self_model_quality
     from mirror_ppl.files import prepare_output_folder
-    from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
-    from mirror_ppl.models.weights import load_self_model, save_self_model
 
     if options.card is not None:
-        _show(load_self_model(options.card)[1])
+        _show(_card(options.card))
         return
-    domain = get_domain(options.domain)
+    get_domain(options.domain)
+    name = options.what.replace("-", "_")
+    out = options.out or Path("runs") / f"{options.domain}_{name}.safetensors"
+    prepare_output_folder(out.parent)
+    checkpoint = out.with_suffix(".checkpoint")
+    card = (_guide if options.what == GUIDE else _self_model)(options, out, checkpoint)
+    checkpoint.unlink(missing_ok=True)
+    _show(card)
+    print(f"weights and card: {out}")
+
+
+def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
+    import torch
+
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.evaluation.self_model import self_model_quality
+    from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
+    from mirror_ppl.models.weights import save_self_model
+
     settings = SelfModelOptions(
         phases=options.phases, steps=options.steps, learning_rate=options.learning_rate
     )
-    prepare_output_folder(options.out.parent)
-    checkpoint = options.out.with_suffix(".checkpoint")
     generator = torch.Generator(usable_device(options.device)).manual_seed(options.seed)
     with Progress("train", settings.phases) as progress:
-        self_model = train_self_model(domain, settings, generator, progress.update, checkpoint)
+        self_model = train_self_model(
+            get_domain(options.domain), settings, generator, progress.update, checkpoint
+        )
     quality = self_model_quality(self_model, discount=settings.discount)
-    card = {
+    card = _described(options, settings, quality, "measured on 4000 rounds")
+    save_self_model(self_model, out, card)
+    return card
+
+
+def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
+    from mirror_ppl.inference.guide_file import save_guide
+    from mirror_ppl.inference.guide_training import GuideOptions, train_guide
+    from mirror_ppl.models.loading import check_contract, load_human_model
+    from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+    weights = options.self_model or shipped_weights(options.domain)
+    self_model, _ = load_self_model(weights, options.domain)
+    human = load_human_model(options.human_model, self_model)
+    check_contract(human)
+    settings = GuideOptions(people=options.people)
+    with Stages() as stages:
+        guide, quality = train_guide(human, settings, options.seed, stages.report, checkpoint)
+    card = _described(options, settings, quality, "nats a person, of people held out")
+    save_guide(guide, human, out, card)
+    return card
+
+
+def _described(options: Options, settings: Any, quality: dict[str, float], measured: str) -> dict:
+    import torch
+
+    from mirror_ppl import __version__
+
+    return {
         "command": _command(options),
         "versions": {"mirror_ppl": __version__, "torch": torch.__version__.split("+")[0]},
         "settings": asdict(settings),
+        "measured": measured,
         "quality": {name: round(value, 4) for name, value in quality.items()},
     }
-    save_self_model(self_model, options.out, card)
-    checkpoint.unlink(missing_ok=True)
-    _show(card)
-    print(f"weights and card: {options.out}")
+
+
+def _card(path: Path) -> dict[str, Any]:
+    """The card of a weights file."""
+    from mirror_ppl.inference import guide_file
+    from mirror_ppl.models import weights
+
+    return weights.read_card(path, {weights.FORMAT: "self-model", guide_file.FORMAT: "guide"})
 
 
 def _command(options: Options) -> str:
-    kept = [part.name for part in fields(options) if part.name not in ("out", "card")]
-    parts = [f"--{name.replace('_', '-')} {getattr(options, name)}" for name in kept]
-    return " ".join([PROGRAM, *parts])
+    """The command that does it again; without what does not matter to what is trained."""
+    left_out = {"out", "card", *(OF_SELF_MODEL if options.what == GUIDE else OF_GUIDE)}
+    values = {
+        part.name: getattr(options, part.name)
+        for part in fields(options)
+        if part.name not in left_out
+    }
+    given = {name: value for name, value in values.items() if value is not None}
+    return " ".join([PROGRAM, *(f"--{name.replace('_', '-')} {given[name]}" for name in given)])
 
 
 def _show(card: dict) -> None:
@@ -98,7 +170,7 @@ def _show(card: dict) -> None:
     from rich.table import Table
 
     table = Table(title=card["command"], title_justify="left")
-    table.add_column("measured on 4000 rounds")
+    table.add_column(card.get("measured", "measured on 4000 rounds"))
     table.add_column("value", justify="right")
     for name, value in card["quality"].items():
         table.add_row(name.replace("_", " "), f"{value:.3f}")

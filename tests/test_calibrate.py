@@ -76,7 +76,7 @@ def test_processes_share_the_people(small, tmp_path):
 
 
 def test_wrong_posteriors_end_with_status_1(small, monkeypatch, capsys):
-    def narrow(human, options, recordings, seed):
+    def narrow(human, options, network, recordings, seed):
         found = infer(human, recordings, options, seed)
         draws = {
             name: value if name == "reach" else value.mean(0) + 0.2 * (value - value.mean(0))
@@ -92,7 +92,7 @@ def test_wrong_posteriors_end_with_status_1(small, monkeypatch, capsys):
 def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
     done = []
 
-    def counted(human, options, recordings, seed):
+    def counted(human, options, network, recordings, seed):
         done.append(recordings.num_people)
         if len(done) == 4:
             raise KeyboardInterrupt
@@ -120,7 +120,7 @@ def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
         (("--rounds", 0), "--rounds must be positive and increase, not 0"),
         (("--jobs", 0), "--jobs must be at least 1, or -1 for all, not 0"),
         (("--guide", "magic"), 'unknown guide "magic"'),
-        (("--guide", "amortized"), "so far in Python only"),
+        (("--guide", "amortized", "--guide-file", "nowhere.x"), "nowhere.x: cannot be read"),
         (("--setting", "hail"), 'unknown setting "hail"'),
         (("--domain", "sailing"), 'unknown domain "sailing"'),
         (("--human-model", "nowhere.py:Nobody"), "there is no such file"),

@@ -180,13 +180,13 @@ def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, mo
     assert not RESULTS & set(content(folder / "killed"))
 
     done = []
-    report = fit._Stages.report
+    report = fit.Stages.report
 
     def spy(self, name, step, total, message):
         done.extend([step] * (name == "fit"))
         report(self, name, step, total, message)
 
-    monkeypatch.setattr(fit._Stages, "report", spy)
+    monkeypatch.setattr(fit.Stages, "report", spy)
     assert command(fit, *args) == 0
     assert done[0] in (26, 51, 76)  # from a checkpoint, of which there is one in 25 steps
     assert set(content(folder / "killed")) >= RESULTS

@@ -1,6 +1,8 @@
 """Every guide against a person whose posterior is known exactly, and what guides have in common."""
 
+import json
 import math
+from dataclasses import replace
 
 import pyro
 import pyro.distributions as dist
@@ -9,9 +11,12 @@ import torch
 from scipy import stats
 from test_views import ragged
 
+from mirror_ppl import calibrate as calibrate_command
+from mirror_ppl import fit, simulate, train
+from mirror_ppl.console import run
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.errors import CheckpointError, HumanModelError, UnknownNameError
-from mirror_ppl.inference import guides
+from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
+from mirror_ppl.inference import guide_training, guides
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
     evidence_of,
@@ -21,6 +26,7 @@ from mirror_ppl.inference.amortized import (
 )
 from mirror_ppl.inference.calibration import CalibrationOptions, calibrate, prior_people
 from mirror_ppl.inference.exact import acts_on_beliefs
+from mirror_ppl.inference.guide_file import load_guide, network_for, save_guide
 from mirror_ppl.inference.guide_training import GuideOptions, simulate_examples, train_guide
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer
 from mirror_ppl.inference.importance import ImportanceOptions, Sampler, places, scalar_sites
@@ -380,3 +386,89 @@ def test_the_package_s_own_model_and_its_prior(self_model):
     assert guide.ways.shape == (64, 2)
     untrained = sample_amortized(human, guide, sightings_of(human, some, 0, [0, 1]))
     assert untrained.effective > 10  # weights make up for what it has not learned
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def test_a_guide_is_read_as_it_was_written(toy, network, tmp_path):
+    path = tmp_path / "toy.safetensors"
+    save_guide(network, toy, path, {"quality": {"loss": 1.0}})
+    again, card = load_guide(path, toy)
+    assert card == {"quality": {"loss": 1.0}}
+    for name, value in network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value)
+    assert network_for("exact", path, toy) is None
+    assert isinstance(network_for("amortized", path, toy), AmortizedGuide)
+
+
+def test_guides_of_something_else_are_refused(toy, network, tmp_path):
+    path = tmp_path / "toy.safetensors"
+    save_guide(network, toy, path, {})
+    other = HumanModel(toy.self_model)
+    with pytest.raises(AssetError, match="is for human model ToyHuman, not HumanModel; train a"):
+        load_guide(path, other)
+
+    class Changed(ToyHuman):
+        def prior(self):
+            rate = pyro.sample("in_sight", dist.Beta(5.0, 2.0))
+            with pyro.poutine.block(hide=["in_sight"]):
+                return super().prior() | {"in_sight": rate}
+
+    Changed.__name__ = "ToyHuman"
+    with pytest.raises(AssetError, match="is for another prior"):
+        load_guide(path, Changed(toy.self_model))
+    with pytest.raises(AssetError, match="not a guide of this program"):
+        load_guide(shipped_weights("driving"), toy)
+    path.write_bytes(b"nonsense")
+    with pytest.raises(AssetError, match="cannot be read"):
+        load_guide(path, toy)
+
+
+def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, capsys):
+    (tmp_path / "toy.py").write_text(
+        "from mirror_ppl.models.toy import ToyHuman\n\n\nclass Toy(ToyHuman):\n    pass\n"
+    )
+    monkeypatch.setattr(
+        guide_training, "GuideOptions", lambda people: replace(TRAINING, people=people, steps=50)
+    )
+    path, human = tmp_path / "guide.safetensors", ("--human-model", f"{tmp_path / 'toy.py'}:Toy")
+    assert command(train, "--what", "guide", "--people", 40, *human, "--out", path) == 0
+    out = capsys.readouterr().out
+    assert "--what guide" in out and "--people 40" in out and "--phases" not in out
+    assert "learned" in out
+    assert command(train, "--card", path) == 0
+    assert "nats a person" in capsys.readouterr().out
+    assert [each.name for each in tmp_path.iterdir() if "checkpoint" in each.name] == []
+    guide = ("--guide", "amortized", "--guide-file", path)
+    small = ("--people", 10, "--rounds", 1, "--draws", 9, "--jobs", 1)
+    assert command(calibrate_command, *human, *guide, *small, "--out", tmp_path / "c") == 0
+    demos = tmp_path / "some.nc"
+    assert command(simulate, "--people", 1, "--rounds", 2, "--out", demos) == 0
+    fit_args = ("--demos", demos, "--draws", 9, "--out", tmp_path / "f")
+    assert command(fit, *human, *guide, *fit_args) == 0
+    summary = json.loads((tmp_path / "f" / "summary.json").read_text())
+    assert summary["guide"] == "amortized"
+    assert "pareto_k" in summary["people"][0]
+
+
+def command(module, *args):
+    return run(
+        module.Options,
+        module.main,
+        prog=module.PROGRAM,
+        description=module.DESCRIPTION,
+        args=[str(arg) for arg in args],
+    )
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("--what", "nothing"), "--what must be self-model or guide, not nothing"),
+        (("--what", "guide", "--people", "3"), "--people must be at least 10, not 3"),
+    ],
+)
+def test_impossible_trainings(args, message, tmp_path, capsys):
+    assert command(train, "--out", tmp_path / "x", *args) == 2
+    assert message in capsys.readouterr().err

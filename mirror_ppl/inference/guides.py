@@ -25,7 +25,7 @@ from torch import Tensor
 
 from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.errors import OptionError, UnknownNameError
+from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
@@ -35,6 +35,7 @@ from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
 from mirror_ppl.inference.views import build_view_table, rounds_of
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.weights import fingerprint
 
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
 GUIDES = ("amortized", "exact", "svi", "nuts")
@@ -79,16 +80,6 @@ class InferenceOptions:
             raise UnknownNameError.of("guide", self.guide, GUIDES)
         if self.draws < 1:
             raise ValueError(f"draws must be at least 1, not {self.draws}")
-
-
-def require_shipped(guide: str) -> None:
-    """Make sure that commands can use a guide.
-
-    Raises:
-        OptionError: they cannot.
-    """
-    if guide == "amortized":
-        raise OptionError("the amortized guide is so far in Python only; use exact")
 
 
 def infer(
@@ -193,16 +184,17 @@ class _People:
         return cls(content["draws"], content["pareto_k"])
 
 
-def run_identity(human: HumanModel, options: InferenceOptions, more: Sequence[object]) -> str:
-    """What results belong to, as a hash: the human model with its source, the options, and more."""
-    digest = hashlib.sha256()
-    for name, value in sorted(human.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(value.detach().cpu().numpy().tobytes())
+def run_identity(
+    human: HumanModel,
+    options: InferenceOptions,
+    network: AmortizedGuide | None,
+    more: Sequence[object],
+) -> str:
+    """What results belong to, as a hash: model with its source, network, options, and more."""
     source = [_source(kind) for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
-    description = [source, __version__, asdict(options), [str(part) for part in more]]
-    digest.update(json.dumps(description, sort_keys=True).encode())
-    return digest.hexdigest()
+    weights = [fingerprint(human), None if network is None else fingerprint(network)]
+    description = [weights, source, __version__, asdict(options), [str(part) for part in more]]
+    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 
 def _source(kind: type) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor, nn
 
 from mirror_ppl.data import asset_path
 from mirror_ppl.domains import get_domain
@@ -30,10 +31,10 @@ def shipped_weights(domain: str) -> Path:
     return asset_path(f"{domain}_self_model.safetensors")
 
 
-def fingerprint(self_model: SelfModel) -> str:
-    """What tells a self-model's weights from others: the beginning of a hash of them."""
+def fingerprint(network: nn.Module) -> str:
+    """What tells a network's weights from others: the beginning of a hash of them."""
     digest = hashlib.sha256()
-    for name, value in sorted(self_model.state_dict().items()):
+    for name, value in sorted(network.state_dict().items()):
         digest.update(name.encode())
         digest.update(value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
@@ -55,6 +56,36 @@ def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) 
     write_whole(path, lambda temporary: save_file(tensors, temporary, metadata))
 
 
+def read_tensors(path: Path, kinds: Mapping[str, str]) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Metadata and tensors of a safetensors file.
+
+    Args:
+        path: the file.
+        kinds: by what its metadata may say under ``"format"``, what that is.
+
+    Raises:
+        AssetError: the file is missing or damaged, or something else.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise AssetError(f"{path}: cannot be read as weights ({error})") from error
+    if metadata.get("format") not in kinds:
+        raise AssetError(f"{path}: not a {' or '.join(kinds.values())} of this program")
+    return metadata, tensors
+
+
+def read_card(path: Path, kinds: Mapping[str, str]) -> dict[str, Any]:
+    """The card of a safetensors file; see :func:`read_tensors`."""
+    metadata, _ = read_tensors(path, kinds)
+    try:
+        return json.loads(metadata["card"])
+    except (KeyError, ValueError) as error:
+        raise AssetError(f"{path}: does not fit this program ({error})") from error
+
+
 def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, dict[str, Any]]:
     """Read a self-model, ready for use, and its card.
 
@@ -65,14 +96,7 @@ def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, d
     Raises:
         AssetError: the file is missing or damaged, or is for another domain or version of it.
     """
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise AssetError(f"{path}: cannot be read as weights ({error})") from error
-    if metadata.get("format") != FORMAT:
-        raise AssetError(f"{path}: not a self-model of this program")
+    metadata, tensors = read_tensors(path, {FORMAT: "self-model"})
     if domain is not None and metadata["domain"] != domain:
         raise AssetError(f'{path}: is for the domain "{metadata["domain"]}", not "{domain}"')
     try:

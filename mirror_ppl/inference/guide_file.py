@@ -1,0 +1,95 @@
+"""Amortized guides as files: safetensors, with a card in the file's own metadata."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+
+from mirror_ppl.data import asset_path
+from mirror_ppl.errors import AssetError
+from mirror_ppl.files import write_whole
+from mirror_ppl.inference.amortized import AmortizedGuide, reference_places
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.weights import fingerprint, read_tensors
+
+FORMAT = "mirror_ppl guide 1"
+
+
+def shipped_guide(domain: str) -> Path:
+    """Path of the guide of the package's own human model that ships for a domain.
+
+    Raises:
+        AssetError: none ships.
+    """
+    return asset_path(f"{domain}_guide.safetensors")
+
+
+def save_guide(
+    guide: AmortizedGuide, human: HumanModel, path: Path, card: Mapping[str, Any]
+) -> None:
+    """Write a guide and its card: how it was made, and how good it is.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    metadata = {
+        "format": FORMAT,
+        "domain": human.domain.name,
+        "domain_version": human.domain.version,
+        "human_model": type(human).__name__,
+        "self_model": fingerprint(human.self_model),
+        "card": json.dumps(card, indent=1),
+    }
+    tensors = {name: value.contiguous() for name, value in guide.state_dict().items()}
+    write_whole(path, lambda temporary: save_file(tensors, temporary, metadata))
+
+
+def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str, Any]]:
+    """Read a guide, ready for use, and its card.
+
+    Args:
+        path: a file of :func:`save_guide`.
+        human: the human model that it has to be for.
+
+    Raises:
+        AssetError: the file is missing or damaged, or is for another human model, self-model,
+            domain or version of it.
+    """
+    metadata, tensors = read_tensors(path, {FORMAT: "guide"})
+    for name, own in (
+        ("domain", human.domain.name),
+        ("domain_version", human.domain.version),
+        ("human_model", type(human).__name__),
+        ("self_model", fingerprint(human.self_model)),
+    ):
+        if metadata.get(name) != own:
+            raise AssetError(
+                f"{path}: is for {name.replace('_', ' ')} {metadata.get(name)}, not {own}; "
+                "train a guide for it, or use --guide exact"
+            )
+    try:
+        card = json.loads(metadata["card"])
+        guide = AmortizedGuide(reference_places(human))
+        same = torch.allclose(guide.ways, tensors["ways"], atol=1e-3)
+        guide.load_state_dict(tensors)
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise AssetError(f"{path}: does not fit this program ({error})") from error
+    if not same:
+        raise AssetError(f"{path}: is for another prior; train a guide for this one")
+    return guide.eval(), card
+
+
+def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGuide | None:
+    """The network of the guide ``amortized``: a file's, or the one that ships; else ``None``.
+
+    Raises:
+        AssetError: there is none for this human model.
+    """
+    if guide != "amortized":
+        return None
+    return load_guide(path or shipped_guide(human.domain.name), human)[0]
