@@ -97,9 +97,8 @@ def main(options: Options) -> int:
     settings = InferenceOptions(options.guide, options.draws)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     parts = folder / "parts"
-    identity = run_identity(
-        human, settings, [options.setting, options.seed, trial, _content(options)]
-    )
+    what = [options.setting, options.seed, trial]
+    identity = run_identity(human, settings, network, what)
     with Progress("calibrate", options.people) as progress:
         calibration = calibrate(
             human,
