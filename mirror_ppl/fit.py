@@ -137,6 +137,8 @@ def _show(summary: dict[str, Any], unit: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from mirror_ppl.inference.ranks import HIGH_PARETO_K
+
     people = summary["people"]
     table = Table(
         title=f"What each person sees ({unit}) and how they decide: {summary['domain']}, "
@@ -160,6 +162,14 @@ def _show(summary: dict[str, Any], unit: str) -> None:
     if not console.is_terminal:
         console = Console(width=40 + 18 * len(names))
     console.print(table)
+    doubtful = [
+        person["id"] for person in people if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
+    ]
+    if doubtful:
+        print(
+            f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
+            f"{HIGH_PARETO_K}): --guide svi may do better"
+        )
     tested = [person["test"] for person in people if person["test"]]
     if tested:
         nll = sum(test["nll"] for test in tested) / len(tested)

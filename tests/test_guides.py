@@ -16,7 +16,7 @@ from mirror_ppl import fit, simulate, train
 from mirror_ppl.console import run
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
-from mirror_ppl.inference import guide_training, guides
+from mirror_ppl.inference import fitting, guide_training, guides
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
     evidence_of,
@@ -472,3 +472,20 @@ def command(module, *args):
 def test_impossible_trainings(args, message, tmp_path, capsys):
     assert command(train, "--out", tmp_path / "x", *args) == 2
     assert message in capsys.readouterr().err
+
+
+def test_people_whose_weights_cannot_be_relied_on_are_named(tmp_path, monkeypatch, capsys):
+    def doubtful(*args):
+        found = infer(*args)
+        return replace(found, pareto_k=torch.tensor([0.9, 0.2]))
+
+    monkeypatch.setattr(fitting, "infer", doubtful)
+    (tmp_path / "toy.py").write_text(
+        "from mirror_ppl.models.toy import ToyHuman\n\n\nclass Toy(ToyHuman):\n    pass\n"
+    )
+    demos = tmp_path / "some.nc"
+    assert command(simulate, "--people", 2, "--rounds", 2, "--out", demos) == 0
+    human = ("--human-model", f"{tmp_path / 'toy.py'}:Toy")
+    assert command(fit, "--demos", demos, *human, "--draws", 9, "--out", tmp_path / "f") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "not to be relied on for person-01 (Pareto k above 0.7)" in out

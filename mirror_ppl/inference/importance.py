@@ -30,8 +30,6 @@ from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 PRUNING_DRAWS = 64
 """Draws from the prior after which combinations of discrete sites are given up."""
-TRUSTED_PARETO_K = 0.7
-"""Above this, the weights of so many draws cannot be relied on (the paper's threshold)."""
 
 
 @dataclass(frozen=True)
