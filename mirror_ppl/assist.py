@@ -244,6 +244,8 @@ def _people(options: Options):
             "and --people-seed (people who were recorded are assisted from Python, see "
             "docs/communicator.md)"
         )
+    if not str(source["seed"]).isdecimal():
+        raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")
     require_known(source["population"], "population", tuple(POPULATIONS))
     return posterior, source
 

@@ -21,8 +21,8 @@ PROGRAM = "python -m mirror_ppl.calibrate"
 DESCRIPTION = """Simulation-based calibration: people are drawn from the human model's prior, play
 rounds, and their implants are inferred. Where inference is right, the truth is as likely to be at
 any place among the posterior draws. Prints a table for each implant and number of rounds, and
-writes ranks.png, coverage.png and calibration.nc. The exit status is 1 if calibration is rejected.
-A run that is stopped goes on where it was when the same command is given again."""
+writes ranks.png, ecdf.png, coverage.png and calibration.nc. The exit status is 1 if calibration is
+rejected. A run that is stopped goes on where it was when the same command is given again."""
 REJECTED = 1
 WIDTH = 80
 
@@ -60,6 +60,10 @@ class Options:
         for name in ("people", "draws"):
             if (number := getattr(self, name)) < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")
+        if self.seed < 0:
+            raise OptionError(f"--seed must be at least 0, not {self.seed}")
+        if self.guide_file is not None and self.guide != "amortized":
+            raise OptionError("--guide-file is for --guide amortized")
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
             numbers = " ".join(map(str, self.rounds))
             raise OptionError(f"--rounds must be positive and increase, not {numbers or 'none'}")

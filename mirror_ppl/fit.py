@@ -57,6 +57,8 @@ class Options:
     """Where to compute: cpu, cuda or cuda:0."""
 
     def __post_init__(self) -> None:
+        if self.guide_file is not None and self.guide != "amortized":
+            raise OptionError("--guide-file is for --guide amortized")
         for name in ("steps", "draws", "train_rounds"):
             number = getattr(self, name)
             if number is not None and number < 1:

@@ -55,6 +55,8 @@ class Options:
             raise OptionError(f"--what must be {SELF_MODEL} or {GUIDE}, not {self.what}")
         if self.people < LEAST_PEOPLE:
             raise OptionError(f"--people must be at least {LEAST_PEOPLE}, not {self.people}")
+        if self.what == GUIDE and self.device != "cpu":
+            raise OptionError("--device is for self-models; guides are trained on the cpu")
         for name in ("phases", "steps"):
             if (number := getattr(self, name)) < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")
@@ -75,7 +77,7 @@ def main(options: Options) -> None:
         CheckpointError: a checkpoint of a run with other options is in the way.
     """
     from mirror_ppl.domains import get_domain
-    from mirror_ppl.files import prepare_output_folder
+    from mirror_ppl.files import prepare_output_folder, require_files_of_their_own
 
     if options.card is not None:
         _show(_card(options.card))
@@ -83,6 +85,8 @@ def main(options: Options) -> None:
     get_domain(options.domain)
     name = options.what.replace("-", "_")
     out = options.out or Path("runs") / f"{options.domain}_{name}.safetensors"
+    inputs = {"--self-model": [options.self_model]}
+    require_files_of_their_own({"--out": out}, inputs)
     prepare_output_folder(out.parent)
     checkpoint = out.with_suffix(".checkpoint")
     card = (_guide if options.what == GUIDE else _self_model)(options, out, checkpoint)
@@ -128,6 +132,8 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
         guide, quality = train_guide(human, settings, options.seed, stages.report, checkpoint)
     card = _described(options, settings, quality, "nats a person, of people held out")
     save_guide(guide, human, out, card)
+    if quality["learned"] <= 0:
+        print("This guide knows no more than the prior; give it more --people")
     return card
 
 

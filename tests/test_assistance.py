@@ -276,7 +276,11 @@ def test_an_audit_is_the_decision_as_plain_data():
     best, second = told["alternatives"]
     assert best["message"] == "verbal: front-left" and second["message"] == "visual: front-left"
     assert (best["gain"], best["cost"], best["later"]) == (1.5, pytest.approx(0.03), "")
-    assert best["low"] < 1.5 < best["high"]
+    assert best["standard_error"] == pytest.approx(0.5)
+    assert best["chosen"] and not second["chosen"]
+    # The chosen one is there however few are shown.
+    (chosen,) = [each for each in audit(decision(1), most=0)["alternatives"] if each["chosen"]]
+    assert chosen["message"] == "visual: front-left"
 
 
 def test_an_audit_of_silence_is_plain_data_too():

@@ -160,6 +160,7 @@ def silent(decision):
     return decision.why() in (
         "silence: nothing that could be told is worth its cost",
         "silence: there is nothing new that can be told now",
+        "silence: the round is over",
     )
 
 

@@ -271,3 +271,20 @@ def test_a_site_of_another_shape(tmp_path, draws):
     assert str(error.value) == (
         f'{path}: "residual_in" has shape (5, 3, 49, 7), expected (5, 3, 49, 8)'
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("consistency", -3.0, '"consistency" has values that the human model rules out'),
+        ("consistency", float("nan"), '"consistency" has values that the human model rules out'),
+        ("lapse", 1.5, '"lapse" has values that the human model rules out'),
+        ("sight_front_own", 77.0, '"sight_front_own" has values that are no bins'),
+        ("sight_front_own", float("nan"), '"sight_front_own" has values that are no bins'),
+    ],
+)
+def test_values_that_cannot_be_are_refused(path, name, value, message):
+    file = load_posterior(path)
+    file.values[name][1] = value
+    with pytest.raises(PosteriorError, match=message):
+        file.draws(human())

@@ -72,6 +72,7 @@ class Decision:
         observation: what there was to observe, ``[E]`` and ``[K, F]``.
         found: the candidates that were compared; ``None`` where there was nothing to choose.
         chosen: which of them this is.
+        over: whether the round is.
     """
 
     message: Message
@@ -81,6 +82,7 @@ class Decision:
     observation: Observation
     found: Found | None
     chosen: int
+    over: bool = False
 
     @property
     def told(self) -> Visibility:
@@ -105,9 +107,9 @@ class Decision:
         """Every candidate with its gain over silence, the best first.
 
         Columns: ``message`` (for now), ``later`` (what would be said in the steps after), ``cost``
-        (of both), ``gain`` (with that taken off), ``low``, ``high`` (90% interval),
-        ``probability`` (share of draws in which it is better than silence), ``chosen``, and
-        ``p(action)``, the predicted probability of each action now.
+        (of both), ``gain`` (with that taken off), its ``standard_error``, ``low``, ``high`` (90%
+        interval), ``probability`` (share of draws in which it is better than silence), ``chosen``,
+        and ``p(action)``, the predicted probability of each action now.
         """
         import pandas as pd
 
@@ -128,6 +130,7 @@ class Decision:
                 ),
                 "cost": float(channels.cost(candidate).sum()),
                 "gain": gain.mean,
+                "standard_error": gain.standard_error,
                 "low": gain.interval[0],
                 "high": gain.interval[1],
                 "probability": gain.probability,
@@ -195,6 +198,8 @@ class Decision:
         return f"{text}: they would {deed}{when} {chances} {worth}"
 
     def _why_not(self) -> str:
+        if self.over:
+            return "the round is over"
         if self.found is None:
             return "there is nothing new that can be told now"
         for step, message in enumerate(self.plan):
@@ -232,7 +237,7 @@ class Communicator:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.sure < 0:
+        if not self.sure >= 0:
             raise ValueError(f"sure must be at least 0, not {self.sure}")
 
     @torch.no_grad()
@@ -251,7 +256,7 @@ class Communicator:
         allowed = channels.join(domain.communicable(now))
         steps_left = domain.horizon - past.time
         if steps_left < 1 or not allowed.any():
-            return self._silence(now, allowed)
+            return self._silence(now, allowed, steps_left < 1)
         standing = Standing.of(self.person, past)
         allowed = standing.telling(allowed)
         if not allowed.any():
@@ -265,12 +270,12 @@ class Communicator:
         gain = gain_over_silence(found.valued, chosen)
         return Decision(channels.message(flags), flags, gain, domain, now, found, chosen)
 
-    def _silence(self, now: Observation, allowed: Tensor) -> Decision:
+    def _silence(self, now: Observation, allowed: Tensor, over: bool = False) -> Decision:
         """Where there is nothing to choose."""
         none = torch.zeros_like(allowed)
         domain = self.person.human.domain
         message = Channels(domain).message(none)
-        return Decision(message, none, Gain(0.0, 0.0, 0.0), domain, now, None, 0)
+        return Decision(message, none, Gain(0.0, 0.0, 0.0), domain, now, None, 0, over)
 
 
 def choose(valued: Valued, sure: float) -> int:

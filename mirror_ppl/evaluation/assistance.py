@@ -255,10 +255,15 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
 
 
 def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
-    """A planner's decision as data: gain, sentence, the best alternatives, what mattered."""
+    """A planner's decision as data: gain, sentence, what mattered, the best alternatives.
+
+    Of the alternatives the chosen one is always there, too. Not the one of the largest gain is
+    chosen, but that of the largest gain after some standard errors.
+    """
     low, high = decision.gain.interval
-    columns = ["message", "later", "cost", "gain", "low", "high"]
-    table = decision.alternatives.head(most)
+    columns = ["message", "later", "cost", "gain", "standard_error", "chosen"]
+    table = decision.alternatives[columns]
+    shown = [row for place, row in enumerate(table.to_numpy().tolist()) if place < most or row[-1]]
     turn = decision.turning_point
     return {
         "gain": decision.gain.mean,
@@ -269,9 +274,7 @@ def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
         "turning_point": None
         if turn is None
         else dict(zip(("steps_ahead", "action", "silent", "told"), turn, strict=True)),
-        "alternatives": [
-            dict(zip(columns, row, strict=True)) for row in table[columns].to_numpy().tolist()
-        ],
+        "alternatives": [dict(zip(columns, row, strict=True)) for row in shown],
     }
 
 

@@ -92,4 +92,12 @@ def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGu
     """
     if guide != "amortized":
         return None
-    return load_guide(path or shipped_guide(human.domain.name), human)[0]
+    if path is None:
+        try:
+            path = shipped_guide(human.domain.name)
+        except AssetError as error:
+            raise AssetError(
+                f"no guide ships for {human.domain.name}: train one with python -m "
+                "mirror_ppl.train --what guide and name it with --guide-file, or use --guide exact"
+            ) from error
+    return load_guide(path, human)[0]

@@ -7,18 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.export import az
+from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
-from mirror_ppl.models.sites import latent_sites
 from mirror_ppl.models.weights import fingerprint
+
+SAME_BIN = 0.5
+"""Cells by which a reach may be off the edge of its bin."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class PosteriorFile:
 
         Raises:
             PosteriorError: the posterior is of another human model, self-model or version of the
-                domain, or holds fewer draws than asked for.
+                domain, holds fewer draws than asked for, or values that cannot be.
         """
         self._check(human)
         held = len(next(iter(self.values.values())))
@@ -54,25 +55,20 @@ class PosteriorFile:
         if number > held:
             raise PosteriorError(f"{self.path}: holds {held} draws, not {number}")
         chosen = np.linspace(0, held - 1, number).round().astype(int)
-        with (
-            torch.random.fork_rng(devices=[]),
-            pyro.plate("person", len(self.people), dim=-2),
-            poutine.block(),
-            poutine.trace() as trace,
-        ):
-            implants = human.prior()
-            latent = human.self_model.latent
-            like = next(human.parameters())
-            belief = like.new_zeros(len(self.people), 1, 1, latent)
-            human.act(implants, belief, human.self_model.action_values(belief))
+        with torch.random.fork_rng(devices=[]):
+            nodes = sample_sites(human, len(self.people))
+        device = next(human.parameters()).device
         domain, draws = human.domain, {}
         bins = np.asarray(domain.reach_bins)
-        for name, site in latent_sites(trace.trace).items():
+        for name, site in nodes.items():
             if name not in self.values:
                 raise PosteriorError(f'{self.path}: has no draws of the site "{name}"')
             value = self.values[name][chosen]
             if name in sight_sites(domain):
-                value = np.abs(value[..., None] - bins).argmin(-1)
+                distance = np.abs(value[..., None] - bins)
+                if not (distance.min(-1) < SAME_BIN).all():
+                    raise PosteriorError(f'{self.path}: "{name}" has values that are no bins')
+                value = distance.argmin(-1)
             fn = site["fn"]
             shape = (number, len(self.people), 1, *fn.event_shape)
             if value.shape != shape[:2] + shape[3:]:
@@ -80,11 +76,12 @@ class PosteriorFile:
                     f'{self.path}: "{name}" has shape {value.shape}, expected '
                     f"{shape[:2] + shape[3:]}"
                 )
-            draws[name] = (
-                torch.as_tensor(value.reshape(shape))
-                .to(site["value"].dtype, copy=True)
-                .to(like.device)
-            )
+            own = torch.as_tensor(value.reshape(shape)).to(site["value"].dtype, copy=True)
+            if number and not (own.isfinite().all() and fn.support.check(own).all()):
+                raise PosteriorError(
+                    f'{self.path}: "{name}" has values that the human model rules out'
+                )
+            draws[name] = own.to(device)
         return draws
 
     def _check(self, human: HumanModel) -> None:
