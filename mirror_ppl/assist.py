@@ -61,9 +61,9 @@ class Options:
     kl_measure: str = "kl"
     """What mirror-kl measures: kl, or squared (the distance of means of the released code)."""
     json: Path | None = None
-    """Write the results as data."""
+    """Write the results as data; the folder is made if it is not there."""
     log: Path | None = None
-    """Write every decision with its audit, one JSON object a line."""
+    """Write every decision with its audit, one JSON object a line, over what is there."""
     human_model: str | None = None
     """The human model that the posterior is of, if it is one of your own: path/to/file.py:Class."""
     self_model: Path | None = None
