@@ -55,6 +55,7 @@ def test_the_table_of_alternatives():
         "later",
         "cost",
         "gain",
+        "standard_error",
         "low",
         "high",
         "probability",
@@ -75,6 +76,7 @@ def test_the_table_of_alternatives():
     assert table["gain"].tolist() == pytest.approx([3.5, 0, 0, -0.5])
     error = [0.5, 0, 0, 1.5]
     assert (table["high"] - table["gain"]).tolist() == pytest.approx([1.645 * e for e in error])
+    assert table["standard_error"].tolist() == pytest.approx(list(error))
     assert (table["gain"] - table["low"]).tolist() == pytest.approx([1.645 * e for e in error])
     assert table["probability"].tolist() == [1.0, 0.0, 0.0, 0.5]
     assert table["chosen"].tolist() == [True, False, False, False]
@@ -114,6 +116,7 @@ def test_a_decision_without_a_choice():
         "later": "",
         "cost": 0.0,
         "gain": 0.0,
+        "standard_error": 0.0,
         "low": 0.0,
         "high": 0.0,
         "probability": 0.0,
