@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+from running import command
 
 from mirror_ppl import assist, fit
-from mirror_ppl.console import run
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation import assistance_cells
@@ -14,17 +14,6 @@ from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.export import az, save_inference_data
 
 SMALL = ("--rounds", "2", "--draws", "4", "--horizon", "2", "--jobs", "1")
-
-
-def command(module, *args):
-    """Run a command in this process; its exit status."""
-    return run(
-        module.Options,
-        module.main,
-        prog=module.PROGRAM,
-        description=module.DESCRIPTION,
-        args=[str(arg) for arg in args],
-    )
 
 
 @pytest.fixture(scope="module")

@@ -2,9 +2,9 @@
 
 import pytest
 from PIL import Image
+from running import command
 
 from mirror_ppl import calibrate
-from mirror_ppl.console import run
 from mirror_ppl.inference.calibration import Calibration
 from mirror_ppl.inference.guides import Inferred, infer
 
@@ -15,16 +15,6 @@ class Toy(ToyHuman):
     pass
 """
 RESULTS = {"calibration.nc", "ranks.png", "ecdf.png", "coverage.png"}
-
-
-def command(*args):
-    return run(
-        calibrate.Options,
-        calibrate.main,
-        prog=calibrate.PROGRAM,
-        description=calibrate.DESCRIPTION,
-        args=[str(arg) for arg in args],
-    )
 
 
 @pytest.fixture
@@ -52,7 +42,7 @@ def names(folder):
 
 
 def test_it_tells_and_writes_what_it_found(small, tmp_path, capsys):
-    assert command(*small, "--jobs", 1) == 0
+    assert command(calibrate, *small, "--jobs", 1) == 0
     out, err = capsys.readouterr()
     assert "60 people drawn from the prior" in out
     for word in ("reach", "in sight", "otherwise", "not rejected for any of 3", "calibration.nc"):
@@ -67,10 +57,10 @@ def test_it_tells_and_writes_what_it_found(small, tmp_path, capsys):
 
 
 def test_processes_share_the_people(small, tmp_path):
-    assert command(*small, "--jobs", 1) == 0
+    assert command(calibrate, *small, "--jobs", 1) == 0
     alone = Calibration.load(tmp_path / "out" / "calibration.nc")
     other = [tmp_path / "shared" if part == tmp_path / "out" else part for part in small]
-    assert command(*other, "--jobs", 2) == 0
+    assert command(calibrate, *other, "--jobs", 2) == 0
     shared = Calibration.load(tmp_path / "shared" / "calibration.nc")
     assert shared.data.equals(alone.data)
 
@@ -85,7 +75,7 @@ def test_wrong_posteriors_end_with_status_1(small, monkeypatch, capsys):
         return Inferred(draws)
 
     monkeypatch.setattr(calibrate, "_infer", narrow)
-    assert command(*small, "--jobs", 1, "--seed", 3) == 1
+    assert command(calibrate, *small, "--jobs", 1, "--seed", 3) == 1
     assert "rejected for 2 of 3" in capsys.readouterr().out
 
 
@@ -99,15 +89,15 @@ def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
         return infer(human, recordings, options, seed)
 
     monkeypatch.setattr(calibrate, "_infer", counted)
-    assert command(*small, "--jobs", 1) == 130
+    assert command(calibrate, *small, "--jobs", 1) == 130
     assert names(tmp_path / "out") == {"parts"}
     assert len(list((tmp_path / "out" / "parts").iterdir())) == 3
-    assert command(*small, "--jobs", 1) == 0
+    assert command(calibrate, *small, "--jobs", 1) == 0
     assert len(done) == 4 + 12 - 3
     assert names(tmp_path / "out") == RESULTS
     resumed = Calibration.load(tmp_path / "out" / "calibration.nc")
     other = [tmp_path / "whole" if part == tmp_path / "out" else part for part in small]
-    assert command(*other, "--jobs", 1) == 0
+    assert command(calibrate, *other, "--jobs", 1) == 0
     assert resumed.data.equals(Calibration.load(tmp_path / "whole" / "calibration.nc").data)
 
 
@@ -130,6 +120,6 @@ def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
     ],
 )
 def test_what_cannot_be_done_is_refused_in_a_line(tmp_path, capsys, args, message):
-    assert command("--out", tmp_path / "out", *args) == 2
+    assert command(calibrate, "--out", tmp_path / "out", *args) == 2
     assert message in " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert not (tmp_path / "out").exists()

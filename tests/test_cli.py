@@ -14,9 +14,9 @@ import pytest
 import torch
 import xarray as xr
 from example_recordings import fields
+from running import command
 
 from mirror_ppl import __main__, assist, calibrate, fit, simulate, train
-from mirror_ppl.console import run
 from mirror_ppl.data import (
     Demonstrations,
     asset_path,
@@ -33,17 +33,6 @@ from mirror_ppl.inference.summary import summarize
 from mirror_ppl.models.weights import load_self_model
 
 RESULTS = {"posterior.nc", "sight.png", "summary.json"}
-
-
-def command(module, *args):
-    """Run a command in this process; its exit status."""
-    return run(
-        module.Options,
-        module.main,
-        prog=module.PROGRAM,
-        description=module.DESCRIPTION,
-        args=[str(arg) for arg in args],
-    )
 
 
 def content(folder):

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.container import ErrorbarContainer
+from running import command
 
 from mirror_ppl import compare, fit
-from mirror_ppl.console import run
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import OptionError, PosteriorError
 from mirror_ppl.evaluation.comparison import compare_fits, label_models, read_fit
@@ -27,17 +27,6 @@ PEOPLE = ("ana", "ben", "cem", "dia")
 REAL = LENGTHS > 0
 ACTIONS = np.where(np.arange(4) < LENGTHS[..., None], np.arange(4) % 2, -1).astype("int8")
 SOURCE = {"recorded_seed": "0", "recorded_population": "paper", "recorded_command": "simulate " * 9}
-
-
-def command(*args):
-    """Run the command in this process; its exit status."""
-    return run(
-        compare.Options,
-        compare.main,
-        prog=compare.PROGRAM,
-        description=compare.DESCRIPTION,
-        args=[str(arg) for arg in args],
-    )
 
 
 def group(attributes, **variables):
@@ -336,7 +325,7 @@ def test_models_are_called_by_their_class_and_by_their_path_where_that_is_needed
 
 
 def test_the_table_tells_the_numbers(paths, values, capsys):
-    assert command(paths[2], paths[0], "--labels", "slow", "fast") == 0
+    assert command(compare, paths[2], paths[0], "--labels", "slow", "fast") == 0
     out, err = capsys.readouterr()
     assert err == ""
     assert "driving, fog: leave-one-out, 7 rounds of 4 people" in out
@@ -352,7 +341,7 @@ def test_the_table_tells_the_numbers(paths, values, capsys):
 def test_the_table_of_held_out_rounds_doubts_nothing(tmp_path, rng, capsys):
     right = rng.uniform(0.2, 0.9, (2, 5, 4, 3, 4))
     paths = [write(tmp_path / f"{m}.nc", right=right[m]) for m in range(2)]
-    assert command(*paths, "--by", "heldout") == 0
+    assert command(compare, *paths, "--by", "heldout") == 0
     out = capsys.readouterr().out
     assert "driving, fog: 7 held-out rounds of 4 people" in out
     assert "doubtful" not in out
@@ -362,7 +351,7 @@ def test_the_table_of_held_out_rounds_doubts_nothing(tmp_path, rng, capsys):
     "label", ["[bold]x[/]", "[/nothing]", "a model " * 30, "x" * 300, "模型$_"]
 )
 def test_names_of_any_kind_fit_in_80_columns(paths, capsys, label):
-    assert command(*paths, "--labels", label, "b", "c") == 0
+    assert command(compare, *paths, "--labels", label, "b", "c") == 0
     lines = capsys.readouterr().out.splitlines()
     assert all(len(line) <= 80 for line in lines)
     # However a name is broken into lines, nothing of it is lost or taken for markup.
@@ -372,7 +361,7 @@ def test_names_of_any_kind_fit_in_80_columns(paths, capsys, label):
 
 def test_results_as_data(paths, values, tmp_path):
     out = tmp_path / "new" / "a.json"
-    assert command(*paths, "--json", out) == 0
+    assert command(compare, *paths, "--json", out) == 0
     results = json.loads(out.read_text(), parse_constant=pytest.fail)
     assert results["command"] == "python -m mirror_ppl.compare"
     assert (results["by"], results["unit"]) == ("loo", "nats an action")
@@ -396,7 +385,7 @@ def test_results_as_data(paths, values, tmp_path):
 )
 def test_a_figure_is_written_in_the_format_of_its_name(paths, tmp_path, capsys, suffix, start):
     path = tmp_path / f"x{suffix}"
-    assert command(*paths[:2], "--figure", path) == 0
+    assert command(compare, *paths[:2], "--figure", path) == 0
     assert path.read_bytes().startswith(start)
     out, err = capsys.readouterr()
     assert out.endswith(f"{path}: the differences\n") and err == ""
@@ -476,7 +465,7 @@ def test_any_name_can_be_drawn_and_many_people_fit(tmp_path, paths, monkeypatch)
 def refused(capsys, folder, *args):
     """The one line of an error; nothing else is printed, and nothing written."""
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    assert command("--json", folder / "a.json", "--figure", folder / "a.png", *args) == 2
+    assert command(compare, "--json", folder / "a.json", "--figure", folder / "a.png", *args) == 2
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("error: ") and err.count("\n") == 1
@@ -684,7 +673,7 @@ def fits(tmp_path_factory):
 def test_folders_of_fits_are_compared(fits, tmp_path, capsys, by):
     capsys.readouterr()
     outputs = ("--json", tmp_path / "a.json", "--figure", tmp_path / "a.png")
-    assert command(fits / "0", fits / "1", "--by", by, *outputs) == 0
+    assert command(compare, fits / "0", fits / "1", "--by", by, *outputs) == 0
     out, err = capsys.readouterr()
     assert err == "" and all(len(line) <= 80 for line in out.splitlines() if "a." not in line)
     assert "HumanModel 0" in out and "HumanModel 1" in out

@@ -8,12 +8,12 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from running import command
 from scipy import stats
 from test_views import ragged
 
 from mirror_ppl import calibrate as calibrate_command
 from mirror_ppl import fit, simulate, train
-from mirror_ppl.console import run
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
 from mirror_ppl.inference import fitting, guide_training, guides
@@ -450,16 +450,6 @@ def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, c
     summary = json.loads((tmp_path / "f" / "summary.json").read_text())
     assert summary["guide"] == "amortized"
     assert "pareto_k" in summary["people"][0]
-
-
-def command(module, *args):
-    return run(
-        module.Options,
-        module.main,
-        prog=module.PROGRAM,
-        description=module.DESCRIPTION,
-        args=[str(arg) for arg in args],
-    )
 
 
 @pytest.mark.parametrize(
