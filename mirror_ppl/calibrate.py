@@ -101,8 +101,8 @@ def main(options: Options) -> int:
     settings = InferenceOptions(options.guide, options.draws)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     parts = folder / "parts"
-    what = [options.setting, options.seed, trial]
-    identity = run_identity(human, settings, network, what)
+    what = [settings, options.setting, options.seed, trial]
+    identity = run_identity(human, network, what)
     with Progress("calibrate", options.people) as progress:
         calibration = calibrate(
             human,

@@ -307,6 +307,11 @@ def test_training_goes_on_where_it_was(toy, tmp_path):
         assert torch.equal(getattr(whole, name), value), name
     with pytest.raises(CheckpointError, match="other options"):
         simulate_examples(toy, options, 1, checkpoint=path)
+    # Nor is another model gone on with, even one of the same file.
+    other = Other(toy.self_model)
+    assert run_identity(Peeking(toy.self_model), None, []) != run_identity(other, None, [])
+    with pytest.raises(CheckpointError, match="other options"):
+        simulate_examples(other, options, 0, checkpoint=path)
 
 
 # --- one interface ----------------------------------------------------------------------------
@@ -342,6 +347,10 @@ def test_inference_goes_on_from_its_checkpoint(toy, recordings, tmp_path, monkey
     assert torch.equal(resumed.pareto_k, whole.pareto_k)
     with pytest.raises(CheckpointError, match="other options"):
         infer(toy, recordings, options_of("exact"), 0, checkpoint=(run[0], "another"))
+
+
+class Other(ToyHuman):
+    """Of this file, too."""
 
 
 class Peeking(ToyHuman):

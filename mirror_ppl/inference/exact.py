@@ -13,6 +13,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.combinations import discrete_sites, grid_of, log_priors
 from mirror_ppl.inference.views import combination_scores
 from mirror_ppl.models.human import HumanModel
@@ -102,6 +103,18 @@ def acts_on_beliefs(human: HumanModel, table: ViewTable) -> bool:
             ends = {site: value.expand_as(implants[site]) for site, value in ends.items()}
             found.append(human.act({**implants, **ends}, belief, action_values))
     return torch.equal(*found)
+
+
+def require_acting_on_beliefs(human: HumanModel, table: ViewTable) -> None:
+    """Refuse models whose likelihoods of views are not enough; see :func:`acts_on_beliefs`.
+
+    Raises:
+        HumanModelError: this is one.
+    """
+    if not acts_on_beliefs(human, table):
+        raise HumanModelError(
+            "act() reads a site that perceive() reads, too; only the guide svi can fit this"
+        )
 
 
 def marginals(table: ViewTable, log_weights: Tensor) -> dict[str, Tensor]:

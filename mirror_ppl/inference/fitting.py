@@ -130,7 +130,7 @@ def fit_people(
     people = train.num_people
     run = None
     if checkpoint is not None:
-        run = checkpoint, run_identity(human, options, network, [_recorded(train), seed])
+        run = checkpoint, run_identity(human, network, [options, _recorded(train), seed])
     posterior = infer(human, train, options, seed, network, report, run)
     prior = draw_prior(human, people, PRIOR_DRAWS, seed)
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}

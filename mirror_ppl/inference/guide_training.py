@@ -12,7 +12,6 @@ minimum the guide is the posterior of everybody at once, as far as it can expres
 from __future__ import annotations
 
 import copy
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from mirror_ppl.inference.amortized import (
     reference_places,
 )
 from mirror_ppl.inference.calibration import prior_people
+from mirror_ppl.inference.guides import run_identity
 from mirror_ppl.inference.importance import places, scalar_sites
 from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.inference.sightings import Sightings
@@ -36,7 +36,6 @@ from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.weights import fingerprint
 
 
 @dataclass(frozen=True)
@@ -124,15 +123,7 @@ def simulate_examples(
     checkpoint: Path | None = None,
 ) -> Examples:
     """People from the prior, and what their rounds say, more and more of them."""
-    description = {
-        "self_model": fingerprint(human.self_model),
-        "human_model": type(human).__name__,
-        "seed": seed,
-        "people": options.people,
-        "rounds": list(options.rounds),
-        "together": options.together,
-    }
-    run = json.dumps(description, sort_keys=True)
+    run = run_identity(human, None, [seed, options.people, options.rounds, options.together])
     parts = _restored(checkpoint, run)
     done = sum(len(part) for part in parts)
     while done < options.people:

@@ -16,7 +16,7 @@ import hashlib
 import inspect
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic
 
@@ -184,16 +184,12 @@ class _People:
         return cls(content["draws"], content["pareto_k"])
 
 
-def run_identity(
-    human: HumanModel,
-    options: InferenceOptions,
-    network: AmortizedGuide | None,
-    more: Sequence[object],
-) -> str:
-    """What results belong to, as a hash: model with its source, network, options, and more."""
-    source = [_source(kind) for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
+def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequence[object]) -> str:
+    """What results belong to, as a hash: model with its source, network, and options and so on."""
+    kinds = [kind for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
+    source = [(kind.__qualname__, _source(kind)) for kind in kinds]
     weights = [fingerprint(human), None if network is None else fingerprint(network)]
-    description = [weights, source, __version__, asdict(options), [str(part) for part in more]]
+    description = [weights, source, __version__, [str(part) for part in what]]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 

@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, biject_to
 
-from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.exact import acts_on_beliefs, log_joints
+from mirror_ppl.inference.exact import log_joints, require_acting_on_beliefs
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import restricted
 from mirror_ppl.models.human import HumanModel
@@ -130,10 +129,7 @@ class Sampler:
     """
 
     def __init__(self, human: HumanModel, table: ViewTable) -> None:
-        if not acts_on_beliefs(human, table):
-            raise HumanModelError(
-                "act() reads a site that perceive() reads, too; only the guide svi can fit this"
-            )
+        require_acting_on_beliefs(human, table)
         self.human = human
         self.table = table
         self.sites = scalar_sites(human)

@@ -24,22 +24,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import pyro
 import pyro.distributions as dist
 import torch
-from pyro.infer import MCMC, NUTS
-from pyro.infer.autoguide import init_to_median
 from torch import Tensor
 
 from mirror_ppl.inference.importance import places, scalar_sites
+from mirror_ppl.inference.nuts import run_chain
 from mirror_ppl.inference.prior import Draws, draw_prior, sample_sites, values_of
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 
 PRIOR_DRAWS = 4000
-WARMUP = 200
 
 
 @dataclass(frozen=True)
@@ -148,19 +145,7 @@ class Pooling:
             seed: of everything random.
             report: told of steps.
         """
-        total, done = WARMUP + number, 0
-
-        def count(*_: object) -> None:
-            nonlocal done
-            done += 1
-            report("population", min(done, total), total, "")
-
-        with torch.random.fork_rng(devices=[]), pyro.validation_enabled(False):
-            torch.manual_seed(seed)
-            kernel = NUTS(self.program, init_strategy=init_to_median, max_tree_depth=6)
-            chain = MCMC(kernel, number, WARMUP, hook_fn=count, disable_progbar=True)
-            chain.run(*self.read(draws))
-        found: dict[str, Any] = chain.get_samples()
+        found = run_chain(self.program, self.read(draws), number, seed, "population", report)
         chances = {name: found[f"{name}_chances"] for name in self.supports}
         return Population(chances, found["mean"], found["spread"])
 

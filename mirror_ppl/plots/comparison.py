@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from mirror_ppl.evaluation.comparison import Comparison, Score
-from mirror_ppl.files import write_whole
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY
 
@@ -84,8 +83,7 @@ def save_comparison_picture(comparison: Comparison, path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    figure = plot_comparison(comparison)
-    write_whole(path, lambda temporary: figure.savefig(temporary, dpi=120))
+    plot_comparison(comparison).save(path)
 
 
 def _dot(ax: Axes, score: Score, y: float, colour: str, marker: str, size: float) -> None:
