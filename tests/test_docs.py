@@ -218,7 +218,8 @@ def test_shortcuts_are_told_with_their_tolerances():
     text = page("docs/human_model.md")
     assert f"more than {Screening().margin:.0f} nats" in text
     assert f"of {Screening().ways} ways" in text
-    assert f"a grid of {Screening().resolution} units" in text
+    assert f"under each of {Screening().alike} of those ways" in text
+    assert f"a grid of {Screening().resolution} nats" in text
     assert f"the same at {FitOptions().prune_margin:.0f} nats" in text
     assert FitOptions().prune_margin == ImportanceOptions().prune_margin
     assert f"under {PRUNING_DRAWS} draws of the prior" in text

@@ -15,11 +15,12 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.combinations import MAX_COMBINATIONS
 from mirror_ppl.inference.courses import _beginnings
 from mirror_ppl.inference.experience import roll_out
+from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import (
-    Screening,
     build_view_table,
     combination_scores,
     restricted,
+    rounds_of,
 )
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
@@ -200,14 +201,19 @@ def test_no_view_is_kept_twice_or_for_nothing(self_model, recordings):
         assert table.real[person].tolist() == [True] * len(lengths) + [False] * (2 - len(lengths))
         for number in range(len(lengths)):
             views = table.index[person, number].unique()
-            beliefs = table.belief[person, views][:, : lengths[number]].flatten(1)
-            # Different views lead to different beliefs, so none is there twice.
-            assert len(beliefs.unique(dim=0)) == len(views)
             # A view belongs to one round: its actions and steps are those of that round.
             steps = torch.arange(STEPS) < lengths[number]
-            assert torch.equal(table.view_steps[person, views], steps.expand(len(views), -1))
+            moments = table.moments[person, views]
+            assert torch.equal(moments != NO_VIEW, steps.expand(len(views), -1))
             real = rounds_actions(recordings, person, number)[steps]
-            assert (table.view_actions[person, views][:, steps] == real).all()
+            assert (table.acted[person].flatten()[moments[:, steps]] == real).all()
+            # Different views lead to different beliefs, so none is there twice.
+            beliefs = table.belief[person].flatten(0, 1)[moments[:, steps]].flatten(1)
+            assert len(beliefs.unique(dim=0)) == len(views)
+        moments = table.moments[person][table.moments[person] != NO_VIEW]
+        used = (moments // table.belief.shape[2]).unique()
+        assert used.tolist() == list(range(len(used)))
+        assert (table.belief[person, max(len(used), 1) :] == 0).all()
 
 
 def rounds_actions(recordings, person, number):
@@ -220,11 +226,9 @@ def test_values_of_shared_beginnings_are_those_of_the_belief(self_model, recordi
     with torch.no_grad():
         expected = self_model.action_values(table.belief)
     close = (table.values - expected).abs().amax(-1) < 1e-4
-    real = (
-        table.view_steps
-        & (torch.arange(table.belief.shape[1]) < table.view_counts[:, None])[..., None]
-    )
-    assert close[real].all()
+    assert close.shape[1] > 500
+    for person in range(2):
+        assert close[person].flatten()[table.moments[person].clamp(min=0)].all()
 
 
 def test_beginnings_are_numbered():
@@ -317,18 +321,52 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, rec
     assert margin < 15 or expected.gather(-1, best).all()
 
 
-def test_merging_moves_values_by_at_most_the_resolution(self_model, recordings):
-    human, rounds = HumanModel(self_model), ragged(recordings, [[15]])
-    whole = build_view_table(human, rounds)
-    merged = build_view_table(human, rounds, screening=Screening(margin=math.inf, resolution=0.1))
-    assert merged.view_counts[0] < 0.8 * whole.view_counts[0]
-    assert (merged.index != NO_VIEW).all()
+class Whole(HumanModel):
+    """The same, but taken for one that acts on whole rounds."""
 
-    def grid(table):
-        values = table.values[0, table.index[0, 0]]
-        return torch.asinh(values - values.mean(-1, keepdim=True))
+    stepwise = False
 
-    assert (grid(merged) - grid(whole)).abs().max() <= 0.1 + 1e-5
+
+def test_a_model_that_is_not_stepwise_has_the_same_likelihoods(self_model, recordings):
+    rounds, found = ragged(recordings, LENGTHS), []
+    some = torch.randperm(9604)[:40].sort().values
+    policy = {name: value[0] for name, value in policies(HumanModel(self_model), 1, 1).items()}
+    for kind in (HumanModel, Whole):
+        human = kind(self_model)
+        table = build_view_table(human, rounds, [some] * 3)
+        found.append(combination_scores(table, human.act(policy, table.belief, table.values)))
+        assert table.belief.shape[2] == (1 if human.stepwise else STEPS)
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", [HumanModel, Whole], ids=["stepwise", "whole"])
+def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordings, kind):
+    human, rounds = kind(self_model), ragged(recordings, [[15, 9]])
+    resolution = 0.1
+    screening = Screening(margin=math.inf, resolution=resolution, alike=8)
+    whole, merged = Sightings(human, None), Sightings(human, screening)
+    for one_round in rounds_of(rounds, 0):
+        whole.add(*one_round)
+        merged.add(*one_round)
+    tables = [sightings.table() for sightings in (whole, merged)]
+    ways = merged.draw_ways()
+    scores = []
+    for table in tables:
+        with (
+            pyro.condition(data=ways),
+            pyro.plate("way", screening.ways, dim=-3),
+            pyro.plate("person", 1, dim=-2),
+        ):
+            log_probabilities = human.act(human.prior(), table.belief, table.values)
+        scores.append(combination_scores(table, log_probabilities)[:, 0])
+    torch.testing.assert_close(scores[1], merged.score, rtol=1e-4, atol=1e-3)
+    off = (scores[1] - scores[0]).abs().amax(-1)
+    # Under the ways that it looks at, both are within half a step of one point, at every moment.
+    assert off[: screening.alike].max() <= (15 + 9) * resolution
+    assert off.max() > 1e-3 and off[screening.alike :].mean() < 0.5
+    assert (tables[1].index != NO_VIEW).all()
+    number = [table.belief.shape[1] for table in tables]
+    assert number[1] < (0.3 if human.stepwise else 1.0) * number[0]
 
 
 def test_restricted_keeps_what_is_alive_and_forgets_the_rest(self_model, recordings):
@@ -349,7 +387,8 @@ def test_restricted_keeps_what_is_alive_and_forgets_the_rest(self_model, recordi
     for person in range(3):
         used = small.index[person][small.index[person] != NO_VIEW].unique()
         assert used.tolist() == list(range(int(small.view_counts[person])))
-    assert small.belief.shape[1] == small.view_counts.max() < table.belief.shape[1]
+    assert small.moments.shape[1] == small.view_counts.max() < table.moments.shape[1]
+    assert small.belief.shape[1] < table.belief.shape[1]
     # Bit by bit is the same as at once.
     first = alive | (torch.rand(3, 14) < 0.5)
     assert_tables_equal(restricted(restricted(table, first), alive), small)

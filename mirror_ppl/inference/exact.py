@@ -19,7 +19,7 @@ from mirror_ppl.inference.views import combination_scores
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
-CHUNK = 2**22
+CHUNK = 2**23
 """Steps of views, of all draws together, that are worked out at once; bounds memory."""
 
 TRIED_VIEWS = 16
@@ -58,14 +58,22 @@ def log_joint(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor])
 
 
 @torch.no_grad()
-def log_joints(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
+def log_joints(
+    human: HumanModel,
+    table: ViewTable,
+    draws: Mapping[str, Tensor],
+    combinations: Tensor | None = None,
+) -> Tensor:
     """As :func:`log_joint` for each of S draws ``[S, P, 1, ...]``: ``[S, P, M]``.
 
-    Right for models in which :func:`acts_on_beliefs`.
+    Right for models in which :func:`acts_on_beliefs`. Of all combinations unless ``combinations``
+    ``[M]`` says of which.
     """
     number = len(next(iter(draws.values()))) if draws else 1
     grid = combination_values(human, table)
-    size = max(1, CHUNK // max(1, table.view_steps.numel()))
+    if combinations is not None:
+        grid = {site: value[combinations] for site, value in grid.items()}
+    size = max(1, CHUNK // max(1, table.moments.numel()))
     parts = []
     for begin in range(0, number, size):
         some = {name: value[begin : begin + size] for name, value in draws.items()}
@@ -77,7 +85,7 @@ def log_joints(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor])
             pyro.plate("person", table.people, dim=-2),
         ):
             log_probabilities = human.act(human.prior(), table.belief, table.values)
-        scores = combination_scores(table, log_probabilities)
+        scores = combination_scores(table, log_probabilities, combinations)
         parts.append(log_priors(human, grid, some, table.people) + scores)
     return torch.cat(parts)
 

@@ -197,7 +197,7 @@ class Sampler:
         return Weighted(policy, self.combinations, joint, log_weights, pareto_k)
 
     def _joint(self, policy: Draws) -> Tensor:
-        return log_joints(self.human, self.table, policy)[:, 0, self.combinations]
+        return log_joints(self.human, self.table, policy, self.combinations)[:, 0]
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ the later rounds need not be seen through their eyes, and exact marginalization 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import prod
 
@@ -20,10 +20,10 @@ from torch import Tensor
 from mirror_ppl.distinct import distinct_rows
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.inference.combinations import grid_of, log_priors, perceived_sites
-from mirror_ppl.inference.courses import beliefs_and_values
+from mirror_ppl.inference.courses import CHUNK, beliefs_and_values
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.models.human import HumanModel, View
-from mirror_ppl.models.view_table import NO_VIEW, ViewTable
+from mirror_ppl.models.view_table import NO_VIEW, ViewTable, log_likelihoods
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,53 @@ class Screening:
             to decide that suits it best.
         ways: number of ways to decide, drawn from the prior.
         seed: seed of those draws.
-        resolution: views of a round count as one when the action values along them, in units of
-            reward, fall on the same points of a grid of this width at every step. The grid widens
-            where one action is far better, because there nothing hangs on how much.
+        resolution: moments of a round count as one when the log-probabilities of what was done
+            there, each under ``alike`` of those ways, fall on the same points of a grid of this
+            width. Whole views do, step by step, if the model is not ``stepwise``. 0 for never.
+        alike: see there.
     """
 
     margin: float = 15.0
     ways: int = 16
     seed: int = 0
-    resolution: float = 0.1
+    resolution: float = 0.03
+    alike: int = 16
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.alike <= self.ways:
+            raise ValueError(f"alike must be 1 to {self.ways}, not {self.alike}")
+
+
+@dataclass(frozen=True)
+class RoundViews:
+    """U distinct views of one round, and the moments that they share; see :class:`ViewTable`.
+
+    Attributes:
+        moments: ``[U, T]``.
+        belief: ``[N, T', Z]``.
+        values: ``[N, T', A]``.
+        acted: ``[N, T']``.
+    """
+
+    moments: Tensor
+    belief: Tensor
+    values: Tensor
+    acted: Tensor
+
+    def __len__(self) -> int:
+        return len(self.moments)
+
+    def kept(self, views: Tensor) -> RoundViews:
+        """Only some views, and the moments that they have."""
+        moments = self.moments[views]
+        real = moments != NO_VIEW
+        length = self.belief.shape[1]
+        used, place = torch.unique(moments[real] // length, return_inverse=True)
+        moments = moments.clone()
+        moments[real] = place * length + moments[real] % length
+        if not len(used):  # of padding alone; act() is asked about something all the same
+            used = used.new_zeros(1)
+        return RoundViews(moments, self.belief[used], self.values[used], self.acted[used])
 
 
 class Sightings:
@@ -84,7 +122,7 @@ class Sightings:
         ways = 0 if screening is None else screening.ways
         self.score = torch.zeros(ways, prod(self.sizes), device=device)
         self.ways: dict[str, Tensor] = {}
-        self._rounds: list[dict[str, Tensor]] = []
+        self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
 
@@ -103,43 +141,44 @@ class Sightings:
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
         view = self.human.perceive(candidates, observation, told)
-        resolution = 0.0 if self.screening is None else self.screening.resolution
-        part, which = _views(self.human, view, observation, actions, real, len(alive), resolution)
-        total = sum(len(one["actions"]) for one in self._rounds)
-        self._rounds.append(part)
-        self._seen.append((alive, total + which))
-        self._recorded.append((actions[0], real))
+        part, which = _views(self.human, view, observation, actions, real, len(alive))
         if self.screening is not None:
+            if self.screening.resolution > 0:
+                part, which = self._merged(part, which, self.screening)
             self.score[:, alive] += self._log_likelihoods(part)[:, which]
             best = self.score[:, alive].amax(0)
             self.alive = alive[best >= best.max() - self.screening.margin]
+        self._rounds.append(part)
+        self._seen.append((alive, which))
+        self._recorded.append((actions[0], real))
 
     def table(self) -> ViewTable:
         """The views that are left, as a table of one person; there was at least one round."""
-        rounds = len(self._seen)
-        index = torch.full((rounds, prod(self.sizes)), NO_VIEW, device=self.alive.device)
-        for row, (combination, view) in zip(index, self._seen, strict=True):
+        index, rounds, views, moments = [], [], 0, 0
+        shifted = []
+        for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
+            # Only what somebody who was never given up has seen is worth keeping.
+            row = torch.full((prod(self.sizes),), NO_VIEW, device=self.alive.device)
             row[combination] = view
-        # Only what somebody who was never given up has seen is worth keeping.
-        kept = torch.full_like(index, NO_VIEW)
-        kept[:, self.alive] = index[:, self.alive]
-        needed, renumbered = torch.unique(kept[kept != NO_VIEW], return_inverse=True)
-        kept[kept != NO_VIEW] = renumbered
-
-        def part(name: str) -> Tensor:
-            return torch.cat([one[name] for one in self._rounds])[needed][None]
-
+            needed, place = torch.unique(row[self.alive], return_inverse=True)
+            row = torch.full_like(row, NO_VIEW)
+            row[self.alive] = views + place
+            part = part.kept(needed)
+            index.append(row)
+            rounds.append(part)
+            shifted.append(torch.where(part.moments == NO_VIEW, NO_VIEW, part.moments + moments))
+            views, moments = views + len(part), moments + part.acted.numel()
         return ViewTable(
             sites=tuple(self.grid),
             sizes=self.sizes,
-            index=kept[None],
-            belief=part("belief"),
-            values=part("values"),
-            view_actions=part("actions"),
-            view_steps=part("steps"),
+            index=torch.stack(index)[None],
+            moments=torch.cat(shifted)[None],
+            belief=torch.cat([part.belief for part in rounds])[None],
+            values=torch.cat([part.values for part in rounds])[None],
+            acted=torch.cat([part.acted for part in rounds])[None],
             recorded=torch.stack([actions for actions, _ in self._recorded])[None],
             steps=torch.stack([real for _, real in self._recorded])[None],
-            view_counts=torch.tensor([len(needed)]),
+            view_counts=torch.tensor([views]),
         )
 
     @cached_property
@@ -148,12 +187,39 @@ class Sightings:
         others = {name: way for name, way in self.draw_ways().items() if name not in self.grid}
         return log_priors(self.human, self.grid, others, 1)[:, 0]
 
-    def _log_likelihoods(self, part: Mapping[str, Tensor]) -> Tensor:
+    def _merged(
+        self, part: RoundViews, which: Tensor, screening: Screening
+    ) -> tuple[RoundViews, Tensor]:
+        """The views of a round with moments that count as one made one; ``which`` each is then."""
+        ways = {name: way[: screening.alike] for name, way in self.draw_ways().items()}
+        real = torch.zeros_like(part.acted, dtype=torch.bool)
+        real.view(-1)[part.moments[part.moments != NO_VIEW]] = True
+        keys = []
+        for some in torch.arange(len(part.acted), device=which.device).split(CHUNK):
+            found = self._act(ways, part.belief[None, some], part.values[None, some])[:, 0]
+            acted = part.acted[some].expand(found.shape[:-1])
+            chosen = found.gather(-1, acted[..., None]).squeeze(-1)
+            keys.append(torch.round(chosen / screening.resolution).long().movedim(0, -1))
+        # What was done tells moments apart, too: theirs is one entry of ``acted``.
+        key = torch.cat([torch.cat(keys), part.acted[..., None]], -1) * real[..., None]
+        first, cluster = distinct_rows(key.flatten(1))
+        length = part.acted.shape[1]
+        moments = part.moments
+        moments = torch.where(
+            moments == NO_VIEW,
+            NO_VIEW,
+            cluster[moments.clamp(min=0) // length] * length + moments.clamp(min=0) % length,
+        )
+        distinct, place = distinct_rows(moments)
+        kept = RoundViews(
+            moments[distinct], part.belief[first], part.values[first], part.acted[first]
+        )
+        return kept, place[which]
+
+    def _log_likelihoods(self, part: RoundViews) -> Tensor:
         """Of a round's actions under each way and view, ``[ways, U]``."""
-        log_probabilities = self._act(part["belief"][None], part["values"][None])[:, 0]
-        actions = part["actions"].expand(log_probabilities.shape[:-1])
-        chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
-        return torch.where(part["steps"], chosen, 0.0).sum(-1)
+        found = self._act(self.draw_ways(), part.belief[None], part.values[None])[:, 0]
+        return log_likelihoods(found, part.acted, part.moments)
 
     def draw_ways(self) -> dict[str, Tensor]:
         """The ways to decide, ``[ways, 1, 1, ...]``; always the same."""
@@ -161,12 +227,12 @@ class Sightings:
             self.ways = draw_prior(self.human, 1, self.screening.ways, self.screening.seed)
         return self.ways
 
-    def _act(self, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities ``[ways, 1, U, T, A]``."""
+    def _act(self, ways: Mapping[str, Tensor], belief: Tensor, values: Tensor) -> Tensor:
+        """Log-probabilities ``[ways, 1, N, T', A]``."""
         with (
             poutine.block(),
-            poutine.condition(data=self.draw_ways()),
-            pyro.plate("way", len(self.score), dim=-3),
+            poutine.condition(data=dict(ways)),
+            pyro.plate("way", len(next(iter(ways.values()))), dim=-3),
             pyro.plate("person", 1, dim=-2),
         ):
             return self.human.act(self.human.prior(), belief, values)
@@ -179,29 +245,19 @@ def _views(
     actions: Tensor,
     real: Tensor,
     combinations: int,
-    resolution: float,
-) -> tuple[dict[str, Tensor], Tensor]:
+) -> tuple[RoundViews, Tensor]:
     """Distinct views of one round, and which of them each combination has."""
     view = view.map(lambda part: part.expand(combinations, *part.shape[1:]))
     numbers = view.numbers() * real
     first, inverse = distinct_rows(numbers)
     some = view.map(lambda part: part[first])
     belief, values, node = beliefs_and_values(human, some, numbers[first], observation, actions)
-    if resolution > 0:
-        merged, cluster = _alike(values[node], real, resolution)
-        node, inverse = node[merged], cluster[inverse]
-    belief, values = belief[node], values[node]
-    return {
-        "belief": belief,
-        "values": values,
-        "actions": actions.expand(len(belief), -1),
-        "steps": real.expand(len(belief), -1),
-    }, inverse
-
-
-def _alike(values: Tensor, real: Tensor, resolution: float) -> tuple[Tensor, Tensor]:
-    """Rows ``[U']`` that stand for clusters of like action values, and each row's cluster."""
-    advantage = values - values.mean(-1, keepdim=True)
-    # asinh is the identity near 0 and logarithmic far from it.
-    grid = torch.round(torch.asinh(advantage) / resolution) * real[:, None]
-    return distinct_rows(grid.flatten(1).long())
+    acted = actions.expand(node.shape)
+    if human.stepwise:
+        at = acted.new_zeros(len(belief)).scatter(0, node.flatten(), acted.flatten())
+        part = RoundViews(node, belief[:, None], values[:, None], at[:, None])
+    else:
+        moments = torch.arange(node.numel(), device=node.device).view(node.shape)
+        part = RoundViews(moments, belief[node], values[node], acted)
+    moments = torch.where(real, part.moments, NO_VIEW)
+    return replace(part, moments=moments), inverse

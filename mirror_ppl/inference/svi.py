@@ -281,6 +281,8 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
     """
     number = next(iter(draws.values())).shape[0]
     person = torch.arange(table.people, device=table.index.device)[:, None]
+    everybody = person[..., None]
+    belief, values = table.belief.flatten(1, 2), table.values.flatten(1, 2)
     results = []
     for draw in range(number):
         own = {name: value[draw] for name, value in draws.items()}
@@ -291,6 +293,8 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
         ):
             implants = human.prior()
             view = table.view_of(implants).expand(table.people, table.rounds)
-            belief, values = table.belief[person, view], table.values[person, view]
-            results.append(human.act(implants, belief, values))
+            moments = table.moments[person, view].clamp(min=0)  # [P, B, T]
+            results.append(
+                human.act(implants, belief[everybody, moments], values[everybody, moments])
+            )
     return torch.stack(results)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.sightings import RoundViews, Screening, Sightings
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
 
@@ -18,39 +18,54 @@ from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
 def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
     """The table with only the combinations ``[P, M]`` that are alive, and the views they had."""
     index = torch.where(alive[:, None], table.index, NO_VIEW)
-    kept = []
-    for person in index:
-        needed, renumbered = torch.unique(person[person != NO_VIEW], return_inverse=True)
-        person[person != NO_VIEW] = renumbered
-        kept.append(needed)
-    most = max(len(needed) for needed in kept)
-
-    def part(value: Tensor) -> Tensor:
-        pairs = zip(value, kept, strict=True)
-        return torch.stack([_pad(own[needed], most) for own, needed in pairs])
-
+    people = []
+    for person, row in enumerate(index):
+        needed, renumbered = torch.unique(row[row != NO_VIEW], return_inverse=True)
+        row[row != NO_VIEW] = renumbered
+        people.append(views_of(table, person).kept(needed))
     return replace(
         table,
         index=index,
-        belief=part(table.belief),
-        values=part(table.values),
-        view_actions=part(table.view_actions),
-        view_steps=part(table.view_steps),
-        view_counts=torch.tensor([len(needed) for needed in kept]),
+        **_padded(people),
+        view_counts=torch.tensor([len(views) for views in people]),
     )
 
 
-def combination_scores(table: ViewTable, log_probabilities: Tensor) -> Tensor:
+def views_of(table: ViewTable, person: int) -> RoundViews:
+    """One person's views, padding included."""
+    return RoundViews(
+        table.moments[person], table.belief[person], table.values[person], table.acted[person]
+    )
+
+
+def _padded(people: Sequence[RoundViews]) -> dict[str, Tensor]:
+    """Views of P people as the fields of a table."""
+    views = max(len(own) for own in people)
+    moments = max(len(own.acted) for own in people)
+    return {
+        "moments": torch.stack([_pad(own.moments, views, NO_VIEW) for own in people]),
+        "belief": torch.stack([_pad(own.belief, moments) for own in people]),
+        "values": torch.stack([_pad(own.values, moments) for own in people]),
+        "acted": torch.stack([_pad(own.acted, moments) for own in people]),
+    }
+
+
+def combination_scores(
+    table: ViewTable, log_probabilities: Tensor, combinations: Tensor | None = None
+) -> Tensor:
     """Log-likelihood ``[..., P, M]`` of each combination, given log-probabilities of actions.
 
     Args:
         table: the recorded rounds.
-        log_probabilities: ``[..., P, V, T, A]`` of actions in each view.
+        log_probabilities: ``[..., P, N, T', A]`` of actions at the table's beliefs.
+        combinations: numbers ``[M]`` of those that are asked for; all unless given.
     """
     likelihood = table.log_likelihoods(log_probabilities)
     scores = []
     for person, index in enumerate(table.index):
         index = index[table.real[person]]
+        if combinations is not None:
+            index = index[:, combinations]
         possible = (index != NO_VIEW).all(0)
         own = likelihood[..., person, :]
         found = own.new_full((*own.shape[:-1], index.shape[-1]), IMPOSSIBLE)
@@ -97,19 +112,11 @@ def build_view_table(
 def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> ViewTable:
     """The table of P people of the tables of each of them."""
     rounds = demonstrations.shape[1]
-    views = max(int(table.view_counts) for table in tables)
-
-    def padded(name: str, length: int, value: int = 0) -> Tensor:
-        return torch.stack([_pad(getattr(table, name)[0], length, value) for table in tables])
-
     return ViewTable(
         sites=tables[0].sites,
         sizes=tables[0].sizes,
-        index=padded("index", rounds, NO_VIEW),
-        belief=padded("belief", views),
-        values=padded("values", views),
-        view_actions=padded("view_actions", views),
-        view_steps=padded("view_steps", views),
+        index=torch.stack([_pad(table.index[0], rounds, NO_VIEW) for table in tables]),
+        **_padded([views_of(table, 0) for table in tables]),
         recorded=demonstrations.actions.clamp(min=0),
         steps=demonstrations.mask,
         view_counts=torch.cat([table.view_counts for table in tables]),

@@ -35,19 +35,40 @@ def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
     return number
 
 
+def log_likelihoods(log_probabilities: Tensor, acted: Tensor, moments: Tensor) -> Tensor:
+    """Log-likelihood ``[..., V]`` of the recorded actions along views.
+
+    Args:
+        log_probabilities: of actions at beliefs, ``[..., N, T', A]``.
+        acted: what was done there, ``[..., N, T']``.
+        moments: of each step of each view, which of the N T' beliefs it is, ``[..., V, T]``;
+            ``NO_VIEW`` in padding.
+    """
+    acted = acted.expand(log_probabilities.shape[:-1])
+    chosen = log_probabilities.gather(-1, acted[..., None]).squeeze(-1).flatten(-2)
+    steps = moments.clamp(min=0).flatten(-2)
+    found = chosen.gather(-1, steps.expand(*chosen.shape[:-1], steps.shape[-1]))
+    found = found.unflatten(-1, moments.shape[-2:])
+    return torch.where(moments == NO_VIEW, 0.0, found).sum(-1)
+
+
 @dataclass(frozen=True)
 class ViewTable:
     """Distinct views of the rounds of P people, V a person (padded), with the beliefs they lead to.
+
+    Views share the moments that they have in common. A model that is ``stepwise`` acts on each of
+    them by itself: there are N moments, and T' is 1. For other models N is V and T' is T.
 
     Attributes:
         sites: names of the discrete sites that views depend on.
         sizes: number of values of each of those sites.
         index: view of each person, round and combination of those sites' values, ``[P, B, M]``, an
             index into the person's V views or ``NO_VIEW``.
-        belief: ``[P, V, T, Z]``.
-        values: the self-model's action values ``[P, V, T, A]``.
-        view_actions: recorded actions of the round that a view belongs to, ``[P, V, T]``.
-        view_steps: which of its steps are real, ``[P, V, T]``.
+        moments: of each step of a view, which of the N T' beliefs it is, ``[P, V, T]``; ``NO_VIEW``
+            in padding.
+        belief: ``[P, N, T', Z]``.
+        values: the self-model's action values ``[P, N, T', A]``.
+        acted: what was done there, ``[P, N, T']``.
         recorded: actions ``[P, B, T]``, 0 in padding.
         steps: which steps are real ``[P, B, T]``.
         view_counts: number of real views of each person ``[P]``.
@@ -56,10 +77,10 @@ class ViewTable:
     sites: tuple[str, ...]
     sizes: tuple[int, ...]
     index: Tensor
+    moments: Tensor
     belief: Tensor
     values: Tensor
-    view_actions: Tensor
-    view_steps: Tensor
+    acted: Tensor
     recorded: Tensor
     steps: Tensor
     view_counts: Tensor
@@ -91,17 +112,12 @@ class ViewTable:
         return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
 
     def log_likelihoods(self, log_probabilities: Tensor) -> Tensor:
-        """Log-likelihood of the recorded actions under each view.
+        """Log-likelihood ``[..., P, V]`` of the recorded actions under each view.
 
         Args:
-            log_probabilities: of actions ``[..., P, V, T, A]``.
-
-        Returns:
-            ``[..., P, V]``.
+            log_probabilities: of actions ``[..., P, N, T', A]``.
         """
-        actions = self.view_actions.expand(log_probabilities.shape[:-1])
-        chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
-        return torch.where(self.view_steps, chosen, 0.0).sum(-1)
+        return log_likelihoods(log_probabilities, self.acted, self.moments)
 
 
 class ViewedActions(TorchDistribution):
