@@ -32,22 +32,36 @@ def draws(toy):
     return {name: value.view(5, 3, 1) for name, value in one.items()}
 
 
+def by_rate(in_sight, otherwise):
+    return {"in_sight": torch.tensor(in_sight), "otherwise": torch.tensor(otherwise)}
+
+
+def population(mean, spread, number):
+    """A population that is known exactly."""
+    chances = {"reach": torch.arange(1.0, 8) / 28}
+    one = Population(*({n: v[None] for n, v in part.items()} for part in (chances, mean, spread)))
+    return one.spaced(number)
+
+
 def test_densities_by_hand(pooling, draws):
     known, place, log_prior = pooling.read(draws)
-    assert place.shape == (3, 5, 2) and log_prior.shape == known["reach"].shape == (3, 5)
+    assert list(place) == list(RATES) and list(known) == ["reach"]
+    assert {value.shape for value in (*place.values(), log_prior)} == {(3, 5)}
+    assert torch.equal(known["reach"].argmax(-1), draws["reach"][..., 0].T)
+    assert (known["reach"].sum(-1) == 1).all()
     chances = {"reach": torch.arange(1.0, 8) / 28}
-    mean, spread = torch.tensor([0.5, -1.0]), torch.tensor([0.7, 0.4])
+    mean, spread = by_rate(0.5, -1.0), by_rate(0.7, 0.4)
     found = pooling.log_density(chances, mean, spread, known, place)
     for person in range(3):
         for draw in range(5):
             reach = int(draws["reach"][draw, person])
             prior, density = -torch.tensor(7.0).log(), torch.tensor((reach + 1) / 28).log()
-            for column, (site, (one, two)) in enumerate(RATES.items()):
+            for site, (one, two) in RATES.items():
                 rate = draws[site][draw, person, 0]
                 logit = torch.logit(rate)
                 # d rate / d logit = rate (1 - rate)
                 prior = prior + Beta(one, two).log_prob(rate) + (rate * (1 - rate)).log()
-                density = density + Normal(mean[column], spread[column]).log_prob(logit)
+                density = density + Normal(mean[site], spread[site]).log_prob(logit)
             torch.testing.assert_close(log_prior[person, draw], prior, rtol=1e-4, atol=1e-4)
             torch.testing.assert_close(found[person, draw], density, rtol=1e-4, atol=1e-4)
 
@@ -55,10 +69,12 @@ def test_densities_by_hand(pooling, draws):
 def test_the_program_weighs_people_by_the_mean_of_ratios(pooling, draws):
     known, place, log_prior = pooling.read(draws)
     trace = pyro.poutine.trace(pooling.program).get_trace(known, place, log_prior)
-    value = {name: trace.nodes[name]["value"] for name in ("reach_chances", "mean", "spread")}
-    density = pooling.log_density(
-        {"reach": value["reach_chances"]}, value["mean"], value["spread"], known, place
+    mean, spread = (
+        {site: trace.nodes[f"{site}_{name}"]["value"] for site in RATES}
+        for name in ("mean", "spread")
     )
+    chances = {"reach": trace.nodes["reach_chances"]["value"]}
+    density = pooling.log_density(chances, mean, spread, known, place)
     trace.compute_log_prob()
     expected = (density - log_prior).exp().mean(-1).log()
     torch.testing.assert_close(trace.nodes["rounds"]["log_prob"], expected)
@@ -66,17 +82,15 @@ def test_the_program_weighs_people_by_the_mean_of_ratios(pooling, draws):
 
 def test_people_are_drawn_by_their_weights(pooling, draws):
     known, place, log_prior = pooling.read(draws)
-    chances = {"reach": torch.arange(1.0, 8) / 28}
-    mean, spread = torch.tensor([0.5, -1.0]), torch.tensor([0.7, 0.9])
-    number = 4000
-    population = Population(
-        {"reach": chances["reach"].expand(number, 7)},
-        mean.expand(number, 2),
-        spread.expand(number, 2),
-    )
-    pooled = pooling.pooled(draws, population, 0)
+    chances, number = {"reach": torch.arange(1.0, 8) / 28}, 4000
+    mean, spread = by_rate(0.5, -1.0), by_rate(0.7, 0.9)
+    found = pooling.pooled(draws, population(mean, spread, number), 0)
+    pooled = found.draws
     weights = torch.softmax(
         pooling.log_density(chances, mean, spread, known, place) - log_prior, -1
+    )
+    torch.testing.assert_close(
+        found.effective, 1 / weights.square().sum(-1), rtol=1e-3, atol=0
     )
     for person in range(3):
         same = pooled["in_sight"][:, person, 0, None] == draws["in_sight"][:, person, 0]
@@ -91,12 +105,7 @@ def test_people_are_drawn_by_their_weights(pooling, draws):
 
 def test_newcomers_are_from_the_population(pooling):
     number = 3000
-    population = Population(
-        {"reach": (torch.arange(1.0, 8) / 28).expand(number, 7)},
-        torch.tensor([0.5, -1.0]).expand(number, 2),
-        torch.tensor([0.7, 0.4]).expand(number, 2),
-    )
-    new = pooling.newcomers(population, 2, 0)
+    new = pooling.newcomers(population(by_rate(0.5, -1.0), by_rate(0.7, 0.4), number), 2, 0)
     assert list(new) == ["reach", *RATES]
     for person in range(2):
         counts = torch.bincount(new["reach"][:, person, 0], minlength=7).numpy()
@@ -120,8 +129,8 @@ def test_people_who_are_alike_tell_of_each_other(toy, pooling):
     recordings = play_rounds(toy, alike, 6, "fog", generator)
     many = infer(toy, recordings, InferenceOptions("exact", 300), 0).draws
     one = infer(toy, recordings.select_rounds([0]), InferenceOptions("exact", 300), 0).draws
-    population = pooling.fit(many, 100, 0)
-    pooled = pooling.pooled(one, population, 0)
+    found = pooling.fit(many, 100, 0)
+    pooled = pooling.pooled(one, found, 0).draws
 
     def right(draws):
         return float((draws["reach"] == 3).float().mean())
@@ -131,6 +140,6 @@ def test_people_who_are_alike_tell_of_each_other(toy, pooling):
 
     assert right(pooled) > right(one) + 0.1
     assert off(pooled) < 0.8 * off(one)
-    new = pooling.newcomers(population, 1, 0)
+    new = pooling.newcomers(found, 1, 0)
     assert right(new) > 3 / 7
     assert float(new["otherwise"].mean()) < 0.12  # of Beta(1, 4) it is 0.2

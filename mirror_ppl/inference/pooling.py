@@ -3,9 +3,9 @@
 The population is a Pyro program above the human model. Every site of one number a person gets
 hyper-parameters; the others (weights of the residual) keep their prior::
 
-    chances_d  ~ Dirichlet(1 .. 1)                        discrete site d, over its values
-    mean_c     ~ Normal(m_c, s_c)                         continuous site c, in unconstrained space;
-    spread_c   ~ LogNormal(log(s_c / 2), 0.5)             m_c, s_c: mean and width of its own prior
+    chances_d  ~ Dirichlet(n_d p_d)          discrete site d: over its n_d values, of prior p_d
+    mean_c     ~ Normal(m_c, s_c)            continuous site c, in unconstrained space: where its
+    spread_c   ~ LogNormal(log(s_c / 2), .5)               prior has the mean m_c and the width s_c
     psi_p      ~ Categorical(chances_d), Normal(mean_c, spread_c)        person p
     actions_p  ~ the human model given psi_p
 
@@ -32,11 +32,16 @@ from torch import Tensor
 
 from mirror_ppl.inference.importance import places, scalar_sites
 from mirror_ppl.inference.nuts import run_chain
-from mirror_ppl.inference.prior import Draws, draw_prior, sample_sites, values_of
+from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 
+POOLINGS = ("none", "partial")
+OWN_DRAWS = 1000
+"""Posterior draws of each person under the human model's own prior, to be weighed."""
 PRIOR_DRAWS = 4000
+SPREAD_WIDTH = 0.5
+"""Standard deviation of the logarithm of how much people differ, before anybody is seen."""
 
 
 @dataclass(frozen=True)
@@ -45,78 +50,108 @@ class Population:
 
     Attributes:
         chances: by discrete site, probabilities of its values ``[S, n]``.
-        mean, spread: of the continuous sites in unconstrained space ``[S, D]``.
+        mean, spread: by continuous site, in unconstrained space, ``[S]``.
     """
 
     chances: dict[str, Tensor]
-    mean: Tensor
-    spread: Tensor
+    mean: dict[str, Tensor]
+    spread: dict[str, Tensor]
 
     def __len__(self) -> int:
-        return len(self.mean)
+        return len(next(iter([*self.chances.values(), *self.mean.values()])))
+
+    def spaced(self, number: int) -> Population:
+        """So many of its draws, spread evenly over all; some twice if there are too few."""
+        chosen = torch.linspace(0, len(self) - 1, number).round().long()
+        return Population(
+            *({name: value[chosen] for name, value in part.items()} for part in vars(self).values())
+        )
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """People who are from a population.
+
+    Attributes:
+        draws: ``[S, P, 1, ...]``, one for each draw of the population.
+        effective: number ``[P]`` of each person's own draws that all of these weights leave.
+    """
+
+    draws: Draws
+    effective: Tensor
 
 
 class Pooling:
     """Partial pooling of one human model.
 
     Args:
-        human: the model of people; the priors of its sites must not depend on each other.
+        human: the model of people.
     """
 
     def __init__(self, human: HumanModel) -> None:
         self.human = human
         self.sites = scalar_sites(human)
-        nodes = sample_sites(human, 1)
-        self.supports = {
-            name: node["fn"].enumerate_support(expand=False).flatten()
-            for name, node in nodes.items()
-            if node["fn"].has_enumerate_support
-        }
-        drawn = places(self.sites, draw_prior(human, 1, PRIOR_DRAWS, 0))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            nodes = sample_sites(human, 1, PRIOR_DRAWS)
+        drawn = places(self.sites, values_of(nodes))
         self.centre, self.width = drawn.mean(0), drawn.std(0)
+        self.supports, self.concentration = {}, {}
+        for name, node in nodes.items():
+            if node["fn"].has_enumerate_support:
+                values = node["fn"].enumerate_support()
+                chances = node["fn"].log_prob(values).exp().flatten(1).mean(1)
+                self.supports[name] = values.flatten(1)[:, 0]
+                self.concentration[name] = len(values) * chances
 
-    def program(self, known: Mapping[str, Tensor], place: Tensor, log_prior: Tensor) -> None:
+    def program(
+        self, known: Mapping[str, Tensor], place: Mapping[str, Tensor], log_prior: Tensor
+    ) -> None:
         """The population and what is known of its people.
 
         Args:
-            known: by discrete site, which of its values each draw has, ``[P, S]``.
-            place: continuous sites of the draws in unconstrained space, ``[P, S, D]``.
+            known: by discrete site, which of its values each draw has, one-hot ``[P, S, n]``.
+            place: by continuous site, its value in unconstrained space, ``[P, S]``.
             log_prior: of the draws under the human model, ``[P, S]``.
         """
         chances = {
-            name: pyro.sample(f"{name}_chances", dist.Dirichlet(torch.ones(len(support))))
-            for name, support in self.supports.items()
+            name: pyro.sample(f"{name}_chances", dist.Dirichlet(concentration))
+            for name, concentration in self.concentration.items()
         }
-        mean = pyro.sample("mean", dist.Normal(self.centre, self.width).to_event(1))
-        spread = pyro.sample(
-            "spread", dist.LogNormal((self.width / 2).log(), self.width.new_tensor(0.5)).to_event(1)
-        )
+        mean, spread = {}, {}
+        for name, centre, width in zip(self.sites, self.centre, self.width, strict=True):
+            mean[name] = pyro.sample(f"{name}_mean", dist.Normal(centre, width))
+            half = dist.LogNormal((width / 2).log(), torch.full_like(width, SPREAD_WIDTH))
+            spread[name] = pyro.sample(f"{name}_spread", half)
         ratio = self.log_density(chances, mean, spread, known, place) - log_prior
-        with pyro.plate("person", len(place)):
+        with pyro.plate("person", len(log_prior)):
             pyro.factor("rounds", torch.logsumexp(ratio, -1) - math.log(ratio.shape[-1]))
 
     @staticmethod
     def log_density(
         chances: Mapping[str, Tensor],
-        mean: Tensor,
-        spread: Tensor,
+        mean: Mapping[str, Tensor],
+        spread: Mapping[str, Tensor],
         known: Mapping[str, Tensor],
-        place: Tensor,
+        place: Mapping[str, Tensor],
     ) -> Tensor:
         """Log density ``[...]`` of people's sites in a population."""
-        total = dist.Normal(mean, spread).log_prob(place).sum(-1)
+        total = torch.zeros(())
+        for name, value in place.items():
+            total = total + dist.Normal(mean[name], spread[name]).log_prob(value)
         for name, value in known.items():
-            total = total + chances[name].log()[value]
+            total = total + value @ chances[name].log()
         return total
 
-    def read(self, draws: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    def read(
+        self, draws: Mapping[str, Tensor]
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
         """What :meth:`program` is given, of posterior draws ``[S, P, 1, ...]``."""
-        number, people = next(iter(draws.values())).shape[:2]
         known = {
-            name: (draws[name][..., 0].T[..., None] == support).long().argmax(-1)
+            name: (draws[name][..., 0].T[..., None] == support).to(self.centre)
             for name, support in self.supports.items()
         }
-        place = places(self.sites, draws).view(number, people, -1).transpose(0, 1)
+        place = {name: site.inv(draws[name][..., 0].T) for name, site in self.sites.items()}
         return known, place, self._log_prior(draws)
 
     def _log_prior(self, draws: Mapping[str, Tensor]) -> Tensor:
@@ -146,11 +181,15 @@ class Pooling:
             report: told of steps.
         """
         found = run_chain(self.program, self.read(draws), number, seed, "population", report)
-        chances = {name: found[f"{name}_chances"] for name in self.supports}
-        return Population(chances, found["mean"], found["spread"])
+        return Population(
+            {name: found[f"{name}_chances"] for name in self.supports},
+            {name: found[f"{name}_mean"] for name in self.sites},
+            {name: found[f"{name}_spread"] for name in self.sites},
+        )
 
-    def pooled(self, draws: Mapping[str, Tensor], population: Population, seed: int) -> Draws:
-        """Draws ``[S', P, 1, ...]`` of people who are from a population, one for each of its draws.
+    @torch.no_grad()
+    def pooled(self, draws: Mapping[str, Tensor], population: Population, seed: int) -> Pooled:
+        """People who are from a population.
 
         Args:
             draws: of each person under the human model's own prior, ``[S, P, 1, ...]``.
@@ -158,20 +197,23 @@ class Pooling:
             seed: of everything random.
         """
         known, place, log_prior = self.read(draws)
+        total, chosen = torch.zeros_like(log_prior), []
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            chosen = []
             for index in range(len(population)):
-                chances = {name: value[index] for name, value in population.chances.items()}
-                density = self.log_density(
-                    chances, population.mean[index], population.spread[index], known, place
+                one = (
+                    {name: value[index] for name, value in part.items()}
+                    for part in vars(population).values()
                 )
-                weights = torch.softmax(density - log_prior, -1)
+                weights = torch.softmax(self.log_density(*one, known, place) - log_prior, -1)
+                total += weights / len(population)
                 chosen.append(torch.multinomial(weights, 1)[:, 0])
         rows = torch.stack(chosen)  # [S', P]
         people = torch.arange(rows.shape[1])
-        return {name: value[rows, people] for name, value in draws.items()}
+        own = {name: value[rows, people] for name, value in draws.items()}
+        return Pooled(own, 1 / total.square().sum(-1))
 
+    @torch.no_grad()
     def newcomers(self, population: Population, people: int, seed: int) -> Draws:
         """Draws ``[S, P, 1, ...]`` of people of whom nothing is known but where they are from."""
         number = len(population)
@@ -181,8 +223,7 @@ class Pooling:
             for name, support in self.supports.items():
                 chances = population.chances[name][:, None].expand(-1, people, -1)
                 given[name] = support[dist.Categorical(chances).sample()][..., None]
-            mean = population.mean[:, None].expand(-1, people, -1)
-            place = dist.Normal(mean, population.spread[:, None]).sample()
-            for column, (name, site) in enumerate(self.sites.items()):
-                given[name] = site(place[..., column])[..., None]
+            for name, site in self.sites.items():
+                normal = dist.Normal(population.mean[name], population.spread[name])
+                given[name] = site(normal.sample(torch.Size([people])).T)[..., None]
             return values_of(sample_sites(self.human, people, number, given))
