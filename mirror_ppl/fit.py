@@ -35,8 +35,8 @@ class Options:
     out: Path = Path("runs/fit")
     """Folder for the results; made if it is not there."""
     train_rounds: int | None = None
-    """How many rounds of each person to learn from, from the first on. Default: 20 of recordings
-    with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
+    """How many rounds of each person to learn from, from the first on; 0 for none. Default: 20 of
+    recordings with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
     human_model: str | None = None
     """A human model of your own: path/to/file.py:Class (see docs/extending.md)."""
     self_model: Path | None = None
@@ -47,6 +47,11 @@ class Options:
     (Hamiltonian Monte Carlo, slow)."""
     guide_file: Path | None = None
     """Network of the guide amortized (see `python -m mirror_ppl.train --what guide`)."""
+    pooling: str = "none"
+    """Whether people tell of each other: none, or partial (the population that they are from is
+    inferred with them, and posterior.nc holds it)."""
+    prior_from: Path | None = None
+    """A posterior.nc of --pooling partial, whose population is the prior of these people."""
     steps: int = 300
     """Gradient steps of svi."""
     draws: int = 200
@@ -59,10 +64,13 @@ class Options:
     def __post_init__(self) -> None:
         if self.guide_file is not None and self.guide != "amortized":
             raise OptionError("--guide-file is for --guide amortized")
-        for name in ("steps", "draws", "train_rounds"):
+        if self.prior_from is not None and self.pooling != "none":
+            raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
+        for name, least in (("steps", 1), ("draws", 1), ("train_rounds", 0)):
             number = getattr(self, name)
-            if number is not None and number < 1:
-                raise OptionError(f"--{name.replace('_', '-')} must be at least 1, not {number}")
+            if number is not None and number < least:
+                option = f"--{name.replace('_', '-')}"
+                raise OptionError(f"{option} must be at least {least}, not {number}")
 
 
 def main(options: Options) -> None:
@@ -79,18 +87,24 @@ def main(options: Options) -> None:
     from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
     from mirror_ppl.inference.guide_file import network_for
     from mirror_ppl.inference.guides import InferenceOptions
+    from mirror_ppl.inference.pooling import Pooling
+    from mirror_ppl.inference.population_file import load_population
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.driving import has_sight, save_sight_picture
 
     device = usable_device(options.device)
-    settings = InferenceOptions(options.guide, options.draws, FitOptions(steps=options.steps))
+    svi = FitOptions(steps=options.steps)
+    settings = InferenceOptions(options.guide, options.draws, svi, pooling=options.pooling)
     weights = options.self_model or shipped_weights(demonstrations.domain)
     self_model, _ = load_self_model(weights, demonstrations.domain)
     human = load_human_model(options.human_model, self_model.to(device))
     check_contract(human)
     network = network_for(options.guide, options.guide_file, human)
+    population = None
+    if options.prior_from is not None:
+        population = load_population(options.prior_from, Pooling(human))
     # Faults of the recordings come to light before anything is written.
     check_world(demonstrations)
     split_rounds(demonstrations, options.train_rounds)
@@ -106,6 +120,7 @@ def main(options: Options) -> None:
             stages.report,
             checkpoint,
             network,
+            population,
         )
     summary = result.summary | {"seconds": round(monotonic() - began, 1)}
     text = json.dumps(summary, indent=1) + "\n"

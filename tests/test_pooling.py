@@ -89,9 +89,7 @@ def test_people_are_drawn_by_their_weights(pooling, draws):
     weights = torch.softmax(
         pooling.log_density(chances, mean, spread, known, place) - log_prior, -1
     )
-    torch.testing.assert_close(
-        found.effective, 1 / weights.square().sum(-1), rtol=1e-3, atol=0
-    )
+    torch.testing.assert_close(found.effective, 1 / weights.square().sum(-1), rtol=1e-3, atol=0)
     for person in range(3):
         same = pooled["in_sight"][:, person, 0, None] == draws["in_sight"][:, person, 0]
         counts = same.sum(0).numpy()

@@ -18,6 +18,7 @@ from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.amortized import AmortizedGuide
 from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
+from mirror_ppl.inference.pooling import Pooling, Population
 from mirror_ppl.inference.prior import Draws, draw_prior
 from mirror_ppl.inference.summary import summarize
 from mirror_ppl.inference.svi import Report, predict_actions, silent
@@ -59,8 +60,9 @@ def split_rounds(
 
     Args:
         demonstrations: all rounds.
-        train_rounds: number of rounds to learn from instead, from the first one on. Where that
-            reaches into the test rounds, those that follow it are held out.
+        train_rounds: number of rounds to learn from instead, from the first one on; 0 for none,
+            which leaves the prior. Where that reaches into the test rounds, those that follow it
+            are held out.
 
     Returns:
         Training rounds, and the held-out ones or ``None`` if none are left.
@@ -72,7 +74,7 @@ def split_rounds(
     paper = rounds >= TEST_ROUNDS.stop
     if train_rounds is None:
         train_rounds = TRAIN_ROUNDS if paper else max(1, -(-3 * rounds // 4))
-    if not 1 <= train_rounds <= rounds:
+    if not 0 <= train_rounds <= rounds:
         raise DemonstrationsError(f"cannot train on {train_rounds} of {rounds} rounds")
     paper = paper and train_rounds <= TEST_ROUNDS.start
     test = list(TEST_ROUNDS if paper else range(train_rounds, rounds))
@@ -99,7 +101,7 @@ def check_world(demonstrations: Demonstrations) -> None:
             )
 
 
-def fit_people(
+def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     human: HumanModel,
     demonstrations: Demonstrations,
     options: InferenceOptions = InferenceOptions(),  # noqa: B008 - frozen
@@ -108,6 +110,7 @@ def fit_people(
     report: Report = silent,
     checkpoint: Path | None = None,
     network: AmortizedGuide | None = None,
+    population: Population | None = None,
 ) -> Fit:
     """Infer the implants of everybody in recordings, and predict their held-out actions.
 
@@ -120,6 +123,7 @@ def fit_people(
         report: told of progress.
         checkpoint: file that ``svi`` continues from; written on the way, removed by nobody.
         network: of the guide ``amortized``.
+        population: that the people are from, if it is known from others.
 
     Raises:
         DemonstrationsError: too few rounds.
@@ -130,8 +134,11 @@ def fit_people(
     people = train.num_people
     run = None
     if checkpoint is not None:
-        run = checkpoint, run_identity(human, network, [options, _recorded(train), seed])
-    posterior = infer(human, train, options, seed, network, report, run)
+        run = (
+            checkpoint,
+            run_identity(human, network, [options, population is None, _recorded(train), seed]),
+        )
+    posterior = infer(human, train, options, seed, network, report, run, population)
     prior = draw_prior(human, people, PRIOR_DRAWS, seed)
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
 
@@ -159,6 +166,7 @@ def fit_people(
     )
 
     from mirror_ppl.inference.export import in_units, to_inference_data
+    from mirror_ppl.inference.population_file import add_population
 
     domain = get_domain(train.domain)
     attributes = {
@@ -168,15 +176,21 @@ def fit_people(
         "human_model": type(human).__name__,
         "self_model": fingerprint(human.self_model),
         "guide": options.guide,
+        "pooling": options.pooling if population is None else "known population",
         "version": __version__,
         "seed": seed,
     } | {f"recorded_{name}": value for name, value in train.provenance.items()}
     generator = torch.Generator().manual_seed(seed)
     data = to_inference_data(train, test, drawn, prior, log_probabilities, attributes, generator)
+    if posterior.population is not None:
+        add_population(data, Pooling(human), posterior.population, attributes, seed)
     found = summarize(in_units(domain, drawn), train, test, log_probabilities)
     if posterior.pareto_k is not None:
         for person, value in zip(found, posterior.pareto_k.tolist(), strict=True):
             person["pareto_k"] = value if isfinite(value) else None
+    if posterior.effective is not None:
+        for person, value in zip(found, posterior.effective.tolist(), strict=True):
+            person["effective_draws"] = round(value, 1)
     summary = attributes | {"options": asdict(options), "people": found}
     return Fit(posterior, data, summary)
 

@@ -30,6 +30,7 @@ from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.nuts import sample_nuts
+from mirror_ppl.inference.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
@@ -39,6 +40,8 @@ from mirror_ppl.models.weights import fingerprint
 
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
 GUIDES = ("amortized", "exact", "svi", "nuts")
+OWN_DRAWS = {"amortized": 4000, "exact": 4000, "svi": 1000, "nuts": 1000}
+"""Draws of each person under the human model's own prior from which pooling chooses."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,15 @@ class Inferred:
         draws: joint posterior draws by site, ``[S, P, 1, ...]``, as the human model samples them.
         pareto_k: of importance weights ``[P]``, if there are any.
         losses: negative ELBO at each step in nats, if one was optimized.
+        population: that people are from, if they were pooled.
+        effective: number ``[P]`` of each person's own draws that pooling leaves, if they were.
     """
 
     draws: Mapping[str, Tensor]
     pareto_k: Tensor | None = None
     losses: tuple[float, ...] = field(default=())
+    population: Population | None = None
+    effective: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,8 @@ class InferenceOptions:
         exact: settings of ``exact``.
         screening: when to give up combinations of discrete sites; ``None`` for never. That of the
             amortized guide is its own.
+        pooling: ``none``, or ``partial`` to infer with the people the population that they are
+            from (:mod:`mirror_ppl.inference.pooling`).
     """
 
     guide: str = "exact"
@@ -74,10 +83,13 @@ class InferenceOptions:
     svi: FitOptions = FitOptions()
     exact: ImportanceOptions = ImportanceOptions()
     screening: Screening | None = Screening()
+    pooling: str = "none"
 
     def __post_init__(self) -> None:
         if self.guide not in GUIDES:
             raise UnknownNameError.of("guide", self.guide, GUIDES)
+        if self.pooling not in POOLINGS:
+            raise UnknownNameError.of("pooling", self.pooling, POOLINGS)
         if self.draws < 1:
             raise ValueError(f"draws must be at least 1, not {self.draws}")
 
@@ -90,6 +102,7 @@ def infer(
     network: AmortizedGuide | None = None,
     report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
+    population: Population | None = None,
 ) -> Inferred:
     """Posterior draws of the implants of P people.
 
@@ -102,11 +115,37 @@ def infer(
         report: told of progress.
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused); not of ``nuts``.
+        population: that the people are from, if it is known from others: their prior, then.
 
     Raises:
         HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
         CheckpointError: the checkpoint is damaged or of another run.
+        ValueError: people are to be pooled whose population is known.
     """
+    if options.pooling == "none" and population is None:
+        return _each(human, demonstrations, options, seed, network, report, checkpoint)
+    if options.pooling != "none" and population is not None:
+        raise ValueError("people from a known population are not pooled")
+    many = replace(options, draws=max(options.draws, OWN_DRAWS[options.guide]))
+    own = _each(human, demonstrations, many, seed, network, report, checkpoint)
+    pooling = Pooling(human)
+    if population is None:
+        population = pooling.fit(own.draws, options.draws, seed, report)
+    population = population.spaced(options.draws)
+    pooled = pooling.pooled(own.draws, population, seed)
+    return replace(own, draws=pooled.draws, population=population, effective=pooled.effective)
+
+
+def _each(
+    human: HumanModel,
+    demonstrations: Demonstrations,
+    options: InferenceOptions,
+    seed: int,
+    network: AmortizedGuide | None,
+    report: Report,
+    checkpoint: tuple[Path, str] | None,
+) -> Inferred:
+    """Every person under the human model's own prior."""
     if options.guide in ("amortized", "exact"):
         if options.guide == "exact":
             network = None

@@ -37,8 +37,8 @@ from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 
 POOLINGS = ("none", "partial")
-OWN_DRAWS = 1000
-"""Posterior draws of each person under the human model's own prior, to be weighed."""
+FIT_DRAWS = 1000
+"""Draws of each person from which a population is inferred."""
 PRIOR_DRAWS = 4000
 SPREAD_WIDTH = 0.5
 """Standard deviation of the logarithm of how much people differ, before anybody is seen."""
@@ -180,7 +180,10 @@ class Pooling:
             seed: of everything random.
             report: told of steps.
         """
-        found = run_chain(self.program, self.read(draws), number, seed, "population", report)
+        held = len(next(iter(draws.values())))
+        some = torch.linspace(0, held - 1, min(held, FIT_DRAWS)).round().long()
+        what = self.read({name: value[some] for name, value in draws.items()})
+        found = run_chain(self.program, what, number, seed, "population", report, compiled=True)
         return Population(
             {name: found[f"{name}_chances"] for name in self.supports},
             {name: found[f"{name}_mean"] for name in self.sites},
@@ -201,11 +204,12 @@ class Pooling:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             for index in range(len(population)):
-                one = (
+                chances, mean, spread = (
                     {name: value[index] for name, value in part.items()}
                     for part in vars(population).values()
                 )
-                weights = torch.softmax(self.log_density(*one, known, place) - log_prior, -1)
+                density = self.log_density(chances, mean, spread, known, place)
+                weights = torch.softmax(density - log_prior, -1)
                 total += weights / len(population)
                 chosen.append(torch.multinomial(weights, 1)[:, 0])
         rows = torch.stack(chosen)  # [S', P]

@@ -49,7 +49,7 @@ class PosteriorFile:
             PosteriorError: the posterior is of another human model, self-model or version of the
                 domain, holds fewer draws than asked for, or values that cannot be.
         """
-        self._check(human)
+        check_origin(self.path, self.attributes, human)
         held = len(next(iter(self.values.values())))
         number = held if number is None else number
         if number > held:
@@ -84,18 +84,24 @@ class PosteriorFile:
             draws[name] = own.to(device)
         return draws
 
-    def _check(self, human: HumanModel) -> None:
-        for name, mine in (
-            ("domain_version", human.domain.version),
-            ("human_model", type(human).__name__),
-            ("self_model", fingerprint(human.self_model)),
-        ):
-            own = self.attributes.get(name)
-            if own != mine:
-                raise PosteriorError(
-                    f"{self.path}: is of {name.replace('_', ' ')} {own}, not {mine}; fit again, or "
-                    "give what it was fitted with"
-                )
+
+def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -> None:
+    """Make sure that a file is of this human model.
+
+    Raises:
+        PosteriorError: it is of another human model, self-model or version of the domain.
+    """
+    for name, mine in (
+        ("domain_version", human.domain.version),
+        ("human_model", type(human).__name__),
+        ("self_model", fingerprint(human.self_model)),
+    ):
+        own = attributes.get(name)
+        if own != mine:
+            raise PosteriorError(
+                f"{path}: is of {name.replace('_', ' ')} {own}, not {mine}; fit again, or "
+                "give what it was fitted with"
+            )
 
 
 def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:

@@ -1,0 +1,116 @@
+"""The population in a posterior file: hyper-parameters, and somebody new from it ("round zero").
+
+Two groups beside the standard ones. ``population``: of each discrete site the probabilities of its
+values, ``<site>_chances``; of each continuous one mean and spread in unconstrained space (of its
+logarithm, or of its logit), ``<site>_mean`` and ``<site>_spread``. ``newcomer``: draws of the
+implants of a person of whom nothing is known but where they are from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+import xarray as xr
+
+from mirror_ppl.errors import PosteriorError
+from mirror_ppl.inference.export import az, in_units
+from mirror_ppl.inference.pooling import Pooling, Population
+from mirror_ppl.inference.posterior_file import check_origin
+from mirror_ppl.models.implants import sight_sites
+
+SAMPLE = ("chain", "draw")
+
+
+def add_population(
+    data: az.InferenceData,
+    pooling: Pooling,
+    population: Population,
+    attributes: Mapping[str, str | int | float],
+    seed: int,
+) -> None:
+    """Add the groups ``population`` and ``newcomer`` to those of a fit.
+
+    Args:
+        data: of the fit.
+        pooling: of the human model.
+        population: S draws.
+        attributes: what the file says of itself.
+        seed: of the newcomer.
+    """
+    domain = pooling.human.domain
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
+    coordinates = {}
+    for name, chances in population.chances.items():
+        axis = f"{name}_value"
+        variables[f"{name}_chances"] = ((*SAMPLE, axis), chances.cpu().numpy()[None])
+        values = pooling.supports[name].cpu().numpy()
+        coordinates[axis] = (
+            np.asarray(domain.reach_bins)[values] if name in sight_sites(domain) else values
+        )
+    for kind, part in (("mean", population.mean), ("spread", population.spread)):
+        for name, value in part.items():
+            variables[f"{name}_{kind}"] = (SAMPLE, value.cpu().numpy()[None])
+    new = in_units(domain, pooling.newcomers(population, 1, seed))
+    newcomer = {}
+    for name, value in new.items():
+        own = value[:, 0].cpu().numpy()[None]
+        axes = tuple(f"{name}_{axis}" for axis in range(own.ndim - len(SAMPLE)))
+        newcomer[name] = ((*SAMPLE, *axes), own)
+    own = {key: str(value) for key, value in attributes.items()}
+    data.add_groups(
+        {
+            "population": xr.Dataset(variables, coordinates, own),
+            "newcomer": xr.Dataset(newcomer, attrs=own),
+        }
+    )
+
+
+def load_population(path: Path, pooling: Pooling) -> Population:
+    """The population of a posterior file, to be the prior of other people.
+
+    Args:
+        path: what ``python -m mirror_ppl.fit --pooling partial`` wrote.
+        pooling: of the human model.
+
+    Raises:
+        PosteriorError: the file is missing or damaged, holds no population, or is of another human
+            model, self-model or version of the domain.
+    """
+    if not path.is_file():
+        raise PosteriorError(f"{path}: there is no such file; fit --pooling partial makes one")
+    try:
+        data = az.from_netcdf(str(path))
+    except Exception as error:
+        raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
+    if "population" not in data.groups():
+        raise PosteriorError(f"{path}: holds no population; fit --pooling partial makes one")
+    group = data["population"]
+    check_origin(path, {str(key): str(value) for key, value in group.attrs.items()}, pooling.human)
+    like = next(pooling.human.parameters())
+
+    def part(names: Mapping[str, object], kind: str, event: int) -> dict[str, torch.Tensor]:
+        found = {}
+        for name in names:
+            if f"{name}_{kind}" not in group:
+                raise PosteriorError(f'{path}: the population lacks "{name}_{kind}"')
+            value = group[f"{name}_{kind}"].transpose(*SAMPLE, ...).values
+            if value.ndim != len(SAMPLE) + event or not np.isfinite(value).all() or not value.size:
+                raise PosteriorError(f'{path}: "{name}_{kind}" holds no numbers of a population')
+            found[name] = torch.as_tensor(value.reshape(-1, *value.shape[2:])).to(like)
+        return found
+
+    chances = part(pooling.supports, "chances", 1)
+    for name, value in chances.items():
+        sums = value.sum(-1)
+        if value.shape[1] != len(pooling.supports[name]) or (value <= 0).any():
+            raise PosteriorError(f'{path}: "{name}_chances" are no probabilities of its values')
+        if not torch.allclose(sums, torch.ones_like(sums), atol=1e-3):
+            raise PosteriorError(f'{path}: "{name}_chances" are no probabilities of its values')
+    spread = part(pooling.sites, "spread", 0)
+    for name, value in spread.items():
+        if (value <= 0).any():
+            raise PosteriorError(f'{path}: "{name}_spread" has values that are not positive')
+    return Population(chances, part(pooling.sites, "mean", 0), spread)
