@@ -55,7 +55,6 @@ def run_chain(
     name: str,
     report: Report,
     plates: int | None = None,
-    compiled: bool = False,
 ) -> Draws:
     """Draws ``[S, ...]`` of a program's continuous sites, by NUTS; discrete ones are enumerated.
 
@@ -67,7 +66,6 @@ def run_chain(
         name: under which steps are reported.
         report: told of steps.
         plates: how deep plates are nested, if there is anything to enumerate.
-        compiled: whether to compile the density first; pays for small programs.
     """
     total, done = WARMUP + number, 0
 
@@ -79,12 +77,7 @@ def run_chain(
     with torch.random.fork_rng(devices=[]), pyro.validation_enabled(False):
         torch.manual_seed(seed)
         kernel = NUTS(
-            program,
-            max_plate_nesting=plates,
-            init_strategy=init_to_median,
-            max_tree_depth=6,
-            jit_compile=compiled,
-            ignore_jit_warnings=True,
+            program, max_plate_nesting=plates, init_strategy=init_to_median, max_tree_depth=6
         )
         chain = MCMC(kernel, number, WARMUP, hook_fn=count, disable_progbar=True)
         chain.run(*arguments)

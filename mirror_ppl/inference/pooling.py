@@ -37,8 +37,9 @@ from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 
 POOLINGS = ("none", "partial")
-FIT_DRAWS = 1000
-"""Draws of each person from which a population is inferred."""
+MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
+"""Draws of a person, at most, from which a population is inferred; of all people together; and
+what each has of these at least."""
 PRIOR_DRAWS = 4000
 SPREAD_WIDTH = 0.5
 """Standard deviation of the logarithm of how much people differ, before anybody is seen."""
@@ -180,10 +181,11 @@ class Pooling:
             seed: of everything random.
             report: told of steps.
         """
-        held = len(next(iter(draws.values())))
-        some = torch.linspace(0, held - 1, min(held, FIT_DRAWS)).round().long()
+        held, people = next(iter(draws.values())).shape[:2]
+        used = min(held, MOST_DRAWS, max(LEAST_DRAWS, ALL_DRAWS // people))
+        some = torch.linspace(0, held - 1, used).round().long()
         what = self.read({name: value[some] for name, value in draws.items()})
-        found = run_chain(self.program, what, number, seed, "population", report, compiled=True)
+        found = run_chain(self.program, what, number, seed, "population", report)
         return Population(
             {name: found[f"{name}_chances"] for name in self.supports},
             {name: found[f"{name}_mean"] for name in self.sites},
