@@ -65,7 +65,8 @@ class Options:
     log: Path | None = None
     """Write every decision with its audit, one JSON object a line, over what is there."""
     human_model: str | None = None
-    """The human model that the posterior is of, if it is one of your own: path/to/file.py:Class."""
+    """The human model that the posterior is of, if it is another: one-radius and so on, or one of
+    your own, path/to/file.py:Class."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     population: str | None = None
@@ -199,8 +200,9 @@ def main(options: Options) -> None:
 
 def _outputs(options: Options) -> list[Path]:
     from mirror_ppl.files import require_files_of_their_own
+    from mirror_ppl.models.variants import VARIANTS
 
-    source = options.human_model
+    source = None if options.human_model in VARIANTS else options.human_model
     inputs = {
         "--posterior": [options.posterior],
         "--self-model": [options.self_model],

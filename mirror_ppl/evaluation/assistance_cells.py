@@ -35,6 +35,7 @@ from mirror_ppl.inference.experience import map_state
 from mirror_ppl.inference.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import Start, draw_starts, simulated_drivers
 
@@ -220,4 +221,6 @@ def _kept(path: Path, identity: str) -> Played | None:
 
 
 def _file_of(human_model: str | None) -> Path | None:
-    return None if human_model is None else Path(human_model.rpartition(":")[0])
+    if human_model is None or human_model in VARIANTS:
+        return None
+    return Path(human_model.rpartition(":")[0])

@@ -28,7 +28,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.files import write_whole
-from mirror_ppl.models.implants import SIGHT, sight_sites
+from mirror_ppl.models.implants import SIGHT
 
 with warnings.catch_warnings():
     # ArviZ announces its next major version at the first import of each day.
@@ -39,10 +39,15 @@ with warnings.catch_warnings():
 def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Draws ``[S, P, ...]`` with the indices of sight bins replaced by distances."""
     bins = torch.tensor(domain.reach_bins)
-    sights = sight_sites(domain)
     return {
-        name: (bins[value] if name in sights else value).squeeze(2) for name, value in draws.items()
+        name: (bins[value] if is_reach(name, value) else value).squeeze(2)
+        for name, value in draws.items()
     }
+
+
+def is_reach(name: str, value: Tensor) -> bool:
+    """Whether draws of a site are indices into the domain's ``reach_bins``."""
+    return name.startswith(SIGHT) and not value.is_floating_point()
 
 
 def to_inference_data(

@@ -16,10 +16,9 @@ import torch
 import xarray as xr
 
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.export import az, in_units
+from mirror_ppl.inference.export import az, in_units, is_reach
 from mirror_ppl.inference.pooling import Pooling, Population
 from mirror_ppl.inference.posterior_file import check_origin
-from mirror_ppl.models.implants import sight_sites
 
 SAMPLE = ("chain", "draw")
 
@@ -46,10 +45,9 @@ def add_population(
     for name, chances in population.chances.items():
         axis = f"{name}_value"
         variables[f"{name}_chances"] = ((*SAMPLE, axis), chances.cpu().numpy()[None])
-        values = pooling.supports[name].cpu().numpy()
-        coordinates[axis] = (
-            np.asarray(domain.reach_bins)[values] if name in sight_sites(domain) else values
-        )
+        values = pooling.supports[name].cpu()
+        bins = torch.tensor(domain.reach_bins)
+        coordinates[axis] = (bins[values] if is_reach(name, values) else values).numpy()
     for kind, part in (("mean", population.mean), ("spread", population.spread)):
         for name, value in part.items():
             variables[f"{name}_{kind}"] = (SAMPLE, value.cpu().numpy()[None])

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.export import az
+from mirror_ppl.inference.export import az, is_reach
 from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.weights import fingerprint
 
 SAME_BIN = 0.5
@@ -64,7 +63,7 @@ class PosteriorFile:
             if name not in self.values:
                 raise PosteriorError(f'{self.path}: has no draws of the site "{name}"')
             value = self.values[name][chosen]
-            if name in sight_sites(domain):
+            if is_reach(name, site["value"]):
                 distance = np.abs(value[..., None] - bins)
                 if not (distance.min(-1) < SAME_BIN).all():
                     raise PosteriorError(f'{self.path}: "{name}" has values that are no bins')

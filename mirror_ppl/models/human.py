@@ -182,7 +182,10 @@ class HumanModel(nn.Module):
         items, imagined = domain.assume(knowledge, observation)
         taken = {name: torch.zeros_like(mask) for name, mask in visible.items()}
         for assumption, about in items.items():
-            makes = implants[implant_priors.ASSUMES + assumption][..., None] == 1
+            site = implant_priors.ASSUMES + assumption
+            if site not in implants:  # open to them, as it is to the robot
+                continue
+            makes = implants[site][..., None] == 1
             for name, mask in about.items():
                 taken[name] = taken[name] | (mask & makes & ~visible[name])
         return View(visible, taken, imagined), knowledge

@@ -40,46 +40,73 @@ def perceptual_implants(
 
     ``sight_<direction>`` is an index into the domain's ``reach_bins``, uniform: a threshold matters
     only where it crosses a distance that can occur, so those crossings are all there is to infer.
-    ``assumes_<assumption>`` is 1 for a person who takes it for granted, and 0 for one to whom it is
-    open, as it is to the robot; the prior probability of 1 can be given.
     """
+    implants = {site: reach_implant(site, domain, like) for site in sight_sites(domain)}
+    return implants | assumption_implants(domain, like, assumption_probability)
+
+
+def reach_implant(site: str, domain: Domain, like: Tensor) -> Tensor:
+    """Sample how far somebody sees, as an index into the domain's ``reach_bins``; uniform."""
     bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
-    implants = {
-        site: pyro.sample(site, dist.Categorical(bins / bins.sum())) for site in sight_sites(domain)
-    }
+    return pyro.sample(site, dist.Categorical(bins / bins.sum()))
+
+
+def assumption_implants(
+    domain: Domain, like: Tensor, probability: float = 0.5
+) -> dict[str, Tensor]:
+    """Sample what a person takes for granted: ``assumes_<assumption>``, 1 if they do.
+
+    0 stands for one to whom it is open, as it is to the robot. The prior probability of 1 can be
+    given.
+    """
     open_or_taken = torch.tensor(
-        [1 - assumption_probability, assumption_probability], dtype=like.dtype, device=like.device
+        [1 - probability, probability], dtype=like.dtype, device=like.device
     )
-    for site in assumption_sites(domain):
-        implants[site] = pyro.sample(site, dist.Categorical(open_or_taken))
-    return implants
+    return {
+        site: pyro.sample(site, dist.Categorical(open_or_taken))
+        for site in assumption_sites(domain)
+    }
 
 
 def policy_implants(
     domain: Domain, latent: int, like: Tensor, lapse: float = 1 / 31
 ) -> dict[str, Tensor]:
-    """Sample how a person decides.
+    """Sample how a person decides: their choices and what distinguishes their policy."""
+    return choice_implants(like, lapse) | residual_implants(domain, latent, like)
+
+
+def choice_implants(like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
+    """Sample how strictly a person chooses.
 
     - ``consistency``: inverse temperature of the choice between action values, per unit of reward;
     - ``lapse``: probability that an action has nothing to do with the belief; its prior mean can
-      be given;
-    - ``residual_in`` ``[..., Z + 1, R]`` and ``residual_out`` ``[..., R + 1, A]``: weights (the
-      last row is the bias) of the network of the residual ``delta(zH_t)``. The prior keeps its
-      output small (about 0.3 on logits), because a large residual can imitate blindness.
+      be given.
     """
 
     def number(value: float) -> Tensor:
         return torch.tensor(value, dtype=like.dtype, device=like.device)
-
-    def weights(rows: int, columns: int, scale: float) -> dist.TorchDistribution:
-        zero = torch.zeros(rows, columns, dtype=like.dtype, device=like.device)
-        return dist.Normal(zero, scale).to_event(2)
 
     return {
         "consistency": pyro.sample(
             "consistency", dist.LogNormal(number(math.log(3.0)), number(0.5))
         ),
         "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(1 / lapse - 1))),
+    }
+
+
+def residual_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tensor]:
+    """Sample what distinguishes a person's policy from the robot's.
+
+    ``residual_in`` ``[..., Z + 1, R]`` and ``residual_out`` ``[..., R + 1, A]`` are weights (the
+    last row is the bias) of the network of the residual ``delta(zH_t)``. The prior keeps its output
+    small (about 0.3 on logits), because a large residual can imitate blindness.
+    """
+
+    def weights(rows: int, columns: int, scale: float) -> dist.TorchDistribution:
+        zero = torch.zeros(rows, columns, dtype=like.dtype, device=like.device)
+        return dist.Normal(zero, scale).to_event(2)
+
+    return {
         "residual_in": pyro.sample(
             "residual_in", weights(latent + 1, RESIDUAL_HIDDEN, latent**-0.5)
         ),
@@ -98,7 +125,9 @@ def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
 
 
 def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
-    """``delta(zH_t)`` ``[..., T, A]`` of beliefs ``[..., T, Z]``: one hidden layer."""
+    """``delta(zH_t)`` ``[..., T, A]`` of beliefs ``[..., T, Z]``: one hidden layer; 0 without."""
+    if "residual_in" not in implants:
+        return belief.new_zeros(())
     hidden = torch.tanh(_layer(implants["residual_in"], belief))
     return _layer(implants["residual_out"], hidden)
 

@@ -16,14 +16,15 @@ from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
+from mirror_ppl.models.variants import VARIANTS
 
 
 def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
     """Make a human model.
 
     Args:
-        specification: ``path/to/file.py:Class``, a class derived from :class:`HumanModel`; the
-            package's own model unless given.
+        specification: a name in ``VARIANTS``, or ``path/to/file.py:Class``, a class derived from
+            :class:`HumanModel`; the package's own model unless given.
         self_model: the robot's networks.
 
     Raises:
@@ -31,9 +32,14 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
     """
     if specification is None:
         return HumanModel(self_model)
+    if specification in VARIANTS:
+        return VARIANTS[specification](self_model)
     path_text, colon, name = specification.rpartition(":")
     if not colon or not name.isidentifier():
-        raise HumanModelError(f'"{specification}" is not of the form path/to/file.py:Class')
+        raise HumanModelError(
+            f'"{specification}" is not of the form path/to/file.py:Class, and none of '
+            f"{', '.join(VARIANTS)}"
+        )
     path = Path(path_text)
     if not path.is_file():
         raise HumanModelError(f"{path}: there is no such file")

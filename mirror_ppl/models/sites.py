@@ -47,6 +47,9 @@ class Readable(Mapping[str, Tensor]):
         self.read.add(name)
         return self.known[name]
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.known
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.known)
 

@@ -1,0 +1,128 @@
+"""Variants of the human model: what each is the special case of."""
+
+import json
+
+import pytest
+import torch
+from running import command
+
+from mirror_ppl import assist, fit
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.combinations import perceived_sites
+from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.inference.views import build_view_table, combination_scores
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.implants import assumption_sites, sight_sites
+from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.variants import VARIANTS
+from mirror_ppl.models.view_table import combination_number
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+POLICY = {"consistency", "lapse", "residual_in", "residual_out"}
+
+
+@pytest.fixture(scope="module")
+def self_model():
+    return load_self_model(shipped_weights("driving"))[0]
+
+
+@pytest.fixture(scope="module")
+def rounds():
+    recordings = load_demonstrations(asset_path("driving_fog_diverse.nc"))
+    return recordings.select_people([0, 1]).select_rounds([0, 1])
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_variants_keep_the_contract_and_are_stepwise(self_model, name):
+    human = load_human_model(name, self_model)
+    check_contract(human)
+    assert human.stepwise and human.domain.name == "driving"
+
+
+def test_the_sites_of_each(self_model):
+    domain = self_model.domain
+    sights, assumed = set(sight_sites(domain)), set(assumption_sites(domain))
+    choice = {"consistency", "lapse"}
+    expected = {
+        "mirror": sights | assumed | POLICY,
+        "one-radius": {"sight_radius"} | assumed | POLICY,
+        "perceptual-only": sights | assumed | choice,
+        "policy-only": POLICY,
+        "no-implants": choice,
+    }
+    found = {name: set(sample_sites(VARIANTS[name](self_model), 1)) for name in VARIANTS}
+    assert found == expected
+    read = {name: len(perceived_sites(VARIANTS[name](self_model))) for name in VARIANTS}
+    assert list(read.values()) == [6, 3, 6, 0, 0]
+
+
+def scores(human, rounds, policy, combinations=None):
+    table = build_view_table(human, rounds, combinations)
+    return combination_scores(table, human.act(policy, table.belief, table.values))
+
+
+def test_variants_are_special_cases(self_model, rounds):
+    human = HumanModel(self_model)
+    policy = {
+        name: node["value"] for name, node in sample_sites(human, 2).items() if name in POLICY
+    }
+    sizes = {name: len(support) for name, support in perceived_sites(human).items()}
+    sights, assumed = sight_sites(human.domain), assumption_sites(human.domain)
+    # One radius: thresholds that are all the same.
+    radius, clear, closing = torch.meshgrid(
+        torch.arange(7), torch.arange(2), torch.arange(2), indexing="ij"
+    )
+    same = dict.fromkeys(sights, radius.flatten())
+    same |= dict(zip(assumed, (clear.flatten(), closing.flatten()), strict=True))
+    number = combination_number(same, sizes)
+    expected = scores(human, rounds, policy, [number.unique()] * 2)[:, number]
+    found = scores(VARIANTS["one-radius"](self_model), rounds, policy)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    assert found.std(-1).min() > 0.1
+    # Policy only: sees everything, so that there is nothing to be assumed.
+    everything = {site: torch.tensor([6]) for site in sights}
+    everything |= {site: torch.tensor([0]) for site in assumed}
+    number = combination_number(everything, sizes)
+    expected = scores(human, rounds, policy, [number] * 2)[:, number]
+    found = scores(VARIANTS["policy-only"](self_model), rounds, policy)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    # Without a residual: one whose weights are zero.
+    zero = policy | {name: 0 * policy[name] for name in ("residual_in", "residual_out")}
+    choice = {name: policy[name] for name in ("consistency", "lapse")}
+    some = [torch.arange(0, 9604, 97)] * 2
+    torch.testing.assert_close(
+        scores(VARIANTS["perceptual-only"](self_model), rounds, choice, some)[:, some[0]],
+        scores(human, rounds, zero, some)[:, some[0]],
+        rtol=1e-4,
+        atol=1e-4,
+    )
+    found = scores(VARIANTS["no-implants"](self_model), rounds, choice)
+    expected = scores(human, rounds, zero, [number] * 2)[:, number]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("guide", ["exact", "svi"])
+def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
+    """Of the smallest, which has nothing discrete, and of one radius."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("no-implants", "one-radius"):
+        given = "--human-model", name
+        status = command(
+            fit, *given, "--guide", guide, "--train-rounds", 1, "--draws", 8, "--steps", 2,
+            "--out", name,
+        )  # fmt: skip
+        assert status == 0
+    people = json.loads((tmp_path / "one-radius" / "summary.json").read_text())["people"]
+    bins = load_self_model(shipped_weights("driving"))[0].domain.reach_bins
+    assert {person["implants"]["sight_radius"]["median"] for person in people} <= set(bins)
+    status = command(
+        assist, "--posterior", "one-radius/posterior.nc", *given, "--rounds", 1,
+        "--communicator", "none", "--jobs", 1,
+    )  # fmt: skip
+    assert status == 0
+
+
+def test_names_that_are_no_variant(self_model):
+    with pytest.raises(HumanModelError, match="none of mirror, one-radius, perceptual-only"):
+        load_human_model("two-radii", self_model)
