@@ -118,7 +118,7 @@ def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
     assert {person["implants"]["sight_radius"]["median"] for person in people} <= set(bins)
     status = command(
         assist, "--posterior", "one-radius/posterior.nc", *given, "--rounds", 1,
-        "--communicator", "none", "--jobs", 1,
+        "--communicator", "none", "--jobs", 1, "--draws", 8,
     )  # fmt: skip
     assert status == 0
 
