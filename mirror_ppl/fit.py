@@ -53,6 +53,9 @@ class Options:
     inferred with them, and posterior.nc holds it)."""
     prior_from: Path | None = None
     """A posterior.nc of --pooling partial, whose population is the prior of these people."""
+    explore: int = 8
+    """Rounds that the model plays in each scenario, to say which would tell more of what people
+    see; 0 leaves it out."""
     steps: int = 300
     """Gradient steps of svi."""
     draws: int = 200
@@ -67,7 +70,8 @@ class Options:
             raise OptionError("--guide-file is for --guide amortized")
         if self.prior_from is not None and self.pooling != "none":
             raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
-        for name, least in (("steps", 1), ("draws", 1), ("train_rounds", 0)):
+        least_of = {"steps": 1, "draws": 1, "train_rounds": 0, "explore": 0}
+        for name, least in least_of.items():
             number = getattr(self, name)
             if number is not None and number < least:
                 option = f"--{name.replace('_', '-')}"
@@ -84,16 +88,18 @@ def main(options: Options) -> None:
     demonstrations = _recordings(options)
     from mirror_ppl.domains import get_domain
     from mirror_ppl.files import prepare_output_folder, write_whole
-    from mirror_ppl.inference.export import save_inference_data
+    from mirror_ppl.inference.export import add_identifiability, save_inference_data
     from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
     from mirror_ppl.inference.guide_file import network_for
     from mirror_ppl.inference.guides import InferenceOptions
+    from mirror_ppl.inference.identifiability import identify
     from mirror_ppl.inference.pooling import Pooling
     from mirror_ppl.inference.population_file import load_population
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.driving import has_sight, save_sight_picture
+    from mirror_ppl.plots.identifiability import plot_identifiability
 
     device = usable_device(options.device)
     svi = FitOptions(steps=options.steps)
@@ -123,6 +129,20 @@ def main(options: Options) -> None:
             network,
             population,
         )
+        found = identify(
+            human,
+            result.train,
+            result.posterior.draws,
+            options.seed,
+            result.posterior.population,
+            stages.report,
+            options.explore,
+        )
+    if found is not None:
+        scenarios = get_domain(demonstrations.domain).scenarios
+        for number, person in enumerate(result.summary["people"]):
+            person["identifiability"] = found.of(number, scenarios)
+        add_identifiability(result.data, found, result.data["posterior"].attrs)
     summary = result.summary | {"seconds": round(monotonic() - began, 1)}
     text = json.dumps(summary, indent=1) + "\n"
     # Without it, results of a run that was killed here cannot be taken for those of an older one.
@@ -130,6 +150,8 @@ def main(options: Options) -> None:
     save_inference_data(result.data, folder / "posterior.nc")
     if has_sight(result.data):
         save_sight_picture(result.data, folder / "sight.png")
+    if found is not None:
+        plot_identifiability(result.data).save(folder / "open.png")
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
     checkpoint.unlink(missing_ok=True)
     _show(summary, get_domain(demonstrations.domain).modalities[0].units[0])
@@ -137,6 +159,8 @@ def main(options: Options) -> None:
     print(f"{folder / 'summary.json'}: the numbers above")
     if has_sight(result.data):
         print(f"{folder / 'sight.png'}: the road as each person sees it")
+    if found is not None:
+        print(f"{folder / 'open.png'}: what is open about what they see, and what would tell")
 
 
 def _recordings(options: Options):

@@ -22,12 +22,14 @@ from typing import Any
 
 import numpy as np
 import torch
+import xarray as xr
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.files import write_whole
+from mirror_ppl.inference.identifiability import Identifiability
 from mirror_ppl.models.implants import SIGHT
 
 with warnings.catch_warnings():
@@ -115,6 +117,41 @@ def to_inference_data(
             if str(variable).startswith(SIGHT):
                 data[name][variable].attrs["units"] = domain.modalities[0].units[0]
     return data
+
+
+def add_identifiability(
+    data: az.InferenceData, found: Identifiability, attributes: Mapping[str, str | int | float]
+) -> None:
+    """Add the group ``identifiability`` to those of a fit; everything in it is in nats.
+
+    Args:
+        data: of the fit.
+        found: what is open about its people.
+        attributes: what the file says of itself.
+    """
+    domain = get_domain(str(attributes["domain"]))
+    scenarios = list(domain.scenarios)[: found.information.shape[1]]
+    by_site, by_scenario = ("person", "site"), ("person", "scenario")
+    variables = {
+        "open": (by_site, found.entropy),
+        "hangs_on_policy": (by_site, found.shared),
+        "open_together": (("person",), found.all_entropy),
+        "hangs_on_policy_together": (("person",), found.all_shared),
+        "information": (by_scenario, found.information),
+        "information_error": (by_scenario, found.information_error),
+    }
+    group = xr.Dataset(
+        {name: (dims, value.cpu().numpy()) for name, (dims, value) in variables.items()},
+        {
+            "person": data["posterior"]["person"].values,
+            "site": list(found.sites),
+            "scenario": scenarios,
+        },
+        {key: str(value) for key, value in attributes.items()},
+    )
+    for name in group.data_vars:
+        group[name].attrs["units"] = "nats"
+    data.add_groups({"identifiability": group})
 
 
 def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) -> Tensor:

@@ -40,11 +40,13 @@ class Fit:
     """Everything that came out of fitting P people.
 
     Attributes:
+        train: the rounds that were learned from.
         posterior: draws, and how they came about.
         data: the posterior and predictions as ArviZ ``InferenceData``.
         summary: what ``summary.json`` holds.
     """
 
+    train: Demonstrations
     posterior: Inferred
     data: az.InferenceData
     summary: dict[str, Any]
@@ -160,6 +162,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     report("predict", 3, 3, "")
 
     # Results live where everybody can read them.
+    learned = train
     train, test = train.to("cpu"), None if test is None else test.to("cpu")
     drawn, prior = (
         {name: value.cpu() for name, value in draws.items()} for draws in (posterior.draws, prior)
@@ -192,7 +195,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         for person, value in zip(found, posterior.effective.tolist(), strict=True):
             person["effective_draws"] = round(value, 1)
     summary = attributes | {"options": asdict(options), "people": found}
-    return Fit(posterior, data, summary)
+    return Fit(learned, posterior, data, summary)
 
 
 def _recorded(train: Demonstrations) -> str:

@@ -3,9 +3,10 @@
 The population is a Pyro program above the human model. Every site of one number a person gets
 hyper-parameters; the others (weights of the residual) keep their prior::
 
-    chances_d  ~ Dirichlet(n_d p_d)          discrete site d: over its n_d values, of prior p_d
-    mean_c     ~ Normal(m_c, s_c)            continuous site c, in unconstrained space: where its
-    spread_c   ~ LogNormal(log(s_c / 2), .5)               prior has the mean m_c and the width s_c
+    concentration_d ~ LogNormal(log(n_d), 1)      discrete site d, of n_d values: large where
+    chances_d  ~ Dirichlet(concentration_d p_d)     people differ as much as its prior p_d says
+    mean_c     ~ Normal(m_c, s_c)                 continuous site c, in unconstrained space: where
+    spread_c   ~ LogNormal(log(s_c / 2), 0.5)       its prior has the mean m_c and the width s_c
     psi_p      ~ Categorical(chances_d), Normal(mean_c, spread_c)        person p
     actions_p  ~ the human model given psi_p
 
@@ -41,6 +42,8 @@ MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
 """Draws of a person, at most, from which a population is inferred; of all people together; and
 what each has of these at least."""
 PRIOR_DRAWS = 4000
+CONCENTRATION_WIDTH = 1.0
+"""Standard deviation of the logarithm of the concentration of chances."""
 SPREAD_WIDTH = 0.5
 """Standard deviation of the logarithm of how much people differ, before anybody is seen."""
 
@@ -97,13 +100,13 @@ class Pooling:
             nodes = sample_sites(human, 1, PRIOR_DRAWS)
         drawn = places(self.sites, values_of(nodes))
         self.centre, self.width = drawn.mean(0), drawn.std(0)
-        self.supports, self.concentration = {}, {}
+        self.supports, self.prior_chances = {}, {}
         for name, node in nodes.items():
             if node["fn"].has_enumerate_support:
                 values = node["fn"].enumerate_support()
                 chances = node["fn"].log_prob(values).exp().flatten(1).mean(1)
                 self.supports[name] = values.flatten(1)[:, 0]
-                self.concentration[name] = len(values) * chances
+                self.prior_chances[name] = chances / chances.sum()
 
     def program(
         self, known: Mapping[str, Tensor], place: Mapping[str, Tensor], log_prior: Tensor
@@ -115,10 +118,12 @@ class Pooling:
             place: by continuous site, its value in unconstrained space, ``[P, S]``.
             log_prior: of the draws under the human model, ``[P, S]``.
         """
-        chances = {
-            name: pyro.sample(f"{name}_chances", dist.Dirichlet(concentration))
-            for name, concentration in self.concentration.items()
-        }
+        chances = {}
+        for name, prior in self.prior_chances.items():
+            size = prior.new_tensor(float(len(prior)))
+            alike = dist.LogNormal(size.log(), torch.full_like(size, CONCENTRATION_WIDTH))
+            concentration = pyro.sample(f"{name}_concentration", alike)
+            chances[name] = pyro.sample(f"{name}_chances", dist.Dirichlet(concentration * prior))
         mean, spread = {}, {}
         for name, centre, width in zip(self.sites, self.centre, self.width, strict=True):
             mean[name] = pyro.sample(f"{name}_mean", dist.Normal(centre, width))

@@ -23,6 +23,7 @@ def play_rounds(
     rounds: int,
     setting: str,
     generator: torch.Generator,
+    scenario: Tensor | None = None,
 ) -> Demonstrations:
     """Let people with given implants play rounds; every action is drawn from the program itself.
 
@@ -33,6 +34,7 @@ def play_rounds(
         rounds: number of rounds B of each.
         setting: name under which the rounds are recorded; what people see is up to their implants.
         generator: source of how rounds begin and of what people choose.
+        scenario: of each round of each person, ``[P B]`` in that order; drawn unless given.
     """
     domain, steps = human.domain, human.domain.horizon
     people = len(next(iter(implants.values())))
@@ -41,7 +43,7 @@ def play_rounds(
     def by_person(part: Tensor) -> Tensor:
         return part.unflatten(0, (people, rounds))
 
-    begin = domain.initial(people * rounds, generator)
+    begin = domain.initial(people * rounds, generator, scenario)
     state = map_state(by_person, begin)
     observed = [domain.observe(state)]
     actions = torch.zeros(people, rounds, steps, dtype=torch.long, device=device)

@@ -1,0 +1,225 @@
+"""What a fit leaves open: does blindness hide behind policy, and which rounds would tell?
+
+Somebody who acts oddly may not see, or may decide oddly. With posterior draws ``psi_s`` of how a
+person decides and the exact ``p(m | psi_s, actions)`` of what they see under each of them,
+
+    open about m          H[ mean_s p(m | psi_s, actions) ]
+    hangs on the policy   open - mean_s H[ p(m | psi_s, actions) ]
+
+in nats: the second is the mutual information of the two in the posterior, what one would learn of
+their sight if one knew how they decide. A round that is still to be recorded, in a scenario, tells
+
+    H[ p(m | actions) ] - E H[ p(m | actions, actions of that round) ]
+
+of what they see whatever their policy, the expectation over rounds that the model itself plays
+(Lindley, *On a measure of the information provided by an experiment*, 1956).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.inference.combinations import log_priors, perceived_sites
+from mirror_ppl.inference.exact import acts_on_beliefs, combination_values, log_joints
+from mirror_ppl.inference.pooling import Population
+from mirror_ppl.inference.sightings import Sightings
+from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.svi import Report, silent
+from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.view_table import combination_number
+
+POLICIES = 48
+"""Posterior draws of how a person decides."""
+COMBINATIONS = 128
+"""Combinations of what they may see, at most."""
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What is open about P people, in nats.
+
+    Attributes:
+        sites: the discrete implants that perception reads; D of them.
+        entropy: open about each ``[P, D]``.
+        shared: of it, what hangs on how they decide ``[P, D]``.
+        all_entropy, all_shared: the same of all of them together ``[P]``.
+        information: expected from one more round in each of the domain's N scenarios, about all
+            of them together, ``[P, N]``; empty if no round was played.
+        information_error: its standard error, of the rounds that were played.
+    """
+
+    sites: tuple[str, ...]
+    entropy: Tensor
+    shared: Tensor
+    all_entropy: Tensor
+    all_shared: Tensor
+    information: Tensor
+    information_error: Tensor
+
+    def of(self, person: int, scenarios: Sequence[str]) -> dict[str, Any]:
+        """What is open about one person, as ``summary.json`` has it."""
+        entropy, shared = (part[person].tolist() for part in (self.entropy, self.shared))
+        information, error = (
+            part[person].tolist() for part in (self.information, self.information_error)
+        )
+        return {
+            "open": dict(zip(self.sites, entropy, strict=True))
+            | {"together": float(self.all_entropy[person])},
+            "hangs_on_policy": dict(zip(self.sites, shared, strict=True))
+            | {"together": float(self.all_shared[person])},
+            "scenarios": {
+                name: {"expected": expected, "error": error}
+                for name, expected, error in zip(
+                    scenarios[: len(information)], information, error, strict=True
+                )
+            },
+        }
+
+
+@torch.no_grad()
+def identify(
+    human: HumanModel,
+    train: Demonstrations,
+    draws: Mapping[str, Tensor],
+    seed: int,
+    population: Population | None = None,
+    report: Report = silent,
+    rounds: int = 8,
+) -> Identifiability | None:
+    """What is open about people after a fit.
+
+    Args:
+        human: the model of people.
+        train: the rounds that were learned from.
+        draws: posterior draws ``[S, P, 1, ...]``, one after the other not alike.
+        seed: of the rounds that are played.
+        population: that people are from, if it was the prior.
+        report: told of people done.
+        rounds: that are played in each scenario; 0 for none.
+
+    Returns:
+        ``None`` of models in which there is nothing discrete to see, or in which actions depend on
+        what is seen otherwise than through beliefs.
+    """
+    sizes = {site: len(support) for site, support in perceived_sites(human).items()}
+    if not sizes:
+        return None
+    held, people = next(iter(draws.values())).shape[:2]
+    chosen = torch.linspace(0, held - 1, min(held, POLICIES)).round().long()
+    found: list[tuple[Tensor, ...]] = []
+    for person in range(people):
+        report("identify", person, people, "people")
+        own = {name: value[:, person : person + 1] for name, value in draws.items()}
+        drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes)
+        candidates, counts = drawn.unique(return_counts=True)
+        candidates = candidates[counts.argsort(descending=True)[:COMBINATIONS]].sort().values
+        one = train.select_people([person])
+        table = build_view_table(human, one, [candidates])
+        if not acts_on_beliefs(human, table):
+            return None
+        policy = {name: value[chosen] for name, value in own.items() if name not in sizes}
+        joint = log_joints(human, table, policy, candidates)[:, 0]
+        grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
+        if population is not None:
+            joint = joint + _instead_of_prior(human, grid, policy, population)
+        weights = torch.log_softmax(joint, -1)  # [S, C]
+        told = (weights.new_zeros(0),) * 2
+        if rounds:
+            generator = torch.Generator(weights.device).manual_seed(seed)
+            told = _information(
+                human, weights, candidates, grid, policy, train.setting, rounds, generator
+            )
+        found.append((*_open(weights, grid), *told))
+    report("identify", people, people, "people")
+    return Identifiability(tuple(sizes), *(torch.stack(part) for part in zip(*found, strict=True)))
+
+
+def _instead_of_prior(
+    human: HumanModel,
+    grid: Mapping[str, Tensor],
+    policy: Mapping[str, Tensor],
+    population: Population,
+) -> Tensor:
+    """Log ratio ``[S, C]`` of the prior of combinations in the population to the model's own."""
+    own = log_priors(human, grid, policy, 1)[:, 0]
+    total = torch.zeros_like(own)
+    supports = perceived_sites(human)
+    for site, value in grid.items():
+        index = (value[:, None] == supports[site]).long().argmax(-1)
+        total = total + population.chances[site].mean(0).log()[index]
+    return total - own
+
+
+def _open(weights: Tensor, grid: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Entropies and what is shared with policy, of each site ``[D]`` and of all together."""
+    open_, shared = [], []
+    for value in grid.values():
+        values = value.unique()
+        member = (value[:, None] == values).to(weights)
+        pair = _entropy_and_shared(weights.exp() @ member)
+        open_.append(pair[0])
+        shared.append(pair[1])
+    return torch.stack(open_), torch.stack(shared), *_entropy_and_shared(weights.exp())
+
+
+def _entropy_and_shared(probability: Tensor) -> tuple[Tensor, Tensor]:
+    """Of conditionals ``[S, n]``."""
+    total = _entropy(probability.mean(0))
+    return total, (total - _entropy(probability).mean()).clamp(min=0)
+
+
+def _entropy(probability: Tensor) -> Tensor:
+    return torch.special.entr(probability).sum(-1)
+
+
+def _information(
+    human: HumanModel,
+    weights: Tensor,
+    candidates: Tensor,
+    grid: Mapping[str, Tensor],
+    policy: Mapping[str, Tensor],
+    setting: str,
+    rounds: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Expected of a round in each scenario ``[N]``, in nats, and its standard error."""
+    domain = human.domain
+    number = len(domain.scenarios)
+    # Who plays: every pair of policy and sight by its probability, the same in each scenario.
+    pairs = torch.multinomial(
+        weights.exp().flatten(), rounds, replacement=True, generator=generator
+    ).repeat(number)
+    draw, which = pairs // len(candidates), pairs % len(candidates)
+    implants = {name: value[draw, 0] for name, value in policy.items()}
+    implants |= {site: value[which][:, None] for site, value in grid.items()}
+    scenario = torch.arange(number, device=weights.device).repeat_interleave(rounds)
+    played = play_rounds(human, implants, 1, setting, generator, scenario)
+    sightings = Sightings(human, None, candidates)
+    for player in range(len(pairs)):
+        for one_round in rounds_of(played, player):
+            sightings.add(*one_round)
+    table = sightings.table()
+    with (
+        poutine.block(),
+        poutine.condition(data=dict(policy)),
+        pyro.plate("draw", len(weights), dim=-3),
+        pyro.plate("person", 1, dim=-2),
+    ):
+        log_probabilities = human.act(human.prior(), table.belief, table.values)
+    likelihood = table.log_likelihoods(log_probabilities)[:, 0]  # [S, V]
+    joint = likelihood[:, table.index[0][:, candidates]] + weights[:, None]  # [S, R, C]
+    after = torch.softmax(torch.logsumexp(joint, 0), -1)  # [R, C]
+    each = (_entropy(weights.exp().mean(0)) - _entropy(after)).view(number, rounds)
+    error = each.std(-1, correction=min(1, rounds - 1)) / math.sqrt(rounds)
+    # It is never negative, but what is found of it may be.
+    return each.mean(-1).clamp(min=0), error

@@ -1,0 +1,85 @@
+"""What a fit leaves open about what people see, and which rounds would tell."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.patches import Patch
+
+from mirror_ppl.plots.implants import TITLES
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE
+
+if TYPE_CHECKING:
+    import arviz as az
+
+COLOURS = (BLUE, "#56B4E9", ORANGE, "#F0E442", PURPLE, "#009E73", "#D55E00", GREY)
+ROW = 0.34
+"""Inches of a person."""
+WRAP = 22
+MOST_PEOPLE = 60
+
+
+def plot_identifiability(data: az.InferenceData) -> Picture:
+    """Draw what is open about each person's sight, and what a round in each scenario would tell.
+
+    Left: nats that are open about each implant of sight, stacked; hatched is what hangs on how they
+    decide. Right, if rounds were played: nats that one more round in a scenario should tell.
+
+    Args:
+        data: with the group ``identifiability``; of more than 60 people the first are drawn.
+    """
+    group = data["identifiability"].isel(person=slice(MOST_PEOPLE))
+    people = [str(person) for person in group["person"].values]
+    scenarios = [str(name) for name in group["scenario"].values]
+    sites = [str(name) for name in group["site"].values]
+    # Room for what stands below: names of scenarios, or the legend.
+    figure = Picture(
+        figsize=(5.2 + 0.75 * len(scenarios), ROW * len(people) + 3.4), layout="constrained"
+    )
+    widths = [5.2, max(0.01, 0.75 * len(scenarios))][: 1 + bool(scenarios)]
+    axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
+    rows = np.arange(len(people))
+    left = np.zeros(len(people))
+    for number, site in enumerate(sites):
+        whole = group["open"].sel(site=site).values
+        hanging = group["hangs_on_policy"].sel(site=site).values
+        colour = COLOURS[number % len(COLOURS)]
+        axes[0].barh(rows, whole, 0.75, left, color=colour, lw=0)
+        axes[0].barh(rows, hanging, 0.75, left, color="none", hatch="//////", edgecolor=BLACK, lw=0)
+        left = left + whole
+    axes[0].set_yticks(rows, people, parse_math=False)
+    axes[0].set_ylim(len(people) - 0.4, -0.6)
+    axes[0].set_xlim(0, max(0.1, 1.05 * float(left.max())))
+    axes[0].set_xlabel("nats open, of each by itself")
+    axes[0].set_title("What is open about what they see", fontsize=12)
+    axes[0].spines[["top", "right"]].set_visible(False)
+    handles = [
+        Patch(color=COLOURS[number % len(COLOURS)], label=TITLES.get(site, site.replace("_", " ")))
+        for number, site in enumerate(sites)
+    ]
+    handles.append(
+        Patch(facecolor="none", hatch="//////", edgecolor=BLACK, label="hangs on how they decide")
+    )
+    if scenarios:
+        _scenarios(axes[1], group["information"].values, scenarios)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=2 if scenarios else 1, frameon=False
+    )
+    return figure
+
+
+def _scenarios(ax, information: np.ndarray, scenarios: list[str]) -> None:
+    most = max(float(information.max()), 1e-6)
+    ax.imshow(information, cmap="Blues", vmin=0, vmax=most, aspect="auto")
+    for row, values in enumerate(information):
+        for column, value in enumerate(values):
+            colour = "white" if value > 0.6 * most else BLACK
+            ax.text(column, row, f"{value:.2f}", ha="center", va="center", color=colour, fontsize=8)
+    names = [textwrap.fill(name, WRAP, break_on_hyphens=False) for name in scenarios]
+    ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9, parse_math=False)
+    ax.set_yticks([])
+    ax.set_title("What one more round would tell (nats)", fontsize=12)
+    ax.spines[:].set_visible(False)

@@ -1,0 +1,172 @@
+"""What is open after a fit: against conditionals by hand, and rounds whose answer is known."""
+
+import math
+
+import pytest
+import torch
+
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.inference.calibration import prior_people
+from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.identifiability import POLICIES, _entropy_and_shared, identify
+from mirror_ppl.inference.pooling import Population
+from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.toy import RATES, ToyHuman
+from mirror_ppl.models.variants import NoImplants
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.plots.identifiability import plot_identifiability
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return ToyHuman(load_self_model(shipped_weights("driving"))[0])
+
+
+@pytest.fixture(scope="module")
+def rounds(toy):
+    generator = torch.Generator().manual_seed(0)
+    return play_rounds(toy, prior_people(toy, 3, generator), 2, "fog", generator)
+
+
+@pytest.fixture(scope="module")
+def draws(toy, rounds):
+    return infer(toy, rounds, InferenceOptions(draws=POLICIES), 0).draws
+
+
+def conditionals(toy, rounds, draws, person):
+    """``p(reach | rates, actions)`` ``[S, n]`` of a toy person, from counts of its actions."""
+    domain, steps = toy.domain, rounds.shape[2]
+    observation = {name: value[:, :, :steps] for name, value in rounds.observation().items()}
+    _, distance = domain.distance(observation)
+    bins = torch.tensor(domain.reach_bins)
+    seen = distance[person].amin(-1)[..., None] <= bins  # [B, T, n]
+    one, other = (draws[site][:, person, 0, None, None, None] for site in RATES)
+    rate = torch.where(seen, one, other)
+    second = (rounds.actions[person] == 1)[..., None]
+    likelihood = torch.where(second, rate, 1 - rate).log().sum((1, 2))
+    some = torch.isin(torch.arange(len(bins)), draws["reach"][:, person, 0])
+    return torch.softmax(likelihood.masked_fill(~some, -math.inf), -1)
+
+
+def entropy(probability):
+    return torch.special.entr(probability).sum(-1)
+
+
+def test_entropies_by_hand():
+    half = torch.full((4, 2), 0.5)
+    assert [float(v) for v in _entropy_and_shared(half)] == pytest.approx([math.log(2), 0])
+    sure = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    assert [float(v) for v in _entropy_and_shared(sure)] == pytest.approx([math.log(2)] * 2)
+
+
+def test_what_is_open_is_that_of_the_exact_conditionals(toy, rounds, draws):
+    found = identify(toy, rounds, draws, 0, rounds=0)
+    assert found.sites == ("reach",)
+    assert found.information.shape == found.information_error.shape == (3, 0)
+    for person in range(3):
+        exact = conditionals(toy, rounds, draws, person)
+        total = entropy(exact.mean(0))
+        hanging = total - entropy(exact).mean()
+        torch.testing.assert_close(found.entropy[person, 0], total, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(found.shared[person, 0], hanging, rtol=1e-2, atol=1e-4)
+    assert (found.shared <= found.entropy).all() and found.shared.max() > 0.003
+    torch.testing.assert_close(found.all_entropy, found.entropy[:, 0])
+    torch.testing.assert_close(found.all_shared, found.shared[:, 0])
+
+
+def test_a_population_takes_the_place_of_the_prior(toy, rounds, draws):
+    chances = torch.arange(1.0, 8) / 28
+    known = Population(
+        {"reach": chances[None]}, dict.fromkeys(RATES, torch.zeros(1)), dict.fromkeys(RATES)
+    )
+    found = identify(toy, rounds, draws, 0, known, rounds=0)
+    for person in range(3):
+        exact = conditionals(toy, rounds, draws, person) * chances
+        exact = exact / exact.sum(-1, keepdim=True)
+        expected = entropy(exact.mean(0))
+        torch.testing.assert_close(found.entropy[person, 0], expected, rtol=1e-3, atol=1e-4)
+
+
+def two_reaches(rates):
+    """Draws of one person who sees one or eight cells, as likely, and has known rates."""
+    reach = torch.tensor([1, 4]).repeat(POLICIES // 2)[:, None, None]
+    return {"reach": reach} | {
+        site: torch.full((POLICIES, 1, 1), rate) for site, rate in zip(RATES, rates, strict=True)
+    }
+
+
+def test_rounds_tell_what_they_should(toy, rounds):
+    nobody = rounds.select_people([0]).select_rounds([])
+    # Both rates alike: what they do has nothing to do with what they see.
+    found = identify(toy, nobody, two_reaches((0.3, 0.3)), 0, rounds=2)
+    assert found.all_entropy[0] == pytest.approx(math.log(2), rel=1e-4)
+    assert found.information.max() < 1e-4
+    # Rates that give them away wherever something is between the two reaches.
+    found = identify(toy, nobody, two_reaches((0.99, 0.01)), 0, rounds=4)
+    assert found.information.shape == (1, 8)
+    assert found.information.max() > 0.9 * math.log(2)
+    assert found.information.max() <= math.log(2) + 1e-4
+    # Nothing is open about somebody of whom everything is known.
+    known = two_reaches((0.99, 0.01)) | {"reach": torch.full((POLICIES, 1, 1), 4)}
+    found = identify(toy, nobody, known, 0, rounds=2)
+    assert found.entropy.max() == found.information.max() == 0
+
+
+def test_expected_information_is_that_of_the_toy(toy, rounds):
+    """Against rounds played by toys directly, whose posterior is two likelihoods."""
+    rates = (0.6, 0.3)
+    nobody, number = rounds.select_people([0]).select_rounds([]), 60
+    found = identify(toy, nobody, two_reaches(rates), 0, rounds=number)
+    generator = torch.Generator().manual_seed(1)
+    scenario = torch.full((400,), 7)
+    one = {"reach": torch.tensor([[1], [4]]).repeat(200, 1)}
+    one |= {site: torch.full((400, 1), rate) for site, rate in zip(RATES, rates, strict=True)}
+    played = play_rounds(toy, one, 1, "fog", generator, scenario)
+    same = {name: value[:1].expand(2, 400, 1) for name, value in one.items() if name != "reach"}
+    same["reach"] = torch.tensor([1, 4])[:, None, None].expand(2, 400, 1)
+    exact = torch.stack([conditionals(toy, played, same, person)[0] for person in range(400)])
+    gain = math.log(2) - entropy(exact)
+    error = math.hypot(float(found.information_error[0, 7]), float(gain.std()) / 20)
+    assert abs(float(found.information[0, 7]) - float(gain.mean())) < 4 * error
+    assert 0.02 < gain.mean() < 0.6
+
+
+def test_models_without_anything_to_see_have_no_report(toy, rounds):
+    human = NoImplants(toy.self_model)
+    draws = infer(human, rounds, InferenceOptions(draws=4), 0).draws
+    assert identify(human, rounds, draws, 0) is None
+
+
+def test_twenty_rounds_leave_less_open_than_one(toy):
+    human = HumanModel(toy.self_model)
+    recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([1])
+    found = []
+    for number in (1, 20):
+        train = recordings.select_rounds(range(number))
+        draws = infer(human, train, InferenceOptions(draws=100), 0).draws
+        found.append(identify(human, train, draws, 0, rounds=1))
+    assert found[0].all_entropy > found[1].all_entropy + 1
+    assert (found[0].all_shared <= found[0].all_entropy).all()
+    told = found[1].of(0, human.domain.scenarios)
+    assert list(told["scenarios"]) == list(human.domain.scenarios)
+    assert told["open"].keys() == told["hangs_on_policy"].keys() == {*found[1].sites, "together"}
+
+
+@pytest.mark.parametrize("explored", [0, 2])
+def test_the_picture(toy, rounds, draws, explored, tmp_path):
+    from mirror_ppl.inference.export import add_identifiability, az
+
+    found = identify(toy, rounds, draws, 0, rounds=explored)
+    data = az.from_dict(
+        posterior={"reach": draws["reach"][None, ..., 0].numpy()},
+        dims={"reach": ["person"]},
+        coords={"person": list(rounds.people)},
+    )
+    add_identifiability(data, found, {"domain": "driving"})
+    assert data["identifiability"]["open"].dims == ("person", "site")
+    figure = plot_identifiability(data)
+    assert len(figure.axes) == 1 + bool(explored)
+    bars = [patch.get_width() for patch in figure.axes[0].patches]
+    assert bars[:3] == pytest.approx(found.entropy[:, 0].tolist())
+    figure.save(tmp_path / "open.png")
