@@ -170,7 +170,7 @@ def sample_amortized(
     human: HumanModel,
     guide: AmortizedGuide,
     sightings: Sightings,
-    proposals: int = 192,
+    proposals: int = 256,
     prune_margin: float = 12.0,
 ) -> Weighted:
     """Weighted draws of one person: the guide's, and the ways that evidence is about.
