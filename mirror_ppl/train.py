@@ -37,7 +37,7 @@ class Options:
     """Of a self-model: gradient steps of a phase."""
     learning_rate: float = 1e-3
     """Of a self-model: learning rate at the start; it falls to a hundredth."""
-    people: int = 600
+    people: int = 1000
     """Of a guide: people to learn from, simulated in the true domain."""
     human_model: str | None = None
     """Of a guide: another human model: one-radius, perceptual-only, policy-only or no-implants, or

@@ -110,7 +110,10 @@ def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
         (("--rounds", 0), "--rounds must be positive and increase, not 0"),
         (("--seed", -1), "--seed must be at least 0, not -1"),
         (("--guide-file", "nowhere.x"), "--guide-file is for --guide amortized"),
-        (("--guide", "amortized"), "no guide ships for driving: train one with"),
+        (
+            ("--guide", "amortized", "--human-model", "one-radius"),
+            "is for human model HumanModel, not OneRadius; train a guide for it",
+        ),
         (("--jobs", 0), "--jobs must be at least 1, or -1 for all, not 0"),
         (("--guide", "magic"), 'unknown guide "magic"'),
         (("--guide", "amortized", "--guide-file", "nowhere.x"), "nowhere.x: cannot be read"),

@@ -32,7 +32,7 @@ from mirror_ppl.inference.fitting import split_rounds
 from mirror_ppl.inference.summary import summarize
 from mirror_ppl.models.weights import load_self_model
 
-RESULTS = {"posterior.nc", "sight.png", "summary.json"}
+RESULTS = {"open.png", "posterior.nc", "sight.png", "summary.json"}
 
 
 def content(folder):
@@ -352,7 +352,8 @@ def test_recordings_that_cannot_be_written_leave_nothing(tmp_path, capsys):
     [
         (fit, ("--steps", "0"), "--steps must be at least 1, not 0"),
         (fit, ("--draws", "-3"), "--draws must be at least 1, not -3"),
-        (fit, ("--train-rounds", "0"), "--train-rounds must be at least 1, not 0"),
+        (fit, ("--train-rounds", "-1"), "--train-rounds must be at least 0, not -1"),
+        (fit, ("--explore", "-1"), "--explore must be at least 0, not -1"),
         (train, ("--phases", "0"), "--phases must be at least 1, not 0"),
         (train, ("--steps", "0"), "--steps must be at least 1, not 0"),
         (train, ("--learning-rate", "0"), "--learning-rate must be a positive number, not 0.0"),
@@ -478,7 +479,7 @@ def test_split_of_rounds(rounds, train_rounds, train, test, more):
     assert numbers == [list(train), None if test is None else list(test)]
 
 
-@pytest.mark.parametrize("train_rounds", [0, 5])
+@pytest.mark.parametrize("train_rounds", [-1, 5])
 def test_rounds_that_are_not_there_cannot_be_learned_from(train_rounds):
     with pytest.raises(DemonstrationsError, match=f"cannot train on {train_rounds} of 4 rounds"):
         split_rounds(numbered(4), train_rounds)

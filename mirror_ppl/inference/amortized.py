@@ -170,7 +170,9 @@ def sample_amortized(
     human: HumanModel,
     guide: AmortizedGuide,
     sightings: Sightings,
-    proposals: int = 256,
+    enough: float = 400.0,
+    proposals: int = 64,
+    stages: int = 16,
     prune_margin: float = 12.0,
 ) -> Weighted:
     """Weighted draws of one person: the guide's, and the ways that evidence is about.
@@ -179,7 +181,9 @@ def sample_amortized(
         human: the model of people that the guide was trained for.
         guide: the trained network.
         sightings: the person's rounds so far.
-        proposals: draws from the guide.
+        enough: effective draws at which no stage is added.
+        proposals: draws from the guide of a stage.
+        stages: the largest number of stages.
         prune_margin: see :class:`ImportanceOptions`.
     """
     evidence = evidence_of(sightings)
@@ -187,5 +191,10 @@ def sample_amortized(
     sampler.take(evidence.ways, evidence.joint)
     sampler.prune(prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
-    sampler.propose(guide.density(evidence.log_evidence, steps), proposals)
-    return sampler.weighted()
+    density = guide.density(evidence.log_evidence, steps)
+    for _ in range(stages):
+        sampler.propose(density, proposals)
+        found = sampler.weighted()
+        if found.effective >= enough:
+            break
+    return found

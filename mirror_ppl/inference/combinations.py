@@ -8,6 +8,7 @@ from math import prod
 import pyro
 import torch
 from pyro import poutine
+from pyro.distributions import TorchDistribution
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
@@ -15,6 +16,8 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 
 MAX_COMBINATIONS = 100_000
+BATCH = 3
+"""Dimensions of draws, people and their rounds."""
 
 
 def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
@@ -91,8 +94,19 @@ def log_priors(
     ):
         human.prior()
     total = next(human.parameters()).new_zeros(1, 1, 1, 1)
-    for site in grid:
-        node = trace.trace.nodes[site]
-        total = total + node["fn"].log_prob(node["value"])
+    for site, value in grid.items():
+        total = total + _log_prior(trace.trace.nodes[site]["fn"], value)
     size = max([len(value) for value in grid.values()], default=1)
     return total.expand(size, number, people, 1).squeeze(-1).permute(1, 2, 0)
+
+
+def _log_prior(fn: TorchDistribution, value: Tensor) -> Tensor:
+    """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 where all is alike."""
+    if len(fn.batch_shape) > BATCH:  # depends on other discrete sites
+        return fn.log_prob(value[:, None, None, None])
+    # The prior of most sites has nothing to do with others, so that it is one table.
+    values, index = value.unique(return_inverse=True)
+    table = fn.log_prob(values[:, None, None, None])
+    if (table == table[:, :1]).all():
+        table = table[:, :1]
+    return table[index]

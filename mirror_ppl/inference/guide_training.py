@@ -52,7 +52,7 @@ class GuideOptions:
         together: people who are simulated at once.
     """
 
-    people: int = 600
+    people: int = 1000
     rounds: tuple[int, ...] = (1, 2, 3, 5, 8, 13, 20, 40)
     steps: int = 4000
     batch: int = 256

@@ -145,8 +145,9 @@ class Sightings:
         if self.screening is not None:
             if self.screening.resolution > 0:
                 part, which = self._merged(part, which, self.screening)
-            self.score[:, alive] += self._log_likelihoods(part)[:, which]
-            best = self.score[:, alive].amax(0)
+            score = self.score[:, alive] + self._log_likelihoods(part)[:, which]
+            self.score[:, alive] = score
+            best = score.amax(0)
             self.alive = alive[best >= best.max() - self.screening.margin]
         self._rounds.append(part)
         self._seen.append((alive, which))

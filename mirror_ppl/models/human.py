@@ -93,9 +93,13 @@ class View:
         for mask in masks.values():
             total = total + torch.where(mask, keys.pop(0), 0).sum(-1)
         for name, mask in self.taken.items():
-            value = as_whole_numbers(self.imagined[name])
-            value = (value * keys.pop(0).view(value.shape[-2:])).sum(-1)
-            total = total + torch.where(mask, value, 0).sum(-1)
+            imagined = self.imagined[name]
+            key = keys.pop(0).view(imagined.shape[-2:])
+            # Few items are taken for granted, and only those count.
+            value = as_whole_numbers(imagined.expand(*mask.shape, -1)[mask])
+            value = (value * key.expand(*mask.shape, -1)[mask]).sum(-1)
+            each = torch.zeros(mask.shape, dtype=torch.long, device=device)
+            total = total + each.masked_scatter(mask, value).sum(-1)
         return total
 
 

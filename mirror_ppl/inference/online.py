@@ -1,0 +1,92 @@
+"""One person's posterior, kept up to date while rounds come in."""
+
+from __future__ import annotations
+
+from time import monotonic
+
+import torch
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
+from mirror_ppl.inference.importance import ImportanceOptions, Weighted, sample_exactly
+from mirror_ppl.inference.prior import Draws, sample_sites
+from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.models.human import HumanModel
+
+
+ENOUGH = 110.0
+"""Effective draws at which a guide proposes no more: as many as an answer needs that cannot wait."""
+
+
+class OnlinePosterior:
+    """What is known of a person so far; a round more is one term more of their likelihood.
+
+    Args:
+        human: the model of people.
+        network: a trained guide (see :func:`mirror_ppl.inference.guide_file.load_guide`); without,
+            draws are those of ``exact``, which takes longer at each asking.
+        seed: of everything random. The same rounds in the same order give the same draws.
+
+    Raises:
+        HumanModelError: what people see cannot be marginalized, or reaches their actions otherwise
+            than through beliefs.
+
+    Attributes:
+        rounds: number of rounds so far.
+        pareto_k: of the importance weights at the last asking; above 0.7 they are not to be relied
+            on.
+        seconds: that the last round, and the last asking, took.
+    """
+
+    def __init__(
+        self, human: HumanModel, network: AmortizedGuide | None = None, seed: int = 0
+    ) -> None:
+        self.human = human
+        self.network = network
+        self.seed = seed
+        self.rounds = 0
+        self.pareto_k = float("nan")
+        self.seconds = 0.0, 0.0
+        screening = Screening() if network is None else guide_screening()
+        self._sightings = Sightings(human, screening)
+
+    def add(self, demonstrations: Demonstrations) -> None:
+        """Learn from rounds that have come in.
+
+        Args:
+            demonstrations: of one person, of any number of rounds.
+
+        Raises:
+            ValueError: they are of more than one person.
+        """
+        if demonstrations.num_people != 1:
+            raise ValueError(f"the rounds are of {demonstrations.num_people} people, not one")
+        began = monotonic()
+        if int(demonstrations.round_counts[0]):
+            for one_round in rounds_of(demonstrations, 0):
+                self._sightings.add(*one_round)
+                self.rounds += 1
+        self.seconds = monotonic() - began, self.seconds[1]
+
+    def draws(self, number: int = 200) -> Draws:
+        """Posterior draws ``[S, 1, 1, ...]`` of all sites, as ``Person`` takes them.
+
+        Raises:
+            ValueError: there was no round yet; see :func:`mirror_ppl.inference.prior.draw_prior`.
+        """
+        if not self.rounds:
+            raise ValueError("there was no round yet; what is known is the prior")
+        began = monotonic()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed * 1_000_003 + self.rounds)
+            found = self._weighted()
+            drawn = found.sample(number, self._sightings.grid)
+        self.pareto_k = found.pareto_k
+        self.seconds = self.seconds[0], monotonic() - began
+        return {name: drawn[name] for name in sample_sites(self.human, 1)}
+
+    def _weighted(self) -> Weighted:
+        if self.network is None:
+            return sample_exactly(self.human, self._sightings.table(), ImportanceOptions())
+        return sample_amortized(self.human, self.network, self._sightings, ENOUGH)
