@@ -24,7 +24,7 @@ from mirror_ppl.inference.views import (
 )
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
-from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewedActions
+from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
 from mirror_ppl.models.views import (
     KIND_PROBABILITIES,
     TOLD_PROBABILITY,
@@ -260,23 +260,48 @@ def test_padding_has_no_influence(self_model, recordings):
         torch.testing.assert_close(together[person], alone, rtol=1e-4, atol=1e-4)
 
 
-def test_viewed_actions_by_hand():
+def test_recorded_actions_by_hand():
     likelihood = torch.tensor([[-1.0, -2.0, -3.0], [-4.0, -5.0, -6.0]]).requires_grad_()
-    view = torch.tensor([[[0, 2], [1, NO_VIEW]], [[1, 1], [NO_VIEW, 0]]])  # [E, P, B]
-    real = torch.tensor([[True, True], [True, False]])
-    actions = ViewedActions(likelihood, view, real)
-    found = actions.log_prob(torch.zeros(2, 2, 15))
-    expected = [[[-1.0, -3.0], [-5.0, 0.0]], [[-2.0, -2.0], [IMPOSSIBLE, 0.0]]]
+    place = torch.tensor([[[0], [1]], [[2], [NO_VIEW]]])  # [E, P, 1]
+    actions = RecordedActions(likelihood, place, torch.Size((4, 15)))
+    found = actions.log_prob(torch.zeros(2, 2, 1, 4, 15))
+    expected = [[[-1.0], [-5.0]], [[-3.0], [IMPOSSIBLE]]]
     assert found.tolist() == expected
-    assert actions.batch_shape == (2, 2, 2)
+    assert actions.batch_shape == (2, 2, 1) and actions.event_shape == (4, 15)
     found.sum().backward()
-    assert likelihood.grad.tolist() == [[1.0, 2.0, 1.0], [0.0, 1.0, 0.0]]
-    # Enumerated likelihoods [E', 1, P, V] broadcast against enumerated views.
+    assert likelihood.grad.tolist() == [[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
+    # Enumerated likelihoods [E', 1, P, C] broadcast against enumerated places.
     many = torch.stack([likelihood.detach(), 10 * likelihood.detach()])[:, None]
-    both = ViewedActions(many, view, real).log_prob(torch.zeros(2, 2, 15))
-    assert both.shape == (2, 2, 2, 2)
+    both = RecordedActions(many, place, torch.Size((4, 15))).log_prob(torch.zeros(4, 15))
+    assert both.shape == (2, 2, 2, 1)
     assert both[0].tolist() == expected
-    assert both[1, 0].tolist() == [[-10.0, -30.0], [-50.0, 0.0]]
+    assert both[1, 0].tolist() == [[-10.0], [-50.0]]
+
+
+def test_scores_are_those_of_the_possible_combinations(self_model, recordings):
+    human, rounds = Few(self_model), ragged(recordings, LENGTHS)
+    whole = build_view_table(human, rounds)
+    alive = (torch.arange(14) + torch.arange(3)[:, None]) % 3 == 0
+    table = restricted(whole, alive)
+    # Of somebody without rounds nothing is given up.
+    assert torch.equal(table.possible, alive | ~table.real.any(-1)[:, None])
+    policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
+    log_probabilities = human.act(policy, table.belief, table.values)
+    expected = combination_scores(table, log_probabilities)
+    found = table.scores(table.log_likelihoods(log_probabilities))
+    for combination in range(14):
+        implants = {
+            "sight_front_own": torch.full((3, 1), combination // 2),
+            "assumes_clear": torch.full((3, 1), combination % 2),
+        }
+        place = table.place_of(implants)[:, 0]
+        for person in range(3):
+            if table.possible[person, combination]:
+                torch.testing.assert_close(
+                    found[person, place[person]], expected[person, combination]
+                )
+            else:
+                assert place[person] == NO_VIEW
 
 
 # --- giving combinations up -------------------------------------------------------------------

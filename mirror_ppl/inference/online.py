@@ -14,9 +14,8 @@ from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models.human import HumanModel
 
-
 ENOUGH = 110.0
-"""Effective draws at which a guide proposes no more: as many as an answer needs that cannot wait."""
+"""Effective draws at which a guide proposes no more: enough for an answer that cannot wait."""
 
 
 class OnlinePosterior:

@@ -36,7 +36,7 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import Rounds, SelfModel
-from mirror_ppl.models.view_table import ViewedActions, ViewTable
+from mirror_ppl.models.view_table import RecordedActions, ViewTable
 
 Implants = Mapping[str, Tensor]
 
@@ -274,12 +274,11 @@ class HumanModel(nn.Module):
         with pyro.plate("person", table.people, dim=-2):
             implants = self.prior()
             log_probabilities = self.act(implants, table.belief, table.values)
-            view = table.view_of(implants)
-            with pyro.plate("round", table.rounds, dim=-1):
-                pyro.sample(
-                    "actions",
-                    ViewedActions(table.log_likelihoods(log_probabilities), view, table.real),
-                    obs=table.recorded,
-                )
+            scores = table.scores(table.log_likelihoods(log_probabilities))
+            pyro.sample(
+                "actions",
+                RecordedActions(scores, table.place_of(implants), table.recorded.shape[1:]),
+                obs=table.recorded[:, None],
+            )
         if world is not None:
             self.self_model.model(world)

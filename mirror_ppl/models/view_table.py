@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -107,6 +108,36 @@ class ViewTable:
         begin = (people * self.rounds + rounds) * self.index.shape[-1]
         return self.index.reshape(-1)[begin + self.combination(implants)]
 
+    @cached_property
+    def possible(self) -> Tensor:
+        """Which combinations were never given up, ``[P, M]``."""
+        return ((self.index != NO_VIEW) | ~self.real[..., None]).all(1)
+
+    @cached_property
+    def _places(self) -> Tensor:
+        """Number of each combination among the possible ones of a person, ``[P, M]``."""
+        return torch.where(self.possible, self.possible.cumsum(1) - 1, NO_VIEW)
+
+    @cached_property
+    def _views(self) -> Tensor:
+        """Views of the C possible combinations in each round, ``[P, B, C]``; 0 in padding."""
+        number = int(self.possible.sum(1).max())
+        first = self.possible.long().argsort(dim=1, descending=True, stable=True)[:, :number]
+        views = self.index.gather(-1, first[:, None].expand(-1, self.rounds, -1))
+        return views.clamp(min=0)
+
+    def place_of(self, implants: Implants) -> Tensor:
+        """Which of the possible combinations implants ``[..., P, 1]`` are, ``[..., P, 1]``."""
+        people = torch.arange(self.people, device=self.index.device)[:, None]
+        begin = people * self.index.shape[-1]
+        return self._places.reshape(-1)[begin + self.combination(implants)]
+
+    def scores(self, likelihoods: Tensor) -> Tensor:
+        """Log-likelihood ``[..., P, C]`` of the possible combinations, of views ``[..., P, V]``."""
+        views = self._views.flatten(1).expand(*likelihoods.shape[:-1], -1)
+        found = likelihoods.gather(-1, views).unflatten(-1, self._views.shape[1:])
+        return torch.where(self.real[..., None], found, 0.0).sum(-2)
+
     def combination(self, implants: Implants) -> Tensor:
         """Number of the combination that implants ``[...]`` are, row-major over ``sizes``."""
         return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
@@ -120,36 +151,34 @@ class ViewTable:
         return log_likelihoods(log_probabilities, self.acted, self.moments)
 
 
-class ViewedActions(TorchDistribution):
-    """Actions of whole rounds, given the log-likelihood of each view and which view was had.
+class RecordedActions(TorchDistribution):
+    """Actions ``[B, T]`` of all rounds of a person, given the log-likelihood of what they may see.
 
     Args:
-        log_likelihoods: of the recorded actions ``[..., P, V]``.
-        view: index ``[..., P, B]`` into V.
-        real: which rounds are real ``[P, B]``; the others have probability one.
+        log_likelihoods: of the recorded actions under each possible combination ``[..., P, C]``.
+        place: which of these a person is ``[..., P, 1]``; ``NO_VIEW`` if none.
+        shape: (B, T).
     """
 
     arg_constraints = {}  # noqa: RUF012 # pyright: ignore[reportAssignmentType]
     support = constraints.independent(  # pyright: ignore[reportAssignmentType]
-        constraints.nonnegative_integer, 1
+        constraints.nonnegative_integer, 2
     )
 
-    def __init__(self, log_likelihoods: Tensor, view: Tensor, real: Tensor) -> None:
+    def __init__(self, log_likelihoods: Tensor, place: Tensor, shape: torch.Size) -> None:
         self.log_likelihoods = log_likelihoods
-        self.view = view
-        self.real = real
-        batch = torch.broadcast_shapes((*log_likelihoods.shape[:-1], 1), view.shape, real.shape)
-        super().__init__(batch, torch.Size((1,)), validate_args=False)
+        self.place = place
+        batch = torch.broadcast_shapes((*log_likelihoods.shape[:-1], 1), place.shape)
+        super().__init__(batch, shape, validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Looked up: ``value`` is what the likelihoods were computed for."""
         del value
-        views = self.log_likelihoods.shape[-1]
+        number = self.log_likelihoods.shape[-1]
         # Where each leading index of the likelihoods begins in the flat table; gathering from a
         # flat table keeps the gradient as small as the table.
-        begin = torch.arange(self.log_likelihoods[..., 0].numel(), device=self.view.device).reshape(
-            *self.log_likelihoods.shape[:-1], 1
-        )
-        found = self.log_likelihoods.reshape(-1)[begin * views + self.view.clamp(min=0)]
-        found = torch.where(self.view == NO_VIEW, IMPOSSIBLE, found)
-        return torch.where(self.real, found, 0.0)
+        begin = torch.arange(
+            self.log_likelihoods[..., 0].numel(), device=self.place.device
+        ).reshape(*self.log_likelihoods.shape[:-1], 1)
+        found = self.log_likelihoods.reshape(-1)[begin * number + self.place.clamp(min=0)]
+        return torch.where(self.place == NO_VIEW, IMPOSSIBLE, found)
