@@ -17,7 +17,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.inference.exact import draw_combinations, log_joint, log_prior, marginals
 from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import (
@@ -472,3 +472,36 @@ def test_people_without_discrete_implants_can_be_fitted(self_model, recordings):
 def test_impossible_options_are_refused(name, value, message):
     with pytest.raises(ValueError, match=message):
         FitOptions(**{name: value})
+
+
+def test_people_are_fitted_in_batches_that_do_not_depend_on_each_other(
+    self_model, tmp_path, monkeypatch
+):
+    from mirror_ppl.inference import guides
+
+    human = HumanModel(self_model)
+    recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0])
+    recordings = recordings.select_people([0, 1, 2])
+    options = InferenceOptions("svi", 6, FitOptions(steps=4, checkpoint_every=2))
+    monkeypatch.setattr(guides, "PEOPLE_AT_ONCE", 2)
+    found = infer(human, recordings, options, 3)
+    first = infer(human, recordings.select_people([0, 1]), options, 3)
+    last = infer(human, recordings.select_people([2]), options, 3 + 2)
+    for name, value in found.draws.items():
+        assert torch.equal(value, torch.cat([first.draws[name], last.draws[name]], 1))
+    assert found.losses == pytest.approx(
+        [one + other for one, other in zip(first.losses, last.losses, strict=True)]
+    )
+    # Stopped in the second batch and continued, it is the same, and leaves one file.
+    path = tmp_path / "some.checkpoint"
+
+    def stop(name, done, total, message):
+        if name == "fit" and done == 3 and (tmp_path / "some.checkpoint.2").exists():
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        infer(human, recordings, options, 3, report=stop, checkpoint=(path, "run"))
+    assert len(list(tmp_path.iterdir())) == 2
+    again = infer(human, recordings, options, 3, checkpoint=(path, "run"))
+    assert all(torch.equal(again.draws[name], value) for name, value in found.draws.items())
+    assert list(tmp_path.iterdir()) == [path]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import prod
+from typing import Any
 
 import pyro
 import torch
 from pyro import poutine
-from pyro.distributions import TorchDistribution
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
@@ -100,7 +100,7 @@ def log_priors(
     return total.expand(size, number, people, 1).squeeze(-1).permute(1, 2, 0)
 
 
-def _log_prior(fn: TorchDistribution, value: Tensor) -> Tensor:
+def _log_prior(fn: Any, value: Tensor) -> Tensor:
     """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 where all is alike."""
     if len(fn.batch_shape) > BATCH:  # depends on other discrete sites
         return fn.log_prob(value[:, None, None, None])

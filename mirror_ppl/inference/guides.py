@@ -39,6 +39,8 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import fingerprint
 
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
+PEOPLE_AT_ONCE = 50
+"""People whose views are in memory together; they do not depend on each other."""
 GUIDES = ("amortized", "exact", "svi", "nuts")
 OWN_DRAWS = {"amortized": 4000, "exact": 4000, "svi": 1000, "nuts": 1000}
 """Draws of each person under the human model's own prior from which pooling chooses."""
@@ -152,18 +154,43 @@ def _each(
         elif network is None:
             raise ValueError("the amortized guide needs its network")
         return _by_importance(human, demonstrations, options, seed, network, report, checkpoint)
-    people = demonstrations.num_people
-    table = build_view_table(
-        human,
-        demonstrations,
-        screening=options.screening,
-        report=lambda done: report("views", done, people, "people"),
-    )
-    if options.guide == "nuts":
-        return Inferred(sample_nuts(human, table, options.draws, seed, report))
-    svi = replace(options.svi, draws=options.draws)
-    posterior = fit_implants(human, table, svi, seed, report, checkpoint)
-    return Inferred(posterior.draws, losses=posterior.losses)
+    return _in_batches(human, demonstrations, options, seed, report, checkpoint)
+
+
+def _in_batches(
+    human: HumanModel,
+    demonstrations: Demonstrations,
+    options: InferenceOptions,
+    seed: int,
+    report: Report,
+    checkpoint: tuple[Path, str] | None,
+) -> Inferred:
+    """``svi`` and ``nuts``: of so many people at once that their views fit into memory."""
+    people, found, files = demonstrations.num_people, [], []
+    for begin in range(0, people, PEOPLE_AT_ONCE):
+        some = range(begin, min(begin + PEOPLE_AT_ONCE, people))
+        table = build_view_table(
+            human,
+            demonstrations.select_people(some) if len(some) < people else demonstrations,
+            screening=options.screening,
+            report=lambda done, begin=begin: report("views", begin + done, people, "people"),
+        )
+        if options.guide == "nuts":
+            drawn = sample_nuts(human, table, options.draws, seed + begin, report)
+            found.append(Inferred(drawn))
+            continue
+        own = checkpoint
+        if checkpoint is not None and begin:
+            own = checkpoint[0].with_name(f"{checkpoint[0].name}.{begin}"), checkpoint[1]
+            files.append(own[0])
+        svi = replace(options.svi, draws=options.draws)
+        posterior = fit_implants(human, table, svi, seed + begin, report, own)
+        found.append(Inferred(posterior.draws, losses=posterior.losses))
+    for file in files:
+        file.unlink(missing_ok=True)
+    draws = {name: torch.cat([one.draws[name] for one in found], 1) for name in found[0].draws}
+    losses = tuple(sum(step) for step in zip(*(one.losses for one in found), strict=True))
+    return Inferred(draws, losses=losses)
 
 
 def _by_importance(

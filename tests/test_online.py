@@ -1,0 +1,71 @@
+"""A posterior that is kept up to date: the same as one of all rounds at once."""
+
+import math
+
+import pytest
+import torch
+
+from mirror_ppl.communication import Person
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.inference.guide_file import load_guide, shipped_guide
+from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.online import OnlinePosterior
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.implants import sight_sites
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+
+@pytest.fixture(scope="module")
+def human():
+    return HumanModel(load_self_model(shipped_weights("driving"))[0])
+
+
+@pytest.fixture(scope="module")
+def network(human):
+    return load_guide(shipped_guide("driving"), human)[0]
+
+
+@pytest.fixture(scope="module")
+def rounds():
+    recordings = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    return recordings.select_people([0]).select_rounds(range(4))
+
+
+@pytest.mark.parametrize("guide", ["amortized", "exact"])
+def test_round_by_round_is_the_same_as_all_at_once(human, network, rounds, guide):
+    given = network if guide == "amortized" else None
+    little, whole = OnlinePosterior(human, given), OnlinePosterior(human, given)
+    for number in range(4):
+        little.add(rounds.select_rounds([number]))
+    whole.add(rounds)
+    one, other = little.draws(40), whole.draws(40)
+    assert all(torch.equal(one[name], other[name]) for name in other)
+    assert little.rounds == whole.rounds == 4
+    assert 0 < little.pareto_k < 0.7 and min(little.seconds) > 0
+    assert Person(human, one).number == 40
+
+
+def test_it_agrees_with_the_fit(human, network, rounds):
+    """Effective draws are 110 and 400 or more, so a probability's s.d. is at most .05 and .03."""
+    online = OnlinePosterior(human, network)
+    online.add(rounds)
+    draws = online.draws(1000)
+    fitted = infer(human, rounds, InferenceOptions(draws=1000), 1).draws
+    for site in sight_sites(human.domain):
+        for value in range(7):
+            share = [float((own[site] == value).float().mean()) for own in (draws, fitted)]
+            assert abs(share[0] - share[1]) < 4 * math.hypot(0.05, 0.03)
+
+
+def test_what_is_known_before_the_first_round_is_the_prior(human, network, rounds):
+    online = OnlinePosterior(human, network)
+    with pytest.raises(ValueError, match="no round yet; what is known is the prior"):
+        online.draws()
+    online.add(rounds.select_rounds([]))
+    assert online.rounds == 0
+
+
+def test_people_are_not_mixed(human, network):
+    two = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([0, 1])
+    with pytest.raises(ValueError, match="of 2 people, not one"):
+        OnlinePosterior(human, network).add(two)
