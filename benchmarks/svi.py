@@ -13,13 +13,12 @@ from time import perf_counter
 
 import pyro
 import torch
-from pyro.infer import TraceEnum_ELBO, config_enumerate
 from torch import Tensor
 from torch.distributions import biject_to
 
 from mirror_ppl.inference.combinations import grid_of, log_priors, perceived_sites
 from mirror_ppl.inference.prior import sample_sites
-from mirror_ppl.inference.svi import PLATES, continuous_guide
+from mirror_ppl.inference.svi import continuous_guide, negative_elbo
 from mirror_ppl.inference.views import Screening, build_view_table
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import residual
@@ -83,13 +82,14 @@ def main() -> None:
     table = build_view_table(human, recordings, screening=Screening())
     pyro.set_rng_seed(0)
     guide = continuous_guide(human, table)
-    elbo = TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)(
-        config_enumerate(human.model, "parallel"), guide
-    )
+    elbo = negative_elbo(human, table, guide)
     by_hand = ByHand(human, table)
     print(f"the same loss: {difference(by_hand, guide, elbo, table):.1e} nats apart")
     steps = {"pyro": (elbo, (table,)), "by hand": (by_hand, None)}
-    optimizers = {name: torch.optim.Adam(loss.parameters()) for name, (loss, _) in steps.items()}
+    optimizers = {
+        "pyro": torch.optim.Adam(guide.parameters()),
+        "by hand": torch.optim.Adam(by_hand.parameters()),
+    }
     times: dict[str, list[float]] = {name: [] for name in steps}
     for _ in range(options.repeats):
         for name, (loss, given) in steps.items():

@@ -93,7 +93,8 @@ for ax, site in zip(axes, sight_sites(human.domain), strict=False):
     for shift, (name, found) in zip((-0.27, 0, 0.27), posteriors.items(), strict=True):
         share = torch.bincount(found.draws[site].flatten(), minlength=len(bins)) / 400
         ax.bar(np.arange(len(bins)) + shift, share, 0.27, label=name)
-    ax.set_title(site.replace("_", " "), fontsize=11)
+    truth = one.truth[site][0]
+    ax.set_title(f"{site.replace('_', ' ')} (truth {truth:g})", fontsize=10)
     ax.set_xticks(range(len(bins)), [f"{value:g}" for value in bins])
     ax.set_ylim(0, 1)
 for name, found in posteriors.items():
@@ -146,6 +147,7 @@ left.set_ylim(0, 1.03)
 right.set_ylim(0, None)
 for ax in (left, right):
     ax.set_xlabel("rounds")
+    ax.set_xticks(range(0, rounds + 1, 5))
     ax.legend(frameon=False)
 figure
 

@@ -28,9 +28,10 @@ from mirror_ppl.inference.svi import (
     continuous_guide,
     draw_implants,
     fit_implants,
+    negative_elbo,
     predict_actions,
 )
-from mirror_ppl.inference.views import build_view_table, combination_scores
+from mirror_ppl.inference.views import build_view_table, combination_scores, restricted
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -505,3 +506,26 @@ def test_people_are_fitted_in_batches_that_do_not_depend_on_each_other(
     again = infer(human, recordings, options, 3, checkpoint=(path, "run"))
     assert all(torch.equal(again.draws[name], value) for name, value in found.draws.items())
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_marginal_elbo_is_that_of_enumeration(self_model):
+    """Loss and gradients, before and after giving up combinations."""
+    human = HumanModel(self_model)
+    recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([0, 4])
+    table = build_view_table(human, recordings.select_rounds([0, 1]))
+    alive = torch.zeros(2, 9604, dtype=torch.bool)
+    alive[0, ::97] = alive[1, ::53] = True
+    for some in (table, restricted(table, alive)):
+        guide = continuous_guide(human, some)
+        enumerated = TraceEnum_ELBO(max_plate_nesting=2, strict_enumeration_warning=False)(
+            config_enumerate(human.model, "parallel"), guide
+        )
+        found = []
+        for loss in (negative_elbo(human, some, guide), enumerated):
+            guide.zero_grad()
+            torch.manual_seed(3)
+            value = loss(some)
+            value.backward()
+            found.append([value.detach(), *(p.grad.clone() for p in guide.parameters())])
+        for one, other in zip(*found, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)

@@ -25,6 +25,7 @@ from torch.distributions import biject_to
 from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.combinations import discrete_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
+from mirror_ppl.inference.marginal_elbo import PLATES, marginal_elbo
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import combination_scores, restricted
 from mirror_ppl.models.human import HumanModel
@@ -41,8 +42,6 @@ def silent(name: str, done: int, total: int, message: str) -> None:
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100
-PLATES = 2
-"""People and their rounds; whatever is drawn or enumerated goes to the left of them."""
 
 
 @dataclass(frozen=True)
@@ -157,9 +156,7 @@ def _optimize(
     checkpoint: tuple[Path, str] | None,
 ) -> tuple[ViewTable, list[float]]:
     """Optimize the guide; returns the table without what was given up, and the losses."""
-    elbo = TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)(
-        config_enumerate(human.model, "parallel"), guide
-    )
+    elbo = negative_elbo(human, table, guide)
     optimizer = torch.optim.Adam(guide.parameters(), options.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
         optimizer, options.steps, options.learning_rate / 20
@@ -184,6 +181,17 @@ def _optimize(
             alive = (table.index != NO_VIEW).any(1)
             _save(*checkpoint, guide, optimizer, schedule, losses, alive)
     return table, losses
+
+
+def negative_elbo(
+    human: HumanModel, table: ViewTable, guide: AutoGuide
+) -> Callable[[ViewTable], Tensor]:
+    """The loss of fitting: discrete sites are summed out, whatever samples them."""
+    if set(discrete_sites(human)) == set(table.sites) == _enumerated(human, table):
+        return marginal_elbo(human, table, guide)
+    return TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)(
+        config_enumerate(human.model, "parallel"), guide
+    )
 
 
 @torch.no_grad()

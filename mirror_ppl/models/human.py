@@ -253,7 +253,8 @@ class HumanModel(nn.Module):
 
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
-            belief: ``[..., P, V, T, Z]``, of each view of each person's rounds, in time order.
+            belief: ``[..., P, V, T, Z]``, of each view of each person's rounds, in time order; of
+                models that are ``stepwise``, of single moments, T = 1.
             values: the self-model's action values at the belief, ``[..., P, V, T, A]``.
         """
         logits = implants["consistency"][..., None, None] * values

@@ -119,12 +119,22 @@ class ViewTable:
         return torch.where(self.possible, self.possible.cumsum(1) - 1, NO_VIEW)
 
     @cached_property
+    def possible_numbers(self) -> Tensor:
+        """Numbers of the possible combinations of each person, ``[C, P]``, padded with others."""
+        number = int(self.possible.sum(1).max())
+        first = self.possible.long().argsort(dim=1, descending=True, stable=True)
+        return first[:, :number].T
+
+    @cached_property
+    def places_used(self) -> Tensor:
+        """Which of ``possible_numbers`` are no padding, ``[C, P]``."""
+        return self.possible.gather(1, self.possible_numbers.T).T
+
+    @cached_property
     def _views(self) -> Tensor:
         """Views of the C possible combinations in each round, ``[P, B, C]``; 0 in padding."""
-        number = int(self.possible.sum(1).max())
-        first = self.possible.long().argsort(dim=1, descending=True, stable=True)[:, :number]
-        views = self.index.gather(-1, first[:, None].expand(-1, self.rounds, -1))
-        return views.clamp(min=0)
+        numbers = self.possible_numbers.T[:, None].expand(-1, self.rounds, -1)
+        return self.index.gather(-1, numbers).clamp(min=0)
 
     def place_of(self, implants: Implants) -> Tensor:
         """Which of the possible combinations implants ``[..., P, 1]`` are, ``[..., P, 1]``."""
