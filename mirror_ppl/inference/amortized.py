@@ -174,6 +174,7 @@ def sample_amortized(
     proposals: int = 64,
     stages: int = 16,
     prune_margin: float = 12.0,
+    checked: bool = False,
 ) -> Weighted:
     """Weighted draws of one person: the guide's, and the ways that evidence is about.
 
@@ -185,9 +186,10 @@ def sample_amortized(
         proposals: draws from the guide of a stage.
         stages: the largest number of stages.
         prune_margin: see :class:`ImportanceOptions`.
+        checked: see :class:`Sampler`.
     """
     evidence = evidence_of(sightings)
-    sampler = Sampler(human, evidence.table)
+    sampler = Sampler(human, evidence.table, checked)
     sampler.take(evidence.ways, evidence.joint)
     sampler.prune(prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from time import monotonic
 
 import torch
@@ -88,4 +89,6 @@ class OnlinePosterior:
     def _weighted(self) -> Weighted:
         if self.network is None:
             return sample_exactly(self.human, self._sightings.table(), ImportanceOptions())
-        return sample_amortized(self.human, self.network, self._sightings, ENOUGH)
+        # What the first asking has checked need not be checked again.
+        checked = not math.isnan(self.pareto_k)
+        return sample_amortized(self.human, self.network, self._sightings, ENOUGH, checked=checked)
