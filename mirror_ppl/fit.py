@@ -12,6 +12,8 @@ from mirror_ppl.console import Stages, run, usable_device
 from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.fit"
+FEW = 20
+"""Effective draws below which a pooled posterior is coarse."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
@@ -200,6 +202,10 @@ def _show(summary: dict[str, Any], unit: str) -> None:
         test = person["test"] or {}
         scores = [_number(test.get(name), 3) for name in ("nll", "floor", "accuracy")]
         table.add_row(f"{person['id']}", *cells, *scores)
+    if "newcomer" in summary:
+        table.add_section()
+        cells = [_cell(summary["newcomer"][name] | {"truth": None}) for name in names]
+        table.add_row("newcomer", *cells, "-", "-", "-")
     console = Console()
     if not console.is_terminal:
         console = Console(width=40 + 18 * len(names))
@@ -212,6 +218,13 @@ def _show(summary: dict[str, Any], unit: str) -> None:
             f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
             f"{HIGH_PARETO_K}): --guide svi may do better"
         )
+    few = [person["id"] for person in people if person.get("effective_draws", FEW) < FEW]
+    if few:
+        print(
+            f"In the population, fewer than {FEW} draws count of {', '.join(few)}: it is at odds "
+            "with what they did, or far from the prior; their posterior is coarse"
+        )
+    _show_open([person["identifiability"] for person in people if "identifiability" in person])
     tested = [person["test"] for person in people if person["test"]]
     if tested:
         nll = sum(test["nll"] for test in tested) / len(tested)
@@ -220,6 +233,28 @@ def _show(summary: dict[str, Any], unit: str) -> None:
         if floors:
             line += f", {nll - sum(floors) / len(floors):.3f} above the people's own entropy"
         print(line)
+
+
+def _show_open(people: list[dict[str, Any]]) -> None:
+    """What is open about sight, and which rounds would tell most."""
+    if not people:
+        return
+    each = [
+        (person["open"]["together"], person["hangs_on_policy"]["together"]) for person in people
+    ]
+    entropy, hanging = (sum(values) / len(people) for values in zip(*each, strict=True))
+    line = (
+        f"Open about what they see: {entropy:.2f} nats on average, of which {hanging:.2f} hang on "
+    )
+    line += "how they decide"
+    expected = {
+        name: sum(person["scenarios"][name]["expected"] for person in people) / len(people)
+        for name in people[0]["scenarios"]
+    }
+    if expected:
+        best = max(expected, key=lambda name: expected[name])
+        line += f'; a round more of "{best}" would tell most, {expected[best]:.2f}'
+    print(line)
 
 
 def _cell(implant: dict[str, float | None]) -> str:

@@ -79,6 +79,13 @@ def test_a_pooled_fit_holds_its_population_and_a_newcomer(folder, toy):
     assert summary["options"]["pooling"] == "partial"
     effective = [person["effective_draws"] for person in summary["people"]]
     assert all(1 <= value <= 4000 for value in effective)
+    told = summary["newcomer"]
+    assert told.keys() == {"reach", "in_sight", "otherwise"}
+    assert told["in_sight"]["q05"] <= told["in_sight"]["median"] <= told["in_sight"]["q95"]
+    values = newcomer["otherwise"].values.ravel()
+    assert told["otherwise"]["q95"] == pytest.approx(
+        float(np.quantile(values, 0.95, method="inverted_cdf"))
+    )
 
 
 def test_the_population_comes_back_as_it_was(folder, toy):

@@ -20,7 +20,7 @@ from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.pooling import Pooling, Population
 from mirror_ppl.inference.prior import Draws, draw_prior
-from mirror_ppl.inference.summary import summarize
+from mirror_ppl.inference.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.svi import Report, predict_actions, silent
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models.human import HumanModel
@@ -185,8 +185,10 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     } | {f"recorded_{name}": value for name, value in train.provenance.items()}
     generator = torch.Generator().manual_seed(seed)
     data = to_inference_data(train, test, drawn, prior, log_probabilities, attributes, generator)
+    newcomer = {}
     if posterior.population is not None:
-        add_population(data, Pooling(human), posterior.population, attributes, seed)
+        newcomer = add_population(data, Pooling(human), posterior.population, attributes, seed)
+        newcomer = {"newcomer": summarize_newcomer(newcomer)}
     found = summarize(in_units(domain, drawn), train, test, log_probabilities)
     if posterior.pareto_k is not None:
         for person, value in zip(found, posterior.pareto_k.tolist(), strict=True):
@@ -194,7 +196,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     if posterior.effective is not None:
         for person, value in zip(found, posterior.effective.tolist(), strict=True):
             person["effective_draws"] = round(value, 1)
-    summary = attributes | {"options": asdict(options), "people": found}
+    summary = attributes | {"options": asdict(options), "people": found} | newcomer
     return Fit(learned, posterior, data, summary)
 
 

@@ -31,7 +31,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.combinations import log_priors, perceived_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, combination_values, log_joints
 from mirror_ppl.inference.pooling import Population
-from mirror_ppl.inference.sightings import Sightings
+from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.inference.views import build_view_table, rounds_of
@@ -41,7 +41,9 @@ from mirror_ppl.models.view_table import combination_number
 POLICIES = 48
 """Posterior draws of how a person decides."""
 COMBINATIONS = 128
-"""Combinations of what they may see, at most."""
+"""Combinations of what they may see between which rounds are to tell, at most."""
+FEW = 64
+"""Combinations among the draws up to which no others are looked at."""
 
 
 @dataclass(frozen=True)
@@ -117,14 +119,17 @@ def identify(
     held, people = next(iter(draws.values())).shape[:2]
     chosen = torch.linspace(0, held - 1, min(held, POLICIES)).round().long()
     found: list[tuple[Tensor, ...]] = []
+    mixer = torch.Generator().manual_seed(seed)
     for person in range(people):
         report("identify", person, people, "people")
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
         drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes)
-        candidates, counts = drawn.unique(return_counts=True)
-        candidates = candidates[counts.argsort(descending=True)[:COMBINATIONS]].sort().values
-        one = train.select_people([person])
-        table = build_view_table(human, one, [candidates])
+        candidates, one = drawn.unique(), train.select_people([person])
+        if len(candidates) <= FEW:
+            table = build_view_table(human, one, [candidates])
+        else:  # draws are too few to tell how many there are
+            table = build_view_table(human, one, screening=Screening())
+            candidates = table.possible[0].nonzero().squeeze(-1)
         if not acts_on_beliefs(human, table):
             return None
         policy = {name: value[chosen] for name, value in own.items() if name not in sizes}
@@ -133,13 +138,20 @@ def identify(
         if population is not None:
             joint = joint + _instead_of_prior(human, grid, policy, population)
         weights = torch.log_softmax(joint, -1)  # [S, C]
+        opened = _open(weights, grid)
+        if len(candidates) > COMBINATIONS:
+            mixed = drawn.cpu()[torch.randperm(held, generator=mixer)[:COMBINATIONS]]
+            some = torch.isin(candidates, mixed.to(candidates))
+            weights = torch.log_softmax(joint[:, some], -1)
+            candidates = candidates[some]
+            grid = {site: value[some] for site, value in grid.items()}
         told = (weights.new_zeros(0),) * 2
         if rounds:
             generator = torch.Generator(weights.device).manual_seed(seed)
             told = _information(
                 human, weights, candidates, grid, policy, train.setting, rounds, generator
             )
-        found.append((*_open(weights, grid), *told))
+        found.append((*opened, *told))
     report("identify", people, people, "people")
     return Identifiability(tuple(sizes), *(torch.stack(part) for part in zip(*found, strict=True)))
 

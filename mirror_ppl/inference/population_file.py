@@ -29,7 +29,7 @@ def add_population(
     population: Population,
     attributes: Mapping[str, str | int | float],
     seed: int,
-) -> None:
+) -> dict[str, torch.Tensor]:
     """Add the groups ``population`` and ``newcomer`` to those of a fit.
 
     Args:
@@ -38,6 +38,9 @@ def add_population(
         population: S draws.
         attributes: what the file says of itself.
         seed: of the newcomer.
+
+    Returns:
+        Draws ``[S, ...]`` of the newcomer, in the domain's units.
     """
     domain = pooling.human.domain
     variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
@@ -52,11 +55,11 @@ def add_population(
         for name, value in part.items():
             variables[f"{name}_{kind}"] = (SAMPLE, value.cpu().numpy()[None])
     new = in_units(domain, pooling.newcomers(population, 1, seed))
+    new = {name: value[:, 0].cpu() for name, value in new.items()}
     newcomer = {}
     for name, value in new.items():
-        own = value[:, 0].cpu().numpy()[None]
-        axes = tuple(f"{name}_{axis}" for axis in range(own.ndim - len(SAMPLE)))
-        newcomer[name] = ((*SAMPLE, *axes), own)
+        axes = tuple(f"{name}_{axis}" for axis in range(value.dim() - 1))
+        newcomer[name] = ((*SAMPLE, *axes), value.numpy()[None])
     own = {key: str(value) for key, value in attributes.items()}
     data.add_groups(
         {
@@ -64,6 +67,7 @@ def add_population(
             "newcomer": xr.Dataset(newcomer, attrs=own),
         }
     )
+    return new
 
 
 def load_population(path: Path, pooling: Pooling) -> Population:

@@ -50,6 +50,11 @@ def summarize(
     ]
 
 
+def summarize_newcomer(draws: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
+    """Quantiles of each implant of somebody new that is one number, of draws ``[S, ...]``."""
+    return {site: _quantiles(value) for site, value in draws.items() if value.dim() == 1}
+
+
 def predictive(log_probabilities: Tensor) -> Tensor:
     """Log posterior predictive ``[P, B, T, A]`` of draws ``[S, P, B, T, A]``."""
     return torch.logsumexp(log_probabilities, 0) - np.log(len(log_probabilities))
