@@ -17,8 +17,8 @@ FEW = 20
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
-InferenceData), summary.json and sight.png. A fit that is stopped goes on from its checkpoint when
-the same command is given again."""
+InferenceData), summary.json, sight.png and open.png. A fit that is stopped goes on from its
+checkpoint when the same command is given again."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,8 @@ def main(options: Options) -> None:
     network = network_for(options.guide, options.guide_file, human)
     population = None
     if options.prior_from is not None:
-        population = load_population(options.prior_from, Pooling(human))
+        pooling = Pooling(human)
+        population = load_population(options.prior_from, pooling, demonstrations.setting)
     # Faults of the recordings come to light before anything is written.
     check_world(demonstrations)
     split_rounds(demonstrations, options.train_rounds)
@@ -145,17 +146,21 @@ def main(options: Options) -> None:
         for number, person in enumerate(result.summary["people"]):
             person["identifiability"] = found.of(number, scenarios)
         add_identifiability(result.data, found, result.data["posterior"].attrs)
+    if options.prior_from is not None:
+        result.summary["prior_from"] = str(options.prior_from)
     summary = result.summary | {"seconds": round(monotonic() - began, 1)}
     text = json.dumps(summary, indent=1) + "\n"
     # Without it, results of a run that was killed here cannot be taken for those of an older one.
-    (folder / "summary.json").unlink(missing_ok=True)
+    for name in ("summary.json", "sight.png", "open.png"):
+        (folder / name).unlink(missing_ok=True)
     save_inference_data(result.data, folder / "posterior.nc")
     if has_sight(result.data):
         save_sight_picture(result.data, folder / "sight.png")
     if found is not None:
         plot_identifiability(result.data).save(folder / "open.png")
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
-    checkpoint.unlink(missing_ok=True)
+    for file in folder.glob("fit.checkpoint*"):
+        file.unlink()
     _show(summary, get_domain(demonstrations.domain).modalities[0].units[0])
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
@@ -216,7 +221,7 @@ def _show(summary: dict[str, Any], unit: str) -> None:
     if doubtful:
         print(
             f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
-            f"{HIGH_PARETO_K}): --guide svi may do better"
+            f"{HIGH_PARETO_K}): another --guide may do better"
         )
     few = [person["id"] for person in people if person.get("effective_draws", FEW) < FEW]
     if few:

@@ -129,7 +129,7 @@ def test_the_exact_posterior_by_hand(toy, recordings):
     first, second = torch.meshgrid(grid, grid, indexing="ij")
     sampler = Sampler(toy, table)
     policy = {"in_sight": first.reshape(-1, 1, 1), "otherwise": second.reshape(-1, 1, 1)}
-    joint = sampler._joint(policy).double()
+    joint = sampler._joint(policy, 3600).double()
     for site, (a, b) in RATES.items():
         joint = joint + dist.Beta(a, b).log_prob(policy[site].flatten())[:, None]
     weight = torch.softmax(joint.flatten(), 0).view(joint.shape)
@@ -212,9 +212,47 @@ def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
     torch.manual_seed(1)
     policy, joint = whole._policies[0], whole._joints[0]
     assert torch.equal(pruned._joints[0], joint[:, kept])
-    torch.testing.assert_close(pruned._joint(policy), joint[:, kept])
+    torch.testing.assert_close(pruned._joint(policy, len(joint)), joint[:, kept])
     behind = (joint.max() - joint).amin(0)
     assert torch.equal(kept, (behind <= 0.5).nonzero().squeeze(-1))
+
+
+@pytest.mark.parametrize("guide", ["exact", "svi"])
+def test_models_with_little_to_infer(toy, recordings, guide):
+    """Sight alone, and an implant that actions do not depend on."""
+    some, few = recordings.select_people([0]), FitOptions(steps=2)
+
+    class OnlySight(ToyHuman):
+        def act(self, implants, belief, values):
+            rate = torch.where(belief[..., 0] > 0, 0.8, 0.1)
+            return torch.stack([torch.log1p(-rate), torch.log(rate)], -1)
+
+    class OnlyReach(OnlySight):
+        def prior(self):
+            like = next(self.self_model.parameters())
+            bins = like.new_ones(7) / 7
+            return {"reach": pyro.sample("reach", dist.Categorical(bins))}
+
+    human = OnlySight(toy.self_model)
+    draws = infer(human, some, InferenceOptions(guide, 40, few), 0).draws
+    assert draws["reach"].shape == draws["in_sight"].shape == (40, 1, 1)
+    if guide == "exact":  # svi needs a continuous site for its guide
+        draws = infer(OnlyReach(toy.self_model), some, InferenceOptions(guide, 40), 0).draws
+        assert list(draws) == ["reach"] and draws["reach"].shape == (40, 1, 1)
+
+
+def test_a_prior_that_depends_on_what_is_seen_is_refused(toy, recordings):
+    class Hierarchical(ToyHuman):
+        def prior(self):
+            implants = super().prior()
+            far = (implants["reach"] > 2).float()
+            implants["in_sight"] = pyro.sample("depends", dist.Beta(1 + far, 2 - far))
+            return implants
+
+    human = Hierarchical(toy.self_model)
+    for guide in ("exact", "svi"):
+        with pytest.raises(HumanModelError, match='"depends" depends on a discrete site'):
+            infer(human, recordings, InferenceOptions(guide, 5, FitOptions(steps=1)), 0)
 
 
 def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):

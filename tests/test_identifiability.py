@@ -78,7 +78,7 @@ def test_what_is_open_is_that_of_the_exact_conditionals(toy, rounds, draws):
 def test_a_population_takes_the_place_of_the_prior(toy, rounds, draws):
     chances = torch.arange(1.0, 8) / 28
     known = Population(
-        {"reach": chances[None]}, dict.fromkeys(RATES, torch.zeros(1)), dict.fromkeys(RATES)
+        {"reach": chances[None]}, *({rate: torch.ones(1) for rate in RATES} for _ in range(2))
     )
     found = identify(toy, rounds, draws, 0, known, rounds=0)
     for person in range(3):
@@ -101,7 +101,7 @@ def test_rounds_tell_what_they_should(toy, rounds):
     # Both rates alike: what they do has nothing to do with what they see.
     found = identify(toy, nobody, two_reaches((0.3, 0.3)), 0, rounds=2)
     assert found.all_entropy[0] == pytest.approx(math.log(2), rel=1e-4)
-    assert found.information.max() < 1e-4
+    assert found.information.abs().max() < 1e-4
     # Rates that give them away wherever something is between the two reaches.
     found = identify(toy, nobody, two_reaches((0.99, 0.01)), 0, rounds=4)
     assert found.information.shape == (1, 8)
@@ -110,7 +110,8 @@ def test_rounds_tell_what_they_should(toy, rounds):
     # Nothing is open about somebody of whom everything is known.
     known = two_reaches((0.99, 0.01)) | {"reach": torch.full((POLICIES, 1, 1), 4)}
     found = identify(toy, nobody, known, 0, rounds=2)
-    assert found.entropy.max() == found.information.max() == 0
+    assert found.entropy.max() == 0
+    assert found.information.abs().max() < 1e-6
 
 
 def test_expected_information_is_that_of_the_toy(toy, rounds):
@@ -130,6 +131,22 @@ def test_expected_information_is_that_of_the_toy(toy, rounds):
     error = math.hypot(float(found.information_error[0, 7]), float(gain.std()) / 20)
     assert abs(float(found.information[0, 7]) - float(gain.mean())) < 4 * error
     assert 0.02 < gain.mean() < 0.6
+
+
+def test_wide_posteriors_are_looked_at_as_a_whole(toy, rounds):
+    """Of somebody without rounds everything is open, however few draws there are."""
+    human = HumanModel(toy.self_model)
+    nobody = rounds.select_people([0]).select_rounds([])
+    draws = infer(human, nobody, InferenceOptions(draws=100), 0).draws
+    found = identify(human, nobody, draws, 0, rounds=1)
+    sevens, twos = found.entropy[0, :4], found.entropy[0, 4:]
+    torch.testing.assert_close(sevens, torch.full((4,), math.log(7)), rtol=1e-3, atol=0)
+    torch.testing.assert_close(twos, torch.full((2,), math.log(2)), rtol=1e-3, atol=0)
+    assert float(found.all_entropy[0]) == pytest.approx(math.log(9604), rel=1e-3)
+    # Of one round there is no standard error.
+    assert found.information_error.isnan().all()
+    told = found.of(0, human.domain.scenarios)["scenarios"]
+    assert all(one["error"] is None and one["expected"] > 0 for one in told.values())
 
 
 def test_models_without_anything_to_see_have_no_report(toy, rounds):

@@ -500,12 +500,19 @@ def test_people_are_fitted_in_batches_that_do_not_depend_on_each_other(
         if name == "fit" and done == 3 and (tmp_path / "some.checkpoint.2").exists():
             raise KeyboardInterrupt
 
+    def refuse(name, done, total, message):
+        raise AssertionError("work was begun")
+
     with pytest.raises(KeyboardInterrupt):
         infer(human, recordings, options, 3, report=stop, checkpoint=(path, "run"))
     assert len(list(tmp_path.iterdir())) == 2
     again = infer(human, recordings, options, 3, checkpoint=(path, "run"))
     assert all(torch.equal(again.draws[name], value) for name, value in found.draws.items())
-    assert list(tmp_path.iterdir()) == [path]
+    path.write_bytes(b"nonsense")
+    with pytest.raises(CheckpointError):
+        infer(human, recordings, options, 3, checkpoint=(tmp_path / "some.checkpoint", "run"))
+    with pytest.raises(CheckpointError):  # of the second batch, before the first is begun
+        infer(human, recordings, options, 3, report=refuse, checkpoint=(path, "another"))
 
 
 def test_the_marginal_elbo_is_that_of_enumeration(self_model):

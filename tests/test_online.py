@@ -65,6 +65,34 @@ def test_what_is_known_before_the_first_round_is_the_prior(human, network, round
     assert online.rounds == 0
 
 
+@pytest.mark.parametrize("stepwise", [True, False])
+def test_rounds_may_be_of_different_lengths(human, rounds, stepwise):
+    """As if the shorter one had been padded to the length of the others."""
+    kind = type("Own", (HumanModel,), {"stepwise": stepwise})
+    own = kind(human.self_model)
+    variables = rounds.variables()
+    variables["length"] = torch.tensor([[15, 7, 15, 15]])
+    padded = type(rounds).from_variables("driving", "fog", rounds.people, variables)
+    found = []
+    for parts in ([padded.select_rounds([n]) for n in range(3)], [padded.select_rounds(range(3))]):
+        online = OnlinePosterior(own)
+        for part in parts:
+            online.add(part)
+        found.append(online.draws(30))
+    assert parts[0].shape[2] == 15 and padded.select_rounds([1]).shape[2] == 7
+    for name, value in found[1].items():
+        torch.testing.assert_close(found[0][name], value)
+
+
+def test_asking_leaves_the_random_state_alone(human, network, rounds):
+    online = OnlinePosterior(human, network)
+    before = torch.random.get_rng_state()
+    online.add(rounds.select_rounds([0]))
+    online.draws(5)
+    infer(human, rounds.select_rounds([0]), InferenceOptions(draws=5), 0)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
 def test_people_are_not_mixed(human, network):
     two = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([0, 1])
     with pytest.raises(ValueError, match="of 2 people, not one"):

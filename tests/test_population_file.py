@@ -139,6 +139,25 @@ def test_runs_with_and_without_a_population_do_not_continue_each_other(inside, t
         fit_people(toy, demonstrations, options, 0, 2, checkpoint=checkpoint, population=known)
 
 
+def test_a_population_of_another_setting_is_refused(folder, toy):
+    with pytest.raises(PosteriorError, match="of people in fog, not in clear"):
+        load_population(folder / "pooled" / "posterior.nc", Pooling(toy), "clear")
+
+
+def test_what_the_prior_rules_out_stays_ruled_out(toy):
+    import pyro
+    import pyro.distributions as dist
+
+    class Short(ToyHuman):
+        def prior(self):
+            chances = torch.tensor([0.5, 0.5, 0, 0, 0, 0, 0])
+            return super().prior() | {"reach": pyro.sample("short", dist.Categorical(chances))}
+
+    pooling = Pooling(Short(toy.self_model))
+    assert pooling.supports["short"].tolist() == [0, 1]
+    assert pooling.prior_chances["short"].tolist() == pytest.approx([0.5, 0.5])
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [

@@ -188,6 +188,8 @@ def sample_amortized(
         prune_margin: see :class:`ImportanceOptions`.
         checked: see :class:`Sampler`.
     """
+    if stages < 1:
+        raise ValueError(f"stages must be at least 1, not {stages}")
     evidence = evidence_of(sightings)
     sampler = Sampler(human, evidence.table, checked)
     sampler.take(evidence.ways, evidence.joint)

@@ -9,6 +9,7 @@ from typing import Any
 import pyro
 import torch
 from pyro import poutine
+from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
@@ -81,6 +82,9 @@ def log_priors(
         grid: values ``[M]`` of the discrete sites; others are not looked at.
         draws: values of all other sites ``[S, P, 1, ...]``, on which the prior may depend.
         people: number of people P.
+
+    Raises:
+        HumanModelError: the prior of another site depends on these.
     """
     values = {site: value[:, None, None, None] for site, value in grid.items()}
     number = len(next(iter(draws.values()))) if draws else 1
@@ -93,6 +97,14 @@ def log_priors(
         pyro.plate("person", people, dim=-2),
     ):
         human.prior()
+    for name, node in trace.trace.nodes.items():
+        if node["type"] != "sample" or name in grid or site_is_subsample(node):
+            continue
+        if len(node["fn"].batch_shape) > BATCH:
+            raise HumanModelError(
+                f'the prior of "{name}" depends on a discrete site that perceive() reads; let that '
+                f'site depend on "{name}" instead'
+            )
     total = next(human.parameters()).new_zeros(1, 1, 1, 1)
     for site, value in grid.items():
         total = total + _log_prior(trace.trace.nodes[site]["fn"], value)

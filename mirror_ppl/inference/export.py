@@ -9,8 +9,8 @@ the truth where it is known). Attributes say which domain, setting, model and ve
 Predictive draws are of each action given what happened before it, as recorded: averages of them
 compare with what people did, the spread within a round does not.
 
-The draws are independent and not a chain, so effective sample sizes and r-hat mean nothing for
-them.
+Draws are independent and not a chain, so effective sample sizes and r-hat mean nothing for them;
+but for those of the guide ``nuts`` and of pooled people, which follow a chain.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         seed: seed of everything random.
         train_rounds: see :func:`split_rounds`.
         report: told of progress.
-        checkpoint: file that ``svi`` continues from; written on the way, removed by nobody.
+        checkpoint: file to continue from; written on the way, removed by nobody.
         network: of the guide ``amortized``.
         population: that the people are from, if it is known from others.
 

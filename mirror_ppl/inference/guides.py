@@ -116,7 +116,8 @@ def infer(
         network: of the amortized guide.
         report: told of progress.
         checkpoint: a file that is written now and then and continued from if it exists, and what
-            identifies this run (a checkpoint of another run is refused); not of ``nuts``.
+            identifies this run (a checkpoint of another run is refused); not of ``nuts``. Of many
+            people there are more, whose names begin alike.
         population: that the people are from, if it is known from others: their prior, then.
 
     Raises:
@@ -166,7 +167,14 @@ def _in_batches(
     checkpoint: tuple[Path, str] | None,
 ) -> Inferred:
     """``svi`` and ``nuts``: of so many people at once that their views fit into memory."""
-    people, found, files = demonstrations.num_people, [], []
+    people, found = demonstrations.num_people, []
+    files = {}
+    if checkpoint is not None:
+        path, run = checkpoint
+        for begin in range(0, people, PEOPLE_AT_ONCE):
+            files[begin] = path.with_name(f"{path.name}.{begin}") if begin else path
+            if files[begin].exists():  # what cannot be continued is refused before any work
+                read_checkpoint(files[begin], run)
     for begin in range(0, people, PEOPLE_AT_ONCE):
         some = range(begin, min(begin + PEOPLE_AT_ONCE, people))
         table = build_view_table(
@@ -179,15 +187,10 @@ def _in_batches(
             drawn = sample_nuts(human, table, options.draws, seed + begin, report)
             found.append(Inferred(drawn))
             continue
-        own = checkpoint
-        if checkpoint is not None and begin:
-            own = checkpoint[0].with_name(f"{checkpoint[0].name}.{begin}"), checkpoint[1]
-            files.append(own[0])
+        own = None if checkpoint is None else (files[begin], checkpoint[1])
         svi = replace(options.svi, draws=options.draws)
         posterior = fit_implants(human, table, svi, seed + begin, report, own)
         found.append(Inferred(posterior.draws, losses=posterior.losses))
-    for file in files:
-        file.unlink(missing_ok=True)
     draws = {name: torch.cat([one.draws[name] for one in found], 1) for name in found[0].draws}
     losses = tuple(sum(step) for step in zip(*(one.losses for one in found), strict=True))
     return Inferred(draws, losses=losses)
@@ -212,7 +215,7 @@ def _by_importance(
             sightings = Sightings(human, screening)
             for one_round in rounds_of(demonstrations, person):
                 sightings.add(*one_round)
-            # People do not depend on each other: the same whoever else is there.
+            # Whatever the number of draws that others took.
             torch.manual_seed((seed + 1) * 1_000_003 + person)
             if network is None:
                 found = sample_exactly(human, sightings.table(), options.exact)
@@ -223,8 +226,8 @@ def _by_importance(
             if checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
                 done.save(*checkpoint)
                 saved = monotonic()
+        order = sample_sites(human, 1)
     report("infer", people, people, "people")
-    order = sample_sites(human, 1)
     draws = {name: torch.cat([own[name] for own in done.draws], 1) for name in order}
     return Inferred(draws, torch.tensor(done.pareto_k))
 

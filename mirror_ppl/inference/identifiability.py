@@ -57,7 +57,8 @@ class Identifiability:
         all_entropy, all_shared: the same of all of them together ``[P]``.
         information: expected from one more round in each of the domain's N scenarios, about all
             of them together, ``[P, N]``; empty if no round was played.
-        information_error: its standard error, of the rounds that were played.
+            What is expected is never negative; what is found of it, of a few rounds, may be.
+        information_error: its standard error, of the rounds that were played; NaN if it was one.
     """
 
     sites: tuple[str, ...]
@@ -80,7 +81,7 @@ class Identifiability:
             "hangs_on_policy": dict(zip(self.sites, shared, strict=True))
             | {"together": float(self.all_shared[person])},
             "scenarios": {
-                name: {"expected": expected, "error": error}
+                name: {"expected": expected, "error": None if math.isnan(error) else error}
                 for name, expected, error in zip(
                     scenarios[: len(information)], information, error, strict=True
                 )
@@ -119,7 +120,6 @@ def identify(
     held, people = next(iter(draws.values())).shape[:2]
     chosen = torch.linspace(0, held - 1, min(held, POLICIES)).round().long()
     found: list[tuple[Tensor, ...]] = []
-    mixer = torch.Generator().manual_seed(seed)
     for person in range(people):
         report("identify", person, people, "people")
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
@@ -136,22 +136,27 @@ def identify(
         joint = log_joints(human, table, policy, candidates)[:, 0]
         grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
         if population is not None:
-            joint = joint + _instead_of_prior(human, grid, policy, population)
+            # The draws are of people from one draw of the population each.
+            own_population = population.spaced(held)
+            chances = {site: own_population.chances[site][chosen] for site in sizes}
+            joint = joint + _instead_of_prior(human, grid, policy, chances)
         weights = torch.log_softmax(joint, -1)  # [S, C]
-        opened = _open(weights, grid)
-        if len(candidates) > COMBINATIONS:
-            mixed = drawn.cpu()[torch.randperm(held, generator=mixer)[:COMBINATIONS]]
-            some = torch.isin(candidates, mixed.to(candidates))
-            weights = torch.log_softmax(joint[:, some], -1)
-            candidates = candidates[some]
-            grid = {site: value[some] for site, value in grid.items()}
         told = (weights.new_zeros(0),) * 2
         if rounds:
-            generator = torch.Generator(weights.device).manual_seed(seed)
+            # Of each person their own worlds, so that averages over people are of many.
+            generator = torch.Generator(weights.device).manual_seed(seed * 1_000_003 + person)
+            some, pairs = _represented(weights, generator)
             told = _information(
-                human, weights, candidates, grid, policy, train.setting, rounds, generator
+                human,
+                pairs,
+                candidates[some],
+                {site: value[some] for site, value in grid.items()},
+                policy,
+                train.setting,
+                rounds,
+                generator,
             )
-        found.append((*opened, *told))
+        found.append((*_open(weights, grid), *told))
     report("identify", people, people, "people")
     return Identifiability(tuple(sizes), *(torch.stack(part) for part in zip(*found, strict=True)))
 
@@ -160,15 +165,15 @@ def _instead_of_prior(
     human: HumanModel,
     grid: Mapping[str, Tensor],
     policy: Mapping[str, Tensor],
-    population: Population,
+    chances: Mapping[str, Tensor],
 ) -> Tensor:
-    """Log ratio ``[S, C]`` of the prior of combinations in the population to the model's own."""
+    """Log ratio ``[S, C]`` of the prior of combinations in populations to the model's own."""
     own = log_priors(human, grid, policy, 1)[:, 0]
     total = torch.zeros_like(own)
     supports = perceived_sites(human)
     for site, value in grid.items():
         index = (value[:, None] == supports[site]).long().argmax(-1)
-        total = total + population.chances[site].mean(0).log()[index]
+        total = total + chances[site].log()[:, index]
     return total - own
 
 
@@ -194,9 +199,26 @@ def _entropy(probability: Tensor) -> Tensor:
     return torch.special.entr(probability).sum(-1)
 
 
+def _represented(weights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Combinations that stand for all, and log weights ``[S, C']`` of them with each policy.
+
+    All of them if they are few; else as many as are drawn, each with the weight of its draws. The
+    weights of all pairs add up to 1.
+    """
+    number = weights.shape[-1]
+    if number <= COMBINATIONS:
+        return torch.arange(number, device=weights.device), weights - math.log(len(weights))
+    drawn = torch.multinomial(
+        weights.exp().mean(0), COMBINATIONS, replacement=True, generator=generator
+    )
+    some, counts = drawn.unique(return_counts=True)
+    given = torch.log_softmax(weights[:, some], 0)
+    return some, given + (counts / COMBINATIONS).log()
+
+
 def _information(
     human: HumanModel,
-    weights: Tensor,
+    pairs: Tensor,
     candidates: Tensor,
     grid: Mapping[str, Tensor],
     policy: Mapping[str, Tensor],
@@ -208,30 +230,31 @@ def _information(
     domain = human.domain
     number = len(domain.scenarios)
     # Who plays: every pair of policy and sight by its probability, the same in each scenario.
-    pairs = torch.multinomial(
-        weights.exp().flatten(), rounds, replacement=True, generator=generator
+    players = torch.multinomial(
+        pairs.exp().flatten(), rounds, replacement=True, generator=generator
     ).repeat(number)
-    draw, which = pairs // len(candidates), pairs % len(candidates)
+    draw, which = players // len(candidates), players % len(candidates)
     implants = {name: value[draw, 0] for name, value in policy.items()}
     implants |= {site: value[which][:, None] for site, value in grid.items()}
-    scenario = torch.arange(number, device=weights.device).repeat_interleave(rounds)
+    scenario = torch.arange(number, device=pairs.device).repeat_interleave(rounds)
     played = play_rounds(human, implants, 1, setting, generator, scenario)
     sightings = Sightings(human, None, candidates)
-    for player in range(len(pairs)):
+    for player in range(len(players)):
         for one_round in rounds_of(played, player):
             sightings.add(*one_round)
     table = sightings.table()
     with (
         poutine.block(),
         poutine.condition(data=dict(policy)),
-        pyro.plate("draw", len(weights), dim=-3),
+        pyro.plate("draw", len(pairs), dim=-3),
         pyro.plate("person", 1, dim=-2),
     ):
         log_probabilities = human.act(human.prior(), table.belief, table.values)
-    likelihood = table.log_likelihoods(log_probabilities)[:, 0]  # [S, V]
-    joint = likelihood[:, table.index[0][:, candidates]] + weights[:, None]  # [S, R, C]
+    likelihood = table.log_likelihoods(log_probabilities)
+    likelihood = likelihood.expand(len(pairs), 1, -1)[:, 0]  # [S, V]
+    joint = likelihood[:, table.index[0][:, candidates]] + pairs[:, None]  # [S, R, C]
     after = torch.softmax(torch.logsumexp(joint, 0), -1)  # [R, C]
-    each = (_entropy(weights.exp().mean(0)) - _entropy(after)).view(number, rounds)
-    error = each.std(-1, correction=min(1, rounds - 1)) / math.sqrt(rounds)
-    # It is never negative, but what is found of it may be.
-    return each.mean(-1).clamp(min=0), error
+    each = (_entropy(pairs.exp().sum(0)) - _entropy(after)).view(number, rounds)
+    if rounds == 1:
+        return each[:, 0], torch.full_like(each[:, 0], math.nan)
+    return each.mean(-1), each.std(-1) / math.sqrt(rounds)

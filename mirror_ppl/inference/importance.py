@@ -150,11 +150,11 @@ class Sampler:
     def draw(self, number: int) -> None:
         """Draw from the prior."""
         policy, _ = complete(self.human, self.table, {}, number)
-        self.take(policy, self._joint(policy))
+        self.take(policy, self._joint(policy, number))
 
     def take(self, policy: Draws, joint: Tensor) -> None:
         """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, C]``."""
-        place = places(self.sites, policy)
+        place = places(self.sites, policy, len(joint))
         given = {name: policy[name] for name in self.sites}
         _, log_prior = complete(self.human, self.table, given, len(joint))
         self._add(policy, joint, place, log_prior)
@@ -179,7 +179,7 @@ class Sampler:
             for column, (name, site) in enumerate(self.sites.items())
         }
         policy, log_prior = complete(self.human, self.table, given, number)
-        self._add(policy, self._joint(policy), place, log_prior)
+        self._add(policy, self._joint(policy, number), place, log_prior)
         self._proposals.append((number, proposal))
 
     def _add(self, policy: Draws, joint: Tensor, place: Tensor, log_prior: Tensor) -> None:
@@ -201,8 +201,9 @@ class Sampler:
         }
         return Weighted(policy, self.combinations, joint, log_weights, pareto_k)
 
-    def _joint(self, policy: Draws) -> Tensor:
-        return log_joints(self.human, self.table, policy, self.combinations)[:, 0]
+    def _joint(self, policy: Draws, number: int) -> Tensor:
+        joint = log_joints(self.human, self.table, policy, self.combinations)[:, 0]
+        return joint.expand(number, -1)
 
 
 @torch.no_grad()
@@ -261,10 +262,10 @@ def scalar_sites(human: HumanModel) -> dict[str, Any]:
         }
 
 
-def places(sites: Mapping[str, Any], policy: Mapping[str, Tensor]) -> Tensor:
-    """The scalar sites of draws in unconstrained space, ``[S, D]``."""
+def places(sites: Mapping[str, Any], policy: Mapping[str, Tensor], number: int = 0) -> Tensor:
+    """The scalar sites of draws in unconstrained space, ``[S, D]``; S is given if D is 0."""
     if not sites:
-        return torch.zeros(len(next(iter(policy.values()))) if policy else 0, 0)
+        return torch.zeros(number, 0)
     return torch.stack([site.inv(policy[name].flatten()) for name, site in sites.items()], -1)
 
 

@@ -36,7 +36,7 @@ class OnlinePosterior:
         rounds: number of rounds so far.
         pareto_k: of the importance weights at the last asking; above 0.7 they are not to be relied
             on.
-        seconds: that the last round, and the last asking, took.
+        seconds: that adding took the last time, and asking.
     """
 
     def __init__(
@@ -58,8 +58,12 @@ class OnlinePosterior:
             demonstrations: of one person, of any number of rounds.
 
         Raises:
-            ValueError: they are of more than one person.
+            ValueError: they are of more than one person, or of another domain.
         """
+        if demonstrations.domain != self.human.domain.name:
+            raise ValueError(
+                f"the rounds are of {demonstrations.domain}, not of {self.human.domain.name}"
+            )
         if demonstrations.num_people != 1:
             raise ValueError(f"the rounds are of {demonstrations.num_people} people, not one")
         began = monotonic()
@@ -82,9 +86,10 @@ class OnlinePosterior:
             torch.manual_seed(self.seed * 1_000_003 + self.rounds)
             found = self._weighted()
             drawn = found.sample(number, self._sightings.grid)
+            order = sample_sites(self.human, 1)
         self.pareto_k = found.pareto_k
         self.seconds = self.seconds[0], monotonic() - began
-        return {name: drawn[name] for name in sample_sites(self.human, 1)}
+        return {name: drawn[name] for name in order}
 
     def _weighted(self) -> Weighted:
         if self.network is None:

@@ -42,6 +42,8 @@ MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
 """Draws of a person, at most, from which a population is inferred; of all people together; and
 what each has of these at least."""
 PRIOR_DRAWS = 4000
+LEAST_CHANCE = 1e-6
+"""Of a value of a discrete site, below which the prior rules it out."""
 CONCENTRATION_WIDTH = 1.0
 """Standard deviation of the logarithm of the concentration of chances."""
 SPREAD_WIDTH = 0.5
@@ -78,7 +80,8 @@ class Pooled:
 
     Attributes:
         draws: ``[S, P, 1, ...]``, one for each draw of the population.
-        effective: number ``[P]`` of each person's own draws that all of these weights leave.
+        effective: number ``[P]`` of each person's own draws that count for a draw of the
+            population, the median over them.
     """
 
     draws: Draws
@@ -98,15 +101,16 @@ class Pooling:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             nodes = sample_sites(human, 1, PRIOR_DRAWS)
-        drawn = places(self.sites, values_of(nodes))
+        drawn = places(self.sites, values_of(nodes), PRIOR_DRAWS)
         self.centre, self.width = drawn.mean(0), drawn.std(0)
         self.supports, self.prior_chances = {}, {}
         for name, node in nodes.items():
             if node["fn"].has_enumerate_support:
                 values = node["fn"].enumerate_support()
                 chances = node["fn"].log_prob(values).exp().flatten(1).mean(1)
-                self.supports[name] = values.flatten(1)[:, 0]
-                self.prior_chances[name] = chances / chances.sum()
+                possible = chances > LEAST_CHANCE  # what the prior rules out stays ruled out
+                self.supports[name] = values.flatten(1)[possible, 0]
+                self.prior_chances[name] = chances[possible] / chances[possible].sum()
 
     def program(
         self, known: Mapping[str, Tensor], place: Mapping[str, Tensor], log_prior: Tensor
@@ -163,13 +167,13 @@ class Pooling:
     def _log_prior(self, draws: Mapping[str, Tensor]) -> Tensor:
         number, people = next(iter(draws.values())).shape[:2]
         nodes = sample_sites(self.human, people, number, draws)
-        total = torch.zeros(number, people)
+        total = torch.zeros(number, people, device=self.centre.device)
         for name in (*self.supports, *self.sites):
             value = nodes[name]["value"]
             total = total + nodes[name]["fn"].log_prob(value).expand(number, people, 1)[..., 0]
         # In unconstrained space.
         place = places(self.sites, draws)
-        stretch = torch.zeros(len(place))
+        stretch = place.new_zeros(len(place))
         for column, site in enumerate(self.sites.values()):
             at = place[:, column]
             stretch = stretch + site.log_abs_det_jacobian(at, site(at))
@@ -207,7 +211,7 @@ class Pooling:
             seed: of everything random.
         """
         known, place, log_prior = self.read(draws)
-        total, chosen = torch.zeros_like(log_prior), []
+        effective, chosen = [], []
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             for index in range(len(population)):
@@ -217,12 +221,12 @@ class Pooling:
                 )
                 density = self.log_density(chances, mean, spread, known, place)
                 weights = torch.softmax(density - log_prior, -1)
-                total += weights / len(population)
+                effective.append(1 / weights.square().sum(-1))
                 chosen.append(torch.multinomial(weights, 1)[:, 0])
         rows = torch.stack(chosen)  # [S', P]
         people = torch.arange(rows.shape[1])
         own = {name: value[rows, people] for name, value in draws.items()}
-        return Pooled(own, 1 / total.square().sum(-1))
+        return Pooled(own, torch.stack(effective).median(0).values)
 
     @torch.no_grad()
     def newcomers(self, population: Population, people: int, seed: int) -> Draws:

@@ -54,8 +54,8 @@ def add_population(
     for kind, part in (("mean", population.mean), ("spread", population.spread)):
         for name, value in part.items():
             variables[f"{name}_{kind}"] = (SAMPLE, value.cpu().numpy()[None])
-    new = in_units(domain, pooling.newcomers(population, 1, seed))
-    new = {name: value[:, 0].cpu() for name, value in new.items()}
+    new = {name: value.cpu() for name, value in pooling.newcomers(population, 1, seed).items()}
+    new = {name: value[:, 0] for name, value in in_units(domain, new).items()}
     newcomer = {}
     for name, value in new.items():
         axes = tuple(f"{name}_{axis}" for axis in range(value.dim() - 1))
@@ -70,16 +70,17 @@ def add_population(
     return new
 
 
-def load_population(path: Path, pooling: Pooling) -> Population:
+def load_population(path: Path, pooling: Pooling, setting: str | None = None) -> Population:
     """The population of a posterior file, to be the prior of other people.
 
     Args:
         path: what ``python -m mirror_ppl.fit --pooling partial`` wrote.
         pooling: of the human model.
+        setting: that the other people are in; any unless given.
 
     Raises:
         PosteriorError: the file is missing or damaged, holds no population, or is of another human
-            model, self-model or version of the domain.
+            model, self-model, version of the domain or setting.
     """
     if not path.is_file():
         raise PosteriorError(f"{path}: there is no such file; fit --pooling partial makes one")
@@ -90,7 +91,13 @@ def load_population(path: Path, pooling: Pooling) -> Population:
     if "population" not in data.groups():
         raise PosteriorError(f"{path}: holds no population; fit --pooling partial makes one")
     group = data["population"]
-    check_origin(path, {str(key): str(value) for key, value in group.attrs.items()}, pooling.human)
+    attributes = {str(key): str(value) for key, value in group.attrs.items()}
+    check_origin(path, attributes, pooling.human)
+    if setting is not None and attributes.get("setting") != setting:
+        raise PosteriorError(
+            f"{path}: the population is of people in {attributes.get('setting')}, not in "
+            f"{setting}; fit people in the same setting with --pooling partial"
+        )
     like = next(pooling.human.parameters())
 
     def part(names: Mapping[str, object], kind: str, event: int) -> dict[str, torch.Tensor]:

@@ -16,6 +16,7 @@ import pyro
 import torch
 from pyro import poutine
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mirror_ppl.distinct import distinct_rows
 from mirror_ppl.domains import Observation, Visibility
@@ -48,8 +49,9 @@ class Screening:
     alike: int = 16
 
     def __post_init__(self) -> None:
-        if not 1 <= self.alike <= self.ways:
-            raise ValueError(f"alike must be 1 to {self.ways}, not {self.alike}")
+        for name, least in (("margin", 0), ("ways", 1), ("resolution", 0), ("alike", 1)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,23 @@ class RoundViews:
 
     def __len__(self) -> int:
         return len(self.moments)
+
+    def lengthened(self, steps: int) -> RoundViews:
+        """The same with padding at the end, as part of a table of longer rounds."""
+        more = steps - self.moments.shape[1]
+        if not more:
+            return self
+        moments, length = self.moments, self.belief.shape[1]
+        if length > 1:  # whole rounds, which get longer
+            real = moments != NO_VIEW
+            moments = torch.where(real, moments // length * steps + moments % length, NO_VIEW)
+        grown = more if length > 1 else 0
+        return RoundViews(
+            pad(moments, [0, more], value=NO_VIEW),
+            pad(self.belief, [0, 0, 0, grown]),
+            pad(self.values, [0, 0, 0, grown]),
+            pad(self.acted, [0, grown]),
+        )
 
     def kept(self, views: Tensor) -> RoundViews:
         """Only some views, and the moments that they have."""
@@ -157,6 +176,7 @@ class Sightings:
         """The views that are left, as a table of one person; there was at least one round."""
         index, rounds, views, moments = [], [], 0, 0
         shifted = []
+        steps = max(len(real) for _, real in self._recorded)
         for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
             # Only what somebody who was never given up has seen is worth keeping.
             row = torch.full((prod(self.sizes),), NO_VIEW, device=self.alive.device)
@@ -164,7 +184,7 @@ class Sightings:
             needed, place = torch.unique(row[self.alive], return_inverse=True)
             row = torch.full_like(row, NO_VIEW)
             row[self.alive] = views + place
-            part = part.kept(needed)
+            part = part.kept(needed).lengthened(steps)
             index.append(row)
             rounds.append(part)
             shifted.append(torch.where(part.moments == NO_VIEW, NO_VIEW, part.moments + moments))
@@ -177,10 +197,15 @@ class Sightings:
             belief=torch.cat([part.belief for part in rounds])[None],
             values=torch.cat([part.values for part in rounds])[None],
             acted=torch.cat([part.acted for part in rounds])[None],
-            recorded=torch.stack([actions for actions, _ in self._recorded])[None],
-            steps=torch.stack([real for _, real in self._recorded])[None],
+            recorded=self._padded_to(steps, 0)[None],
+            steps=self._padded_to(steps, 1)[None],
             view_counts=torch.tensor([views]),
         )
+
+    def _padded_to(self, steps: int, which: int) -> Tensor:
+        """Recorded actions (0) or real steps (1) of all rounds, ``[B, T]``."""
+        parts = [recorded[which] for recorded in self._recorded]
+        return torch.stack([pad(part, [0, steps - len(part)]) for part in parts])
 
     @cached_property
     def log_prior(self) -> Tensor:
@@ -230,13 +255,16 @@ class Sightings:
 
     def _act(self, ways: Mapping[str, Tensor], belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities ``[ways, 1, N, T', A]``."""
+        number = len(next(iter(ways.values()))) if ways else len(self.score)
         with (
             poutine.block(),
             poutine.condition(data=dict(ways)),
-            pyro.plate("way", len(next(iter(ways.values()))), dim=-3),
+            pyro.plate("way", number, dim=-3),
             pyro.plate("person", 1, dim=-2),
         ):
-            return self.human.act(self.human.prior(), belief, values)
+            found = self.human.act(self.human.prior(), belief, values)
+        # Of a model whose actions depend on no implant they are the same in every way.
+        return found.expand(number, *found.shape[-4:])
 
 
 def _views(

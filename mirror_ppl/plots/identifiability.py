@@ -51,7 +51,7 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
         axes[0].barh(rows, hanging, 0.75, left, color="none", hatch="//////", edgecolor=BLACK, lw=0)
         left = left + whole
     axes[0].set_yticks(rows, people, parse_math=False)
-    axes[0].set_ylim(len(people) - 0.4, -0.6)
+    axes[0].set_ylim(len(people) - 0.5, -0.5)
     axes[0].set_xlim(0, max(0.1, 1.05 * float(left.max())))
     axes[0].set_xlabel("nats open, of each by itself")
     axes[0].set_title("What is open about what they see", fontsize=12)
@@ -64,7 +64,7 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
         Patch(facecolor="none", hatch="//////", edgecolor=BLACK, label="hangs on how they decide")
     )
     if scenarios:
-        _scenarios(axes[1], group["information"].values, scenarios)
+        _scenarios(axes[1], group["information"].values.clip(min=0), scenarios)
     figure.legend(
         handles=handles, loc="outside lower center", ncols=2 if scenarios else 1, frameon=False
     )
