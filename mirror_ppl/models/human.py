@@ -91,7 +91,8 @@ class View:
         (*keys,) = random_keys(sum(sizes), device, kind=1).split(sizes)
         total = torch.zeros((), dtype=torch.long, device=device)
         for mask in masks.values():
-            total = total + torch.where(mask, keys.pop(0), 0).sum(-1)
+            # Sums of few keys of 48 bits are exact in 64-bit floats, which multiply faster.
+            total = total + (mask.double() @ (keys.pop(0) >> 14).double()).long()
         for name, mask in self.taken.items():
             imagined = self.imagined[name]
             key = keys.pop(0).view(imagined.shape[-2:])
@@ -155,9 +156,10 @@ class HumanModel(nn.Module):
             observation: everything that could be seen at this step, ``[..., K, F]``.
         """
         direction, distance = self.domain.distance(observation)
-        thresholds = implant_priors.reach(self.domain, implants)[..., None, :]
-        within = distance[..., None] <= thresholds
-        visual = within.gather(-1, direction[..., None].expand(*within.shape[:-1], 1)).squeeze(-1)
+        reach = implant_priors.reach(self.domain, implants)  # [..., D]
+        batch = torch.broadcast_shapes(reach.shape[:-1], direction.shape[:-1])
+        own = reach.expand(*batch, -1).gather(-1, direction.expand(*batch, -1))
+        visual = distance <= own
         unseen = torch.zeros_like(visual)
         return {
             modality.name: visual if modality.name == "visual" else unseen
