@@ -25,6 +25,8 @@ writes ranks.png, ecdf.png, coverage.png and calibration.nc. The exit status is 
 rejected. A run that is stopped goes on where it was when the same command is given again."""
 REJECTED = 1
 WIDTH = 80
+FEW_PEOPLE = 100
+"""Of fewer, tests of uniformity have little power."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +179,8 @@ def _show(calibration: Calibration, guide: str) -> None:
     console.print(table)
     rate = calibration.failure_rate
     verdict = f"rejected for {len(rejected)}" if rejected else "not rejected for any"
+    if calibration.people < FEW_PEOPLE:
+        print(f"Of {calibration.people} people, only gross faults would show")
     print(f"Calibration is {verdict} of {len(calibration.table())} (a right one: {rate} of each)")
 
 

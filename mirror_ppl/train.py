@@ -56,8 +56,11 @@ class Options:
             raise OptionError(f"--what must be {SELF_MODEL} or {GUIDE}, not {self.what}")
         if self.people < LEAST_PEOPLE:
             raise OptionError(f"--people must be at least {LEAST_PEOPLE}, not {self.people}")
-        if self.what == GUIDE and self.device != "cpu":
-            raise OptionError("--device is for self-models; guides are trained on the cpu")
+        other, of_other = (SELF_MODEL, OF_SELF_MODEL) if self.what == GUIDE else (GUIDE, OF_GUIDE)
+        defaults = {field.name: field.default for field in fields(self)}
+        for name in of_other:
+            if getattr(self, name) != defaults[name]:
+                raise OptionError(f"--{name.replace('_', '-')} is for --what {other}")
         for name in ("phases", "steps"):
             if (number := getattr(self, name)) < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")

@@ -45,7 +45,8 @@ def test_it_tells_and_writes_what_it_found(small, tmp_path, capsys):
     assert command(calibrate, *small, "--jobs", 1) == 0
     out, err = capsys.readouterr()
     assert "60 people drawn from the prior" in out
-    for word in ("reach", "in sight", "otherwise", "not rejected for any of 3", "calibration.nc"):
+    words = "reach", "in sight", "otherwise", "not rejected for any of 3", "calibration.nc"
+    for word in (*words, "Of 60 people, only gross faults would show"):
         assert word in out
     assert "60/60" in err
     assert names(tmp_path / "out") == RESULTS

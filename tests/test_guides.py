@@ -504,7 +504,9 @@ def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, c
     [
         (("--what", "nothing"), "--what must be self-model or guide, not nothing"),
         (("--what", "guide", "--people", "3"), "--people must be at least 10, not 3"),
-        (("--what", "guide", "--device", "cuda"), "--device is for self-models"),
+        (("--what", "guide", "--device", "cuda"), "--device is for --what self-model"),
+        (("--what", "guide", "--phases", "3"), "--phases is for --what self-model"),
+        (("--people", "30"), "--people is for --what guide"),
         (("--what", "guide", "--out", "."), "it is not a regular file"),
     ],
 )
