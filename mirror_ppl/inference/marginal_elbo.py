@@ -54,9 +54,6 @@ def marginal_elbo(
                 joint = joint + node["log_prob"]
             else:
                 total = total + node["log_prob"].sum()
-        # Padding of people with fewer combinations counts as impossible.
-        real = table.places_used[..., None]
-        summed = torch.logsumexp(torch.where(real, joint, -torch.inf), 0)
-        return guided.log_prob_sum() - total - summed.sum()
+        return guided.log_prob_sum() - total - torch.logsumexp(joint, 0).sum()
 
     return loss

@@ -120,15 +120,13 @@ class ViewTable:
 
     @cached_property
     def possible_numbers(self) -> Tensor:
-        """Numbers of the possible combinations of each person, ``[C, P]``, padded with others."""
+        """Numbers of the possible combinations of each person, ``[C, P]``.
+
+        Padded with impossible ones, whose likelihood is as good as none.
+        """
         number = int(self.possible.sum(1).max())
         first = self.possible.long().argsort(dim=1, descending=True, stable=True)
         return first[:, :number].T
-
-    @cached_property
-    def places_used(self) -> Tensor:
-        """Which of ``possible_numbers`` are no padding, ``[C, P]``."""
-        return self.possible.gather(1, self.possible_numbers.T).T
 
     @cached_property
     def _views(self) -> Tensor:
