@@ -244,14 +244,12 @@ def _show_open(people: list[dict[str, Any]]) -> None:
     """What is open about sight, and which rounds would tell most."""
     if not people:
         return
-    each = [
-        (person["open"]["together"], person["hangs_on_policy"]["together"]) for person in people
-    ]
-    entropy, hanging = (sum(values) / len(people) for values in zip(*each, strict=True))
-    line = (
-        f"Open about what they see: {entropy:.2f} nats on average, of which {hanging:.2f} hang on "
+    entropy, hanging = (
+        sum(person[part]["together"] for person in people) / len(people)
+        for part in ("open", "hangs_on_policy")
     )
-    line += "how they decide"
+    line = f"Open about what they see: {entropy:.2f} nats on average, "
+    line += f"of which {hanging:.2f} hang on how they decide"
     expected = {
         name: sum(person["scenarios"][name]["expected"] for person in people) / len(people)
         for name in people[0]["scenarios"]

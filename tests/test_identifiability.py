@@ -2,6 +2,8 @@
 
 import math
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
@@ -86,6 +88,28 @@ def test_a_population_takes_the_place_of_the_prior(toy, rounds, draws):
         exact = exact / exact.sum(-1, keepdim=True)
         expected = entropy(exact.mean(0))
         torch.testing.assert_close(found.entropy[person, 0], expected, rtol=1e-3, atol=1e-4)
+
+
+def test_what_the_prior_rules_out_is_not_open(toy, rounds):
+    """Also when its chances in a population are told of the other values alone."""
+
+    class Short(ToyHuman):
+        def prior(self):
+            chances = torch.tensor([0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0])
+            reach = pyro.sample("reach", dist.Categorical(chances))
+            one = torch.ones(())
+            rates = {rate: pyro.sample(rate, dist.Beta(one, one)) for rate in RATES}
+            return {"reach": reach} | rates
+
+    human = Short(toy.self_model)
+    nobody = rounds.select_people([0]).select_rounds([])
+    draws = infer(human, nobody, InferenceOptions(draws=POLICIES), 0).draws
+    draws["reach"] = torch.arange(POLICIES).remainder(7)[:, None, None]  # all are looked at
+    chances = {"reach": torch.tensor([[0.9, 0.1]])}
+    known = Population(chances, *({rate: torch.ones(1) for rate in RATES} for _ in range(2)))
+    found = identify(human, nobody, draws, 0, known, rounds=0)
+    expected = entropy(torch.tensor([0.9, 0.1]))
+    torch.testing.assert_close(found.all_entropy[0], expected, rtol=1e-3, atol=1e-4)
 
 
 def two_reaches(rates):

@@ -30,7 +30,7 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.combinations import log_priors, perceived_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, combination_values, log_joints
-from mirror_ppl.inference.pooling import Population
+from mirror_ppl.inference.pooling import Pooling, Population
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent
@@ -120,6 +120,9 @@ def identify(
     held, people = next(iter(draws.values())).shape[:2]
     chosen = torch.linspace(0, held - 1, min(held, POLICIES)).round().long()
     found: list[tuple[Tensor, ...]] = []
+    supports: Mapping[str, Tensor] = {}
+    if population is not None:
+        population, supports = population.spaced(held), Pooling(human).supports
     for person in range(people):
         report("identify", person, people, "people")
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
@@ -137,9 +140,8 @@ def identify(
         grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
         if population is not None:
             # The draws are of people from one draw of the population each.
-            own_population = population.spaced(held)
-            chances = {site: own_population.chances[site][chosen] for site in sizes}
-            joint = joint + _instead_of_prior(human, grid, policy, chances)
+            chances = {site: value[chosen] for site, value in population.chances.items()}
+            joint = joint + _instead_of_prior(human, grid, policy, chances, supports)
         weights = torch.log_softmax(joint, -1)  # [S, C]
         told = (weights.new_zeros(0),) * 2
         if rounds:
@@ -166,14 +168,16 @@ def _instead_of_prior(
     grid: Mapping[str, Tensor],
     policy: Mapping[str, Tensor],
     chances: Mapping[str, Tensor],
+    supports: Mapping[str, Tensor],
 ) -> Tensor:
     """Log ratio ``[S, C]`` of the prior of combinations in populations to the model's own."""
     own = log_priors(human, grid, policy, 1)[:, 0]
     total = torch.zeros_like(own)
-    supports = perceived_sites(human)
     for site, value in grid.items():
-        index = (value[:, None] == supports[site]).long().argmax(-1)
-        total = total + chances[site].log()[:, index]
+        same = value[:, None] == supports[site]
+        own_chance = chances[site].log()[:, same.long().argmax(-1)]
+        # A value that the prior rules out has no chance.
+        total = total + torch.where(same.any(-1), own_chance, -torch.inf)
     return total - own
 
 
