@@ -51,10 +51,10 @@ class Options:
 class EncoderRemembers(HumanModel):
     """Only what is seen or told at a step is visible at it."""
 
-    def look(self, implants, knowledge, observation, told):
+    def look(self, implants, knowledge, observation, told, step):
         """See `HumanModel.look`."""
-        view, after = super().look(implants, knowledge, observation, told)
-        seen = self.sees(implants, observation)
+        view, after = super().look(implants, knowledge, observation, told, step)
+        seen = self.sees(implants, observation, step)
         return replace(
             view, visible={name: mask | told[name] for name, mask in seen.items()}
         ), after

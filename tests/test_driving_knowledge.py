@@ -379,9 +379,9 @@ def test_people_of_the_human_model_have_in_mind_what_drivers_remember(generator)
 class Mirrors(HumanModel):
     """People who see what is behind them as far as what is ahead."""
 
-    def sees(self, implants, observation):
+    def sees(self, implants, observation, step):
         alike = {name: implants[name.replace("back", "front")] for name in SIGHTS}
-        return super().sees(alike, observation)
+        return super().sees(alike, observation, step)
 
 
 def test_a_model_that_overrides_sees_is_stepwise_and_notices_what_it_misses(generator):

@@ -104,14 +104,14 @@ def test_threshold_of_its_direction_decides_at_every_edge(human, lane, car):
     observation = {name: value[0] for name, value in looked_at(positions, lane).items()}
     direction = DIRECTIONS[lane][car]
     for index, edge in enumerate(BINS):
-        seen = human.sees(sight(**{direction: index}), observation)
+        seen = human.sees(sight(**{direction: index}), observation, 0)
         expected = [distance <= edge for distance in distances]
         assert seen["visual"][:, car].tolist() == expected
         assert not seen["verbal"].any()
         # No other threshold matters to it.
         others = {name: 6 for name in DRIVING.directions if name != direction}
         implants = sight(**others, **{direction: index})
-        assert human.sees(implants, observation)["visual"][:, car].tolist() == expected
+        assert human.sees(implants, observation, 0)["visual"][:, car].tolist() == expected
         # Each look the first of a round: a car seen twice would be known wherever it is then.
         rounds = {name: value[:, None] for name, value in observation.items()}
         view = human.perceive(implants, rounds, nothing_told(1))
@@ -255,7 +255,7 @@ def test_steps_by_hand_are_those_of_the_round(human, recordings):
     for step in range(STEPS):
         now = {name: value[:, step] for name, value in observation.items()}
         heard = {name: mask[:, step] for name, mask in told.items()}
-        view, knowledge = human.look(implants, knowledge, now, heard)
+        view, knowledge = human.look(implants, knowledge, now, heard, step)
         assert torch.equal(view.numbers(), whole[:, step])
 
 
@@ -263,8 +263,8 @@ def test_a_model_may_say_what_is_visible_and_no_more(human, recordings):
     class Attentive(HumanModel):
         """They see every other car, whatever the distance."""
 
-        def sees(self, implants, observation):
-            seen = super().sees(implants, observation)
+        def sees(self, implants, observation, step):
+            seen = super().sees(implants, observation, step)
             return seen | {"visual": (torch.arange(4) % 2 == 0).expand(seen["visual"].shape)}
 
     observation, actions = first_round(recordings)

@@ -426,7 +426,7 @@ def test_checkpoint_of_another_fit_is_refused(few, recordings, tmp_path):
 
 def test_pruning_gives_up_whoever_is_hopeless(few, table):
     policy = some_policy(few, 3)
-    score = combination_scores(table, few.act(policy, table.belief, table.values))
+    score = combination_scores(table, few.log_likelihoods(policy, table))
     behind = score.amax(-1, keepdim=True) - score
     margin = behind[behind > 0].median().item() + 1e-3
     pruned = _prune(few, table, lambda table: policy, margin)

@@ -104,7 +104,7 @@ def test_everybody_sees_for_themselves():
     knowledge = DOMAIN.nothing_known(number)
     first = {name: value[:, 0] for name, value in observation.items()}
     told = {name: mask[:, 0] for name, mask in nothing.items()}
-    look, after = someone.look(someone.eye, knowledge, first, told)
+    look, after = someone.look(someone.eye, knowledge, first, told, 0)
     assert torch.equal(look.numbers(), view.numbers()[:, 0])
     assert after.unsure.tolist() == [behind, ahead, ahead]
 

@@ -13,7 +13,7 @@ from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.inference.views import build_view_table, combination_scores
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.implants import assumption_sites, sight_sites
+from mirror_ppl.models.implants import NOTICES, assumption_sites, sight_sites
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.view_table import combination_number
@@ -47,6 +47,7 @@ def test_the_sites_of_each(self_model):
     expected = {
         "mirror": sights | assumed | POLICY,
         "one-radius": {"sight_radius"} | assumed | POLICY,
+        "per-item": {NOTICES + car for car in domain.modalities[0].items} | assumed | POLICY,
         "perceptual-only": sights | assumed | choice,
         "policy-only": POLICY,
         "no-implants": choice,
@@ -54,12 +55,12 @@ def test_the_sites_of_each(self_model):
     found = {name: set(sample_sites(VARIANTS[name](self_model), 1)) for name in VARIANTS}
     assert found == expected
     read = {name: len(perceived_sites(VARIANTS[name](self_model))) for name in VARIANTS}
-    assert list(read.values()) == [6, 3, 6, 0, 0]
+    assert list(read.values()) == [6, 3, 2, 6, 0, 0]
 
 
 def scores(human, rounds, policy, combinations=None):
     table = build_view_table(human, rounds, combinations)
-    return combination_scores(table, human.act(policy, table.belief, table.values))
+    return combination_scores(table, human.log_likelihoods(policy, table))
 
 
 def test_variants_are_special_cases(self_model, rounds):
@@ -104,9 +105,9 @@ def test_variants_are_special_cases(self_model, rounds):
 
 @pytest.mark.parametrize("guide", ["exact", "svi"])
 def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
-    """Of the smallest, which has nothing discrete, and of one radius."""
+    """Of the smallest, which has nothing discrete, of one that attends, and of one radius."""
     monkeypatch.chdir(tmp_path)
-    for name in ("no-implants", "one-radius"):
+    for name in ("no-implants", "per-item", "one-radius"):
         given = "--human-model", name
         status = command(
             fit, *given, "--guide", guide, "--train-rounds", 1, "--draws", 8, "--steps", 2,
@@ -116,13 +117,14 @@ def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
     people = json.loads((tmp_path / "one-radius" / "summary.json").read_text())["people"]
     bins = load_self_model(shipped_weights("driving"))[0].domain.reach_bins
     assert {person["implants"]["sight_radius"]["median"] for person in people} <= set(bins)
-    status = command(
-        assist, "--posterior", "one-radius/posterior.nc", *given, "--rounds", 1,
-        "--communicator", "none", "--jobs", 1, "--draws", 8,
-    )  # fmt: skip
-    assert status == 0
+    for name in ("per-item", "one-radius"):
+        status = command(
+            assist, "--posterior", f"{name}/posterior.nc", "--human-model", name, "--rounds", 1,
+            "--communicator", "none", "mirror", "--jobs", 1, "--draws", 8,
+        )  # fmt: skip
+        assert status == 0
 
 
 def test_names_that_are_no_variant(self_model):
-    with pytest.raises(HumanModelError, match="none of mirror, one-radius, perceptual-only"):
+    with pytest.raises(HumanModelError, match="none of mirror, one-radius, per-item, perc"):
         load_human_model("two-radii", self_model)

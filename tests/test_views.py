@@ -163,7 +163,7 @@ def test_table_agrees_with_perceive_believe_act(self_model, recordings, kind):
     assert table.sites == ((*SIGHTS, *ASSUMED) if number > 14 else (SIGHTS[0], ASSUMED[0]))
     assert math.prod(table.sizes) == table.index.shape[-1] == number
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
-    found = combination_scores(table, human.act(policy, table.belief, table.values))
+    found = combination_scores(table, human.log_likelihoods(policy, table))
     axes = torch.unravel_index(some, table.sizes)
     values = dict(zip(table.sites, axes, strict=True))
     for person, lengths in enumerate(LENGTHS):
@@ -185,10 +185,10 @@ def test_views_are_looked_up_by_combination(self_model, recordings):
     assert torch.equal(table.combination(implants), torch.arange(14))
     # [E, P, 1] and [P, 1]: a leading dimension of enumeration is kept.
     enumerated = {name: value[:, None, None] for name, value in implants.items()}
-    assert torch.equal(table.view_of(enumerated), table.index.permute(2, 0, 1))
+    assert torch.equal(table.sight_of(enumerated), table.index.permute(2, 0, 1))
     mixed = {"sight_front_own": torch.tensor([[1], [0], [6]]), "assumes_clear": torch.ones(3, 1)}
     expected = table.index[torch.arange(3), :, torch.tensor([3, 1, 13])]
-    assert torch.equal(table.view_of(mixed), expected)
+    assert torch.equal(table.sight_of(mixed), expected)
 
 
 def test_no_view_is_kept_twice_or_for_nothing(self_model, recordings):
@@ -248,7 +248,7 @@ def test_padding_has_no_influence(self_model, recordings):
 
     def scores(rounds):
         table = build_view_table(human, rounds)
-        return combination_scores(table, human.act(policy, table.belief, table.values))
+        return combination_scores(table, human.log_likelihoods(policy, table))
 
     together = scores(rounds)
     for person, lengths in enumerate(LENGTHS):
@@ -286,9 +286,9 @@ def test_scores_are_those_of_the_possible_combinations(self_model, recordings):
     # Of somebody without rounds nothing is given up.
     assert torch.equal(table.possible, alive | ~table.real.any(-1)[:, None])
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
-    log_probabilities = human.act(policy, table.belief, table.values)
-    expected = combination_scores(table, log_probabilities)
-    found = table.scores(table.log_likelihoods(log_probabilities))
+    likelihoods = human.log_likelihoods(policy, table)
+    expected = combination_scores(table, likelihoods)
+    found = table.scores(likelihoods)
     for combination in range(14):
         implants = {
             "sight_front_own": torch.full((3, 1), combination // 2),
@@ -359,7 +359,7 @@ def test_a_model_that_is_not_stepwise_has_the_same_likelihoods(self_model, recor
     for kind in (HumanModel, Whole):
         human = kind(self_model)
         table = build_view_table(human, rounds, [some] * 3)
-        found.append(combination_scores(table, human.act(policy, table.belief, table.values)))
+        found.append(combination_scores(table, human.log_likelihoods(policy, table)))
         assert table.belief.shape[2] == (1 if human.stepwise else STEPS)
     torch.testing.assert_close(*found, rtol=1e-4, atol=1e-4)
 
@@ -382,8 +382,8 @@ def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordi
             pyro.plate("way", screening.ways, dim=-3),
             pyro.plate("person", 1, dim=-2),
         ):
-            log_probabilities = human.act(human.prior(), table.belief, table.values)
-        scores.append(combination_scores(table, log_probabilities)[:, 0])
+            likelihoods = human.log_likelihoods(human.prior(), table)
+        scores.append(combination_scores(table, likelihoods)[:, 0])
     torch.testing.assert_close(scores[1], merged.score, rtol=1e-4, atol=1e-3)
     off = (scores[1] - scores[0]).abs().amax(-1)
     # Under the ways that it looks at, both are within half a step of one point, at every moment.
@@ -401,14 +401,12 @@ def test_restricted_keeps_what_is_alive_and_forgets_the_rest(self_model, recordi
     alive = (torch.arange(14) + torch.arange(3)[:, None]) % 4 == 0
     small = restricted(table, alive)
     assert_tables_equal(table, before)  # untouched
-    log_probabilities = {}
+    scores = {}
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
     for name, part in (("all", table), ("some", small)):
-        log_probabilities[name] = combination_scores(
-            part, human.act(policy, part.belief, part.values)
-        )
-    assert torch.equal(log_probabilities["some"][alive], log_probabilities["all"][alive])
-    assert (log_probabilities["some"][0][~alive[0]] == IMPOSSIBLE).all()
+        scores[name] = combination_scores(part, human.log_likelihoods(policy, part))
+    assert torch.equal(scores["some"][alive], scores["all"][alive])
+    assert (scores["some"][0][~alive[0]] == IMPOSSIBLE).all()
     for person in range(3):
         used = small.index[person][small.index[person] != NO_VIEW].unique()
         assert used.tolist() == list(range(int(small.view_counts[person])))

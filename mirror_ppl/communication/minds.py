@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
@@ -26,6 +27,9 @@ from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.sites import latent_sites
 
+ATTENTION_VALUES = 16
+"""Values of what differs from round to round, of which each draw gets one."""
+
 
 class Person:
     """A human model with posterior draws of one person's implants.
@@ -35,7 +39,8 @@ class Person:
         draws: values ``[S, 1, 1, ...]`` of all its sites.
 
     Attributes:
-        eyes: values ``[U]`` of the discrete sites, each combination that occurs in the draws once.
+        eyes: values ``[U]`` of the discrete sites, each combination that occurs in the draws once;
+            in a round those of attention, too.
         eye: which of them each draw has, ``[S]``.
 
     Raises:
@@ -53,20 +58,69 @@ class Person:
         missing = latent_sites(trace.trace)
         if missing:
             raise HumanModelError(f"there are no draws of the site {', '.join(missing)}")
-        sites = [
-            name
+        self._discrete = {
+            name: draws[name].reshape(self.number)
             for name, site in trace.trace.nodes.items()
             if name in draws and site["fn"].has_enumerate_support
-        ]
-        device = next(iter(draws.values())).device
-        rows = torch.stack(
-            [draws[name].reshape(self.number).long() for name in sites]
-            or [torch.zeros(self.number, dtype=torch.long, device=device)],
-            -1,
-        )
-        first, self.eye = distinct_rows(rows)
-        self.eyes = {name: draws[name].reshape(self.number)[first] for name in sites}
-        self.eye_count = len(first)
+        }
+        self.device = next(iter(draws.values())).device
+        self.eyes, self.eye = self._distinct_eyes(self._discrete, self.number)
+        self.eye_count = int(self.eye.max()) + 1
+
+    def _distinct_eyes(
+        self, values: Mapping[str, Tensor], number: int
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """Each combination of values ``[number]`` once, and which of them each is."""
+        none = [torch.zeros(number, dtype=torch.long, device=self.device)]
+        rows = torch.stack([value.long() for value in values.values()] or none, -1)
+        first, which = distinct_rows(rows)
+        return {name: value[first] for name, value in values.items()}, which
+
+    @torch.no_grad()
+    def in_round(self, past: RoundSoFar) -> Person:
+        """The person in a round under way, with what they attend to as their actions tell it.
+
+        Each draw gets one of a few values of attention from ``p(m | psi)``, by how probable it
+        makes what was done so far. Nothing changes if no attention differs from round to round.
+        """
+        if not self.human.attends:
+            return self
+        plate = pyro.plate("round", ATTENTION_VALUES, dim=-1)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # the same values at every step of a round
+            with self._conditioned(), plate:
+                drawn = self.human.attend(self.implants)
+            drawn = {
+                name: value.expand(self.number, 1, ATTENTION_VALUES)[:, 0]
+                for name, value in drawn.items()
+            }
+            chances = self._log_chances(drawn, past).softmax(-1)
+            chosen = torch.multinomial(chances, 1).squeeze(-1)
+        each = torch.arange(self.number, device=self.device)
+        own = {name: value[each, chosen] for name, value in drawn.items()}
+        person = copy(self)
+        person.eyes, person.eye = self._distinct_eyes({**self._discrete, **own}, self.number)
+        person.eye_count = int(person.eye.max()) + 1
+        return person
+
+    def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
+        """Log-probability ``[S, J]`` of what was done so far under values of attention alike."""
+        number = next(iter(attention.values())).shape[-1]
+        if not past.time:
+            return torch.zeros(self.number, number, device=self.device)
+        own = {name: value.repeat_interleave(number) for name, value in self._discrete.items()}
+        own |= {name: value.flatten() for name, value in attention.items()}
+        eyes, which = self._distinct_eyes(own, self.number * number)
+        count = int(which.max()) + 1
+        observation, told, actions = _history(past, count)
+        view = self.human.perceive(eyes, observation, told)
+        view = view.map(lambda part: part.expand(count, *part.shape[1:]))
+        belief = self.human.believe(view, observation, actions)
+        values = self.human.self_model.action_values(belief)
+        which = which.view(self.number, 1, number)
+        with self._conditioned():
+            found = self.human.act(self.implants, belief[which], values[which])[:, 0]
+        return found.gather(-1, past.actions.expand(*found.shape[:-1])[..., None]).sum((-1, -2))
 
     def _conditioned(self) -> ExitStack:
         stack = ExitStack()
@@ -83,11 +137,16 @@ class Person:
         return view.map(lambda part: part.expand(len(eye), *part.shape[1:]))
 
     def look(
-        self, eye: Tensor, knowledge: Any, observation: Observation, told: Visibility
+        self,
+        eye: Tensor,
+        knowledge: Any,
+        observation: Observation,
+        told: Visibility,
+        step: int,
     ) -> tuple[View, Any]:
         """One step of eyes ``[n]`` with the domain's knowledge ``[n]``; see `HumanModel.look`."""
         implants = {name: value[eye] for name, value in self.eyes.items()}
-        view, knowledge = self.human.look(implants, knowledge, observation, told)
+        view, knowledge = self.human.look(implants, knowledge, observation, told, step)
         return view.map(lambda part: part.expand(len(eye), *part.shape[1:])), knowledge
 
     def act(self, belief: Tensor, values: Tensor) -> Tensor:
@@ -159,6 +218,7 @@ class Standing:
     @classmethod
     def of(cls, person: Person, past: RoundSoFar) -> Standing:
         """The person at this point of a round."""
+        person = person.in_round(past)
         kind = StepwiseBeliefs if person.human.stepwise else CourseBeliefs
         return cls(person, past, *kind.before(person, past))
 
@@ -210,11 +270,13 @@ class StepwiseBeliefs:
         person: whose they are.
         state: ``q(zH_t | ...)``, parameters ``[n, Z]``; beliefs are the means.
         knowledge: the domain's, ``[n]``.
+        step: the number of the next step.
     """
 
     person: Person
     state: Gaussian
     knowledge: Any
+    step: int
 
     @property
     def courses(self) -> Tensor:
@@ -228,13 +290,13 @@ class StepwiseBeliefs:
         knowledge = human.domain.nothing_known(1, device=eyes.device)
         if past.time == 0:
             zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
-            beliefs = cls(person, Gaussian(zero, torch.ones_like(zero)), knowledge)
+            beliefs = cls(person, Gaussian(zero, torch.ones_like(zero)), knowledge, 0)
             return beliefs, torch.zeros_like(eyes)
         views = []
         for time in range(past.time):
             now = {name: value[time : time + 1] for name, value in past.observation.items()}
             told = {name: mask[time : time + 1] for name, mask in past.told.items()}
-            view, knowledge = person.look(eyes, knowledge, now, told)
+            view, knowledge = person.look(eyes, knowledge, now, told, time)
             views.append(view)
         view = View.stack(views)
         known = torch.cat(_whole_numbers(knowledge), -1)
@@ -242,14 +304,14 @@ class StepwiseBeliefs:
         observation, _, actions = _history(past, len(first))
         mean = human.believe(view.map(lambda part: part[first]), observation, actions)[:, -1]
         state = Gaussian(mean, torch.ones_like(mean))
-        return cls(person, state, _rows(knowledge, first)), which
+        return cls(person, state, _rows(knowledge, first), past.time), which
 
     def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
         """See :class:`Beliefs`; looks that tell the same after the same lead to one belief."""
         human = self.person.human
         seen = {name: value[looks.row] for name, value in looks.observation.items()}
         before = _rows(self.knowledge, looks.parent)
-        view, knowledge = self.person.look(looks.eye, before, seen, looks.told)
+        view, knowledge = self.person.look(looks.eye, before, seen, looks.told, self.step)
         told_by, which = distinct_rows(torch.stack([looks.row, view.numbers()], -1))
         rows = looks.row[told_by]
         evidence = human.evidence(
@@ -263,7 +325,8 @@ class StepwiseBeliefs:
         state = human.advance(
             self.state.mean[looks.parent[first]], evidence[which[first]], looks.action[first]
         )
-        return StepwiseBeliefs(self.person, state, _rows(knowledge, first)), index
+        after = StepwiseBeliefs(self.person, state, _rows(knowledge, first), self.step + 1)
+        return after, index
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,24 @@ def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
     }
 
 
+def attention_sites(human: HumanModel) -> dict[str, Tensor]:
+    """Supports ``[n]`` of the sites of a human model's ``attend``, by name."""
+    if not human.attends:
+        return {}
+    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
+        nodes = attention_nodes(human, human.prior())
+    return {
+        name: node["fn"].enumerate_support(expand=False).flatten() for name, node in nodes.items()
+    }
+
+
+def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Nodes of the sites of attention in one round; runs inside the person plate."""
+    with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
+        human.attend(implants)
+    return latent_sites(trace.trace)
+
+
 def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of those discrete sites that ``perceive`` reads, in the program's order.
 
@@ -53,7 +71,8 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
         m.name: torch.zeros(1, steps, len(m.items), dtype=torch.bool, device=device)
         for m in domain.modalities
     }
-    implants = Readable({name: support[:1] for name, support in supports.items()})
+    attended = attention_sites(human)
+    implants = Readable({name: support[:1] for name, support in (supports | attended).items()})
     human.perceive(implants, observation, told)
     supports = {name: support for name, support in supports.items() if name in implants.read}
     number = prod(len(support) for support in supports.values())

@@ -84,8 +84,8 @@ def log_joints(
             pyro.plate("draw", min(size, number - begin), dim=-3),
             pyro.plate("person", table.people, dim=-2),
         ):
-            log_probabilities = human.act(human.prior(), table.belief, table.values)
-        scores = combination_scores(table, log_probabilities, combinations)
+            likelihoods = human.log_likelihoods(human.prior(), table)
+        scores = combination_scores(table, likelihoods, combinations)
         parts.append(log_priors(human, grid, some, table.people) + scores)
     return torch.cat(parts)
 

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     import arviz as az
 
 PRIOR_DRAWS = 100
+PREDICTED_VALUES = 128
+"""Values of attention that predictions average over, where it differs from round to round."""
 TRAIN_ROUNDS, TEST_ROUNDS = 20, range(30, 36)
 """Rounds 1-20 train and 31-36 test (21-30 are for validation, 37-40 spare), counted from 0."""
 
@@ -150,7 +152,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
             combination_number({site: draws[site][:, person, 0] for site in sizes}, sizes).unique()
             for person in range(people)
         ]
-        return predict_actions(human, build_view_table(human, rounds, candidates), draws).cpu()
+        table = build_view_table(human, rounds, candidates, likely=draws, values=PREDICTED_VALUES)
+        return predict_actions(human, table, draws).cpu()
 
     report("predict", 0, 3, "")
     log_probabilities = {"posterior": predicted(train, dict(posterior.draws))}

@@ -32,6 +32,7 @@ from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.nuts import sample_nuts
 from mirror_ppl.inference.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.inference.prior import Draws, sample_sites
+from mirror_ppl.inference.second_look import LIKELY_DRAWS, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
 from mirror_ppl.inference.views import build_view_table, rounds_of
@@ -177,23 +178,39 @@ def _in_batches(
                 read_checkpoint(files[begin], run)
     for begin in range(0, people, PEOPLE_AT_ONCE):
         some = range(begin, min(begin + PEOPLE_AT_ONCE, people))
+        own = demonstrations.select_people(some) if len(some) < people else demonstrations
         table = build_view_table(
             human,
-            demonstrations.select_people(some) if len(some) < people else demonstrations,
+            own,
             screening=options.screening,
             report=lambda done, begin=begin: report("views", begin + done, people, "people"),
+            likely=_likely(human, own, options, seed + begin, report),
         )
         if options.guide == "nuts":
             drawn = sample_nuts(human, table, options.draws, seed + begin, report)
             found.append(Inferred(drawn))
             continue
-        own = None if checkpoint is None else (files[begin], checkpoint[1])
+        file = None if checkpoint is None else (files[begin], checkpoint[1])
         svi = replace(options.svi, draws=options.draws)
-        posterior = fit_implants(human, table, svi, seed + begin, report, own)
+        posterior = fit_implants(human, table, svi, seed + begin, report, file)
         found.append(Inferred(posterior.draws, losses=posterior.losses))
     draws = {name: torch.cat([one.draws[name] for one in found], 1) for name in found[0].draws}
     losses = tuple(sum(step) for step in zip(*(one.losses for one in found), strict=True))
     return Inferred(draws, losses=losses)
+
+
+def _likely(
+    human: HumanModel,
+    demonstrations: Demonstrations,
+    options: InferenceOptions,
+    seed: int,
+    report: Report,
+) -> Draws | None:
+    """Roughly who people are, where what stands for all they may attend to hangs on that."""
+    if not human.attends:
+        return None
+    roughly = replace(options, guide="exact", draws=LIKELY_DRAWS, exact=rough(options.exact))
+    return dict(_by_importance(human, demonstrations, roughly, seed, None, report, None).draws)
 
 
 def _by_importance(
@@ -212,15 +229,20 @@ def _by_importance(
     with torch.random.fork_rng(devices=[]):
         for person in range(len(done), people):
             report("infer", person, people, "people")
-            sightings = Sightings(human, screening)
-            for one_round in rounds_of(demonstrations, person):
+            sightings, rounds = Sightings(human, screening), list(rounds_of(demonstrations, person))
+            for one_round in rounds:
                 sightings.add(*one_round)
             # Whatever the number of draws that others took.
             torch.manual_seed((seed + 1) * 1_000_003 + person)
             if network is None:
-                found = sample_exactly(human, sightings.table(), options.exact)
+                first = rough(options.exact) if human.attends else options.exact
+                found = sample_exactly(human, sightings.table(), first)
             else:
                 found = sample_amortized(human, network, sightings)
+            if human.attends:
+                sightings, found = second_look(
+                    human, rounds, screening, options.exact, sightings, found
+                )
             done.draws.append(found.sample(options.draws, sightings.grid))
             done.pareto_k.append(found.pareto_k)
             if checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:

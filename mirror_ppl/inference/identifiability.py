@@ -45,6 +45,9 @@ COMBINATIONS = 128
 FEW = 64
 """Combinations among the draws up to which no others are looked at."""
 
+VALUES = 64
+"""Values of attention in a round, where it differs from round to round."""
+
 
 @dataclass(frozen=True)
 class Identifiability:
@@ -129,9 +132,9 @@ def identify(
         drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes)
         candidates, one = drawn.unique(), train.select_people([person])
         if len(candidates) <= FEW:
-            table = build_view_table(human, one, [candidates])
+            table = build_view_table(human, one, [candidates], likely=own, values=VALUES)
         else:  # draws are too few to tell how many there are
-            table = build_view_table(human, one, screening=Screening())
+            table = build_view_table(human, one, screening=Screening(), likely=own, values=VALUES)
             candidates = table.possible[0].nonzero().squeeze(-1)
         if not acts_on_beliefs(human, table):
             return None
@@ -242,7 +245,7 @@ def _information(
     implants |= {site: value[which][:, None] for site, value in grid.items()}
     scenario = torch.arange(number, device=pairs.device).repeat_interleave(rounds)
     played = play_rounds(human, implants, 1, setting, generator, scenario)
-    sightings = Sightings(human, None, candidates)
+    sightings = Sightings(human, None, candidates, policy, VALUES)
     for player in range(len(players)):
         for one_round in rounds_of(played, player):
             sightings.add(*one_round)
@@ -253,9 +256,8 @@ def _information(
         pyro.plate("draw", len(pairs), dim=-3),
         pyro.plate("person", 1, dim=-2),
     ):
-        log_probabilities = human.act(human.prior(), table.belief, table.values)
-    likelihood = table.log_likelihoods(log_probabilities)
-    likelihood = likelihood.expand(len(pairs), 1, -1)[:, 0]  # [S, V]
+        likelihood = human.log_likelihoods(human.prior(), table)
+    likelihood = likelihood.expand(len(pairs), 1, -1)[:, 0]  # [S, U]
     joint = likelihood[:, table.index[0][:, candidates]] + pairs[:, None]  # [S, R, C]
     after = torch.softmax(torch.logsumexp(joint, 0), -1)  # [R, C]
     each = (_entropy(pairs.exp().sum(0)) - _entropy(after)).view(number, rounds)

@@ -207,7 +207,12 @@ class Sampler:
 
 
 @torch.no_grad()
-def sample_exactly(human: HumanModel, table: ViewTable, options: ImportanceOptions) -> Weighted:
+def sample_exactly(
+    human: HumanModel,
+    table: ViewTable,
+    options: ImportanceOptions,
+    near: Weighted | None = None,
+) -> Weighted:
     """Weighted draws of one person by adaptive importance sampling.
 
     The first stage draws from the prior; each that follows draws the scalar sites from a Gaussian,
@@ -217,12 +222,16 @@ def sample_exactly(human: HumanModel, table: ViewTable, options: ImportanceOptio
         human: the model of people.
         table: views of one person's rounds.
         options: settings.
+        near: draws from much the same posterior, whose moments are used from the first stage on.
     """
     sampler = Sampler(human, table)
     few = min(PRUNING_DRAWS, options.proposals)
     sampler.draw(few)
     sampler.prune(options.prune_margin)
-    if options.proposals > few:
+    if near is not None and sampler.sites:
+        found = places(sampler.sites, near.policy)
+        sampler.propose(_gaussian(found, near.log_weights, options.wider), options.proposals)
+    elif options.proposals > few:
         sampler.draw(options.proposals - few)
     for _ in range(options.stages if sampler.sites else 0):
         found = sampler.weighted()

@@ -11,6 +11,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, Weighted, sample_exactly
 from mirror_ppl.inference.prior import Draws, sample_sites
+from mirror_ppl.inference.second_look import Round, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models.human import HumanModel
@@ -33,7 +34,6 @@ class OnlinePosterior:
             than through beliefs.
 
     Attributes:
-        rounds: number of rounds so far.
         pareto_k: of the importance weights at the last asking; above 0.7 they are not to be relied
             on.
         seconds: that adding took the last time, and asking.
@@ -45,11 +45,16 @@ class OnlinePosterior:
         self.human = human
         self.network = network
         self.seed = seed
-        self.rounds = 0
+        self._rounds: list[Round] = []
         self.pareto_k = float("nan")
         self.seconds = 0.0, 0.0
-        screening = Screening() if network is None else guide_screening()
-        self._sightings = Sightings(human, screening)
+        self._screening = Screening() if network is None else guide_screening()
+        self._sightings = Sightings(human, self._screening)
+
+    @property
+    def rounds(self) -> int:
+        """Number of rounds so far."""
+        return len(self._rounds)
 
     def add(self, demonstrations: Demonstrations) -> None:
         """Learn from rounds that have come in.
@@ -70,7 +75,7 @@ class OnlinePosterior:
         if int(demonstrations.round_counts[0]):
             for one_round in rounds_of(demonstrations, 0):
                 self._sightings.add(*one_round)
-                self.rounds += 1
+                self._rounds.append(one_round)
         self.seconds = monotonic() - began, self.seconds[1]
 
     def draws(self, number: int = 200) -> Draws:
@@ -92,8 +97,16 @@ class OnlinePosterior:
         return {name: drawn[name] for name in order}
 
     def _weighted(self) -> Weighted:
+        human, options = self.human, ImportanceOptions()
         if self.network is None:
-            return sample_exactly(self.human, self._sightings.table(), ImportanceOptions())
-        # What the first asking has checked need not be checked again.
-        checked = not math.isnan(self.pareto_k)
-        return sample_amortized(self.human, self.network, self._sightings, ENOUGH, checked=checked)
+            first = rough(options) if human.attends else options
+            found = sample_exactly(human, self._sightings.table(), first)
+        else:
+            # What the first asking has checked need not be checked again.
+            checked = not math.isnan(self.pareto_k)
+            found = sample_amortized(human, self.network, self._sightings, ENOUGH, checked=checked)
+        if human.attends:
+            _, found = second_look(
+                human, self._rounds, self._screening, options, self._sightings, found
+            )
+        return found

@@ -7,7 +7,8 @@ the later rounds need not be seen through their eyes, and exact marginalization 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import prod
@@ -18,13 +19,18 @@ from pyro import poutine
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mirror_ppl.distinct import distinct_rows
+from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains import Observation, Visibility
+from mirror_ppl.inference.attention import KEPT, VALUES, AttentionValues, Proposal
 from mirror_ppl.inference.combinations import grid_of, log_priors, perceived_sites
 from mirror_ppl.inference.courses import CHUNK, beliefs_and_values
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.models.human import HumanModel, View
-from mirror_ppl.models.view_table import NO_VIEW, ViewTable, log_likelihoods
+from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, log_likelihoods
+
+PROPOSING_WAYS = 64
+"""Draws from the prior by which attention is proposed where nothing is screened."""
+TONED_DOWN = 4.0
 
 
 @dataclass(frozen=True)
@@ -56,22 +62,27 @@ class Screening:
 
 @dataclass(frozen=True)
 class RoundViews:
-    """U distinct views of one round, and the moments that they share; see :class:`ViewTable`.
+    """V distinct views of one round, and the moments that they share; see :class:`ViewTable`.
 
     Attributes:
-        moments: ``[U, T]``.
+        moments: ``[V, T]``.
         belief: ``[N, T', Z]``.
         values: ``[N, T', A]``.
         acted: ``[N, T']``.
+        sights: the view under each value of attention, ``[U, G]``; ``None`` if a sight is a view.
+        rounds: of each sight ``[U]``, if there is more than one round.
     """
 
     moments: Tensor
     belief: Tensor
     values: Tensor
     acted: Tensor
+    sights: Tensor | None = None
+    rounds: Tensor | None = None
 
     def __len__(self) -> int:
-        return len(self.moments)
+        """The number of sights U."""
+        return len(self.moments if self.sights is None else self.sights)
 
     def lengthened(self, steps: int) -> RoundViews:
         """The same with padding at the end, as part of a table of longer rounds."""
@@ -83,16 +94,22 @@ class RoundViews:
             real = moments != NO_VIEW
             moments = torch.where(real, moments // length * steps + moments % length, NO_VIEW)
         grown = more if length > 1 else 0
-        return RoundViews(
-            pad(moments, [0, more], value=NO_VIEW),
-            pad(self.belief, [0, 0, 0, grown]),
-            pad(self.values, [0, 0, 0, grown]),
-            pad(self.acted, [0, grown]),
+        return replace(
+            self,
+            moments=pad(moments, [0, more], value=NO_VIEW),
+            belief=pad(self.belief, [0, 0, 0, grown]),
+            values=pad(self.values, [0, 0, 0, grown]),
+            acted=pad(self.acted, [0, grown]),
         )
 
-    def kept(self, views: Tensor) -> RoundViews:
-        """Only some views, and the moments that they have."""
-        moments = self.moments[views]
+    def kept(self, sights: Tensor) -> RoundViews:
+        """Only some sights, and the views and moments that they have."""
+        if self.sights is not None:
+            views, place = torch.unique(self.sights[sights], return_inverse=True)
+            rounds = None if self.rounds is None else self.rounds[sights]
+            alone = replace(self, sights=None, rounds=None)
+            return replace(alone.kept(views), sights=place, rounds=rounds)
+        moments = self.moments[sights]
         real = moments != NO_VIEW
         length = self.belief.shape[1]
         used, place = torch.unique(moments[real] // length, return_inverse=True)
@@ -111,6 +128,9 @@ class Sightings:
         screening: when to give up combinations on the way; never if ``None``.
         candidates: numbers of the combinations that are considered at all (see
             :meth:`ViewTable.combination`); all of them unless given.
+        likely: draws ``[S, 1, 1, ...]`` of what the person may be like, from whom attention is
+            proposed; what rounds say of draws from the prior unless given.
+        values: of attention that stand for all in a round.
 
     Raises:
         HumanModelError: see :func:`perceived_sites`.
@@ -120,7 +140,7 @@ class Sightings:
         sizes: number of values of each of these sites.
         alive: numbers of the combinations that are left.
         score: log-likelihood ``[ways, M]`` of each of them under each way to decide.
-        ways: these ways, see :meth:`draw_ways`.
+        ways: these ways, see :meth:`draw_ways`; what is likely, if that is known.
     """
 
     def __init__(
@@ -128,6 +148,8 @@ class Sightings:
         human: HumanModel,
         screening: Screening | None,
         candidates: Tensor | None = None,
+        likely: Mapping[str, Tensor] | None = None,
+        values: int = VALUES,
     ) -> None:
         device = next(human.parameters()).device
         self.human = human
@@ -141,9 +163,18 @@ class Sightings:
         ways = 0 if screening is None else screening.ways
         self.score = torch.zeros(ways, prod(self.sizes), device=device)
         self.ways: dict[str, Tensor] = {}
+        if likely is not None and screening is not None:
+            some = torch.arange(ways, device=device) % len(next(iter(likely.values())))
+            self.ways = {name: value[some] for name, value in likely.items()}
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
+        self._attended: list[AttentionValues] = []
+        self._proposal: Proposal | None = None
+        if human.attends:
+            known = {} if likely is not None else self.draw_ways()
+            anybody = known or draw_prior(human, 1, PROPOSING_WAYS, 0)
+            self._proposal = Proposal(human, anybody, likely, values)
 
     @torch.no_grad()
     def add(
@@ -159,23 +190,47 @@ class Sightings:
         """
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
+        attended, number, seed = None, len(alive), 0
+        if self._proposal is not None:
+            seed = _number_of({**observation, "actions": actions}) % 2**62
+            attended = self._proposal.values(self._weights(), seed)
+            each = len(attended)
+            candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
+            candidates |= {name: value.repeat(number) for name, value in attended.values.items()}
+            number = number * each
         view = self.human.perceive(candidates, observation, told)
-        part, which = _views(self.human, view, observation, actions, real, len(alive))
+        part, which = _views(self.human, view, observation, actions, real, number)
+        if self.screening is not None and self.screening.resolution > 0:
+            part, which = self._merged(part, which, self.screening)
+        sights = None
+        if attended is not None:
+            seen = which.view(len(alive), -1)
+            first, which = distinct_rows(seen)
+            sights = seen[first]  # [U, G]
         if self.screening is not None:
-            if self.screening.resolution > 0:
-                part, which = self._merged(part, which, self.screening)
-            score = self.score[:, alive] + self._log_likelihoods(part)[:, which]
+            found = self._log_likelihoods(part)
+            if attended is not None and sights is not None:
+                found = self._attending(found[:, sights], attended)
+                useful = torch.softmax(found, -1).mean(1)
+                found = torch.logsumexp(found, -1)
+                attended = attended.thinned(self._weights() @ useful, KEPT, seed)
+                sights = sights[:, attended.kept]
+            score = self.score[:, alive] + found[:, which]
             self.score[:, alive] = score
             best = score.amax(0)
             self.alive = alive[best >= best.max() - self.screening.margin]
+        if attended is not None:
+            self._attended.append(attended)
+            part = replace(part, sights=sights)
+            part = part.kept(torch.arange(len(part), device=alive.device))
         self._rounds.append(part)
         self._seen.append((alive, which))
         self._recorded.append((actions[0], real))
 
     def table(self) -> ViewTable:
         """The views that are left, as a table of one person; there was at least one round."""
-        index, rounds, views, moments = [], [], 0, 0
-        shifted = []
+        index, rounds, sights, views, moments = [], [], 0, 0, 0
+        shifted, attended = [], []
         steps = max(len(real) for _, real in self._recorded)
         for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
             # Only what somebody who was never given up has seen is worth keeping.
@@ -183,12 +238,15 @@ class Sightings:
             row[combination] = view
             needed, place = torch.unique(row[self.alive], return_inverse=True)
             row = torch.full_like(row, NO_VIEW)
-            row[self.alive] = views + place
+            row[self.alive] = sights + place
             part = part.kept(needed).lengthened(steps)
             index.append(row)
             rounds.append(part)
             shifted.append(torch.where(part.moments == NO_VIEW, NO_VIEW, part.moments + moments))
-            views, moments = views + len(part), moments + part.acted.numel()
+            if part.sights is not None:
+                attended.append(part.sights + views)
+            sights, views = sights + len(part), views + len(part.moments)
+            moments = moments + part.acted.numel()
         return ViewTable(
             sites=tuple(self.grid),
             sizes=self.sizes,
@@ -200,7 +258,34 @@ class Sightings:
             recorded=self._padded_to(steps, 0)[None],
             steps=self._padded_to(steps, 1)[None],
             view_counts=torch.tensor([views]),
+            attention=self._attention(attended) if attended else None,
         )
+
+    def _attention(self, sights: list[Tensor]) -> Attention:
+        """Values of all rounds, given the sights of each ``[U, G']``."""
+        attended = self._attended
+        rounds = [torch.full((len(part),), place) for place, part in enumerate(sights)]
+        most = max(part.shape[1] for part in sights)
+        return Attention(
+            values={
+                name: _stacked([one.values[name] for one in attended])
+                for name in attended[0].values
+            },
+            log_weights=_stacked([one.log_weights for one in attended], -torch.inf),
+            kept=_stacked([one.kept for one in attended]),
+            log_kept=_stacked([one.log_kept for one in attended], torch.inf),
+            sights=torch.cat([pad(part, [0, most - part.shape[1]]) for part in sights])[None],
+            rounds=torch.cat(rounds).to(self.alive.device)[None],
+        )
+
+    def _weights(self) -> Tensor:
+        """Of the ways, as the rounds so far have it ``[ways]``; the same for all without ways."""
+        if self.screening is None:
+            number = PROPOSING_WAYS
+            return torch.full((number,), 1 / number, device=self.alive.device)
+        joint = (self.score + self.log_prior)[:, self.alive].logsumexp(-1)
+        # Toned down: few ways would have all the weight, and none of them is the person.
+        return torch.softmax(joint / TONED_DOWN, 0)
 
     def _padded_to(self, steps: int, which: int) -> Tensor:
         """Recorded actions (0) or real steps (1) of all rounds, ``[B, T]``."""
@@ -243,9 +328,17 @@ class Sightings:
         return kept, place[which]
 
     def _log_likelihoods(self, part: RoundViews) -> Tensor:
-        """Of a round's actions under each way and view, ``[ways, U]``."""
+        """Of a round's actions under each way and view, ``[ways, V]``."""
         found = self._act(self.draw_ways(), part.belief[None], part.values[None])[:, 0]
         return log_likelihoods(found, part.acted, part.moments)
+
+    def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
+        """Log joint ``[ways, U, G]`` of actions and attention, of likelihoods ``[ways, U, G]``."""
+        values = {name: value[None, None] for name, value in attended.values.items()}
+        with self._deciding(self.draw_ways()):
+            implants = self.human.prior()
+            chances = self.human.log_attention(implants, values, attended.log_weights[None, None])
+        return likelihoods + chances[:, 0]
 
     def draw_ways(self) -> dict[str, Tensor]:
         """The ways to decide, ``[ways, 1, 1, ...]``; always the same."""
@@ -255,6 +348,14 @@ class Sightings:
 
     def _act(self, ways: Mapping[str, Tensor], belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities ``[ways, 1, N, T', A]``."""
+        with self._deciding(ways) as number:
+            found = self.human.act(self.human.prior(), belief, values)
+        # Of a model whose actions depend on no implant they are the same in every way.
+        return found.expand(number, *found.shape[-4:])
+
+    @contextmanager
+    def _deciding(self, ways: Mapping[str, Tensor]) -> Iterator[int]:
+        """The program runs for so many people, each with one of the ways."""
         number = len(next(iter(ways.values()))) if ways else len(self.score)
         with (
             poutine.block(),
@@ -262,9 +363,7 @@ class Sightings:
             pyro.plate("way", number, dim=-3),
             pyro.plate("person", 1, dim=-2),
         ):
-            found = self.human.act(self.human.prior(), belief, values)
-        # Of a model whose actions depend on no implant they are the same in every way.
-        return found.expand(number, *found.shape[-4:])
+            yield number
 
 
 def _views(
@@ -290,3 +389,18 @@ def _views(
         part = RoundViews(moments, belief[node], values[node], acted)
     moments = torch.where(real, part.moments, NO_VIEW)
     return replace(part, moments=moments), inverse
+
+
+def _number_of(values: Mapping[str, Tensor]) -> int:
+    """A whole number that tells recordings from others."""
+    total = 0
+    for value in values.values():
+        whole = as_whole_numbers(value).flatten()
+        total += int((whole * random_keys(len(whole), whole.device)).sum())
+    return total
+
+
+def _stacked(parts: list[Tensor], fill: float = 0) -> Tensor:
+    """Values ``[...]`` of each round as ``[1, B, ...]``, padded at the end."""
+    most = max(len(part) for part in parts)
+    return torch.stack([pad(part, [0, most - len(part)], value=fill) for part in parts])[None]

@@ -52,20 +52,28 @@ def play_rounds(
         for m in domain.modalities
     }
     sites = dict(implants)
+    # What the program itself draws comes from the generator, too, whatever else is drawn from it.
+    own = torch.Generator(device)
+    own.set_state(generator.get_state())
+    seed = int(torch.randint(2**31, (), generator=own, device=device))
     for step in range(steps):
         # What comes later does not matter to this step: the last observation stands in for it.
         shown = observed + observed[-1:] * (steps - 1 - step)
         observation = {name: torch.stack([one[name] for one in shown], 2) for name in shown[0]}
         with (
+            torch.random.fork_rng(devices=[]),
             poutine.trace() as trace,
             poutine.condition(data=sites),
             pyro.plate("person", people, dim=-2),
         ):
+            torch.manual_seed(seed)
             drawn = human.prior()
+            with pyro.plate("round", rounds, dim=-1):
+                drawn = {**drawn, **human.attend(drawn)}
             view = human.perceive(drawn, observation, told)
             belief = human.believe(view, observation, actions)
             log_probability = human.act(drawn, belief, human.self_model.action_values(belief))
-        # What was drawn at the first step stays for all rounds.
+        # What was drawn at the first step stays, of a person for all rounds.
         sites |= latent_values(trace.trace)
         probability = log_probability[..., step, :].exp().flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)

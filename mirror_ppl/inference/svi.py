@@ -30,7 +30,7 @@ from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import combination_scores, restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import discrete_names, latent_sites
-from mirror_ppl.models.view_table import NO_VIEW, ViewTable
+from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable
 
 Report = Callable[[str, int, int, str], None]
 """Told of long work: what it is, how many steps are done, of how many, and a message."""
@@ -207,8 +207,8 @@ def _prune(human: HumanModel, table: ViewTable, guide: AutoGuide, margin: float)
             poutine.condition(data=guide(table)),
             pyro.plate("person", table.people, dim=-PLATES),
         ):
-            log_probabilities = human.act(human.prior(), table.belief, table.values)
-        score = combination_scores(table, log_probabilities)
+            likelihoods = human.log_likelihoods(human.prior(), table)
+        score = combination_scores(table, likelihoods)
         best = score if best is None else torch.maximum(best, score)
     assert best is not None
     return restricted(table, best >= best.amax(-1, keepdim=True) - margin)
@@ -302,9 +302,34 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
             pyro.plate("person", table.people, dim=-PLATES),
         ):
             implants = human.prior()
-            view = table.view_of(implants).expand(table.people, table.rounds)
-            moments = table.moments[person, view].clamp(min=0)  # [P, B, T]
+            sight = table.sight_of(implants).expand(table.people, table.rounds)
+            if table.attention is not None:
+                results.append(_attentive(human, implants, table, table.attention, sight))
+                continue
+            moments = table.moments[person, sight].clamp(min=0)  # [P, B, T]
             results.append(
                 human.act(implants, belief[everybody, moments], values[everybody, moments])
             )
     return torch.stack(results)
+
+
+def _attentive(
+    human: HumanModel,
+    implants: Mapping[str, Tensor],
+    table: ViewTable,
+    attention: Attention,
+    sight: Tensor,
+) -> Tensor:
+    """Log-probabilities ``[P, B, T, A]`` with attention summed out, given what was done so far."""
+    person = torch.arange(table.people, device=sight.device)[:, None]
+    views = attention.sights[person, sight]  # [P, B, G']
+    moments = table.moments[person[..., None], views].clamp(min=0)  # [P, B, G', T]
+    each = human.act(implants, table.belief, table.values).flatten(-3, -2)
+    found = each.expand(table.people, *each.shape[-2:])[person[..., None, None], moments]
+    done = table.recorded[:, :, None, :, None].expand(*moments.shape, 1)
+    along = found.gather(-1, done).squeeze(-1).cumsum(-1)
+    weights = human.log_attention(implants, attention.values, attention.log_weights)
+    # What was done before a step tells what they attend to at it.
+    before = torch.nn.functional.pad(along[..., :-1], [1, 0])
+    before = torch.log_softmax(before + attention.shares(weights)[..., None], 2)
+    return torch.logsumexp(before[..., None] + found, 2)

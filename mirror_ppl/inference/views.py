@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation, Visibility
+from mirror_ppl.inference.attention import VALUES
 from mirror_ppl.inference.sightings import RoundViews, Screening, Sightings
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, ViewTable
+from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
 
 
 def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
@@ -23,24 +25,34 @@ def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
         needed, renumbered = torch.unique(row[row != NO_VIEW], return_inverse=True)
         row[row != NO_VIEW] = renumbered
         people.append(views_of(table, person).kept(needed))
+    attention = table.attention
+    if attention is not None:
+        attention = replace(attention, **_padded_sights(people))
     return replace(
         table,
         index=index,
         **_padded(people),
-        view_counts=torch.tensor([len(views) for views in people]),
+        view_counts=torch.tensor([len(views.moments) for views in people]),
+        attention=attention,
     )
 
 
 def views_of(table: ViewTable, person: int) -> RoundViews:
     """One person's views, padding included."""
+    attention = table.attention
     return RoundViews(
-        table.moments[person], table.belief[person], table.values[person], table.acted[person]
+        table.moments[person],
+        table.belief[person],
+        table.values[person],
+        table.acted[person],
+        None if attention is None else attention.sights[person],
+        None if attention is None else attention.rounds[person],
     )
 
 
 def _padded(people: Sequence[RoundViews]) -> dict[str, Tensor]:
     """Views of P people as the fields of a table."""
-    views = max(len(own) for own in people)
+    views = max(len(own.moments) for own in people)
     moments = max(len(own.acted) for own in people)
     return {
         "moments": torch.stack([_pad(own.moments, views, NO_VIEW) for own in people]),
@@ -50,17 +62,29 @@ def _padded(people: Sequence[RoundViews]) -> dict[str, Tensor]:
     }
 
 
+def _padded_sights(people: Sequence[RoundViews]) -> dict[str, Tensor]:
+    """Sights of P people as the fields of a table."""
+    most = max(len(own) for own in people)
+    sights = [own.sights for own in people if own.sights is not None]
+    widest = max(part.shape[1] for part in sights)
+    sights = [pad(part, [0, widest - part.shape[1]]) for part in sights]
+    rounds = [own.rounds for own in people if own.rounds is not None]
+    return {
+        "sights": torch.stack([_pad(part, most) for part in sights]),
+        "rounds": torch.stack([_pad(part, most) for part in rounds]),
+    }
+
+
 def combination_scores(
-    table: ViewTable, log_probabilities: Tensor, combinations: Tensor | None = None
+    table: ViewTable, likelihood: Tensor, combinations: Tensor | None = None
 ) -> Tensor:
-    """Log-likelihood ``[..., P, M]`` of each combination, given log-probabilities of actions.
+    """Log-likelihood ``[..., P, M]`` of each combination, given that of sights.
 
     Args:
         table: the recorded rounds.
-        log_probabilities: ``[..., P, N, T', A]`` of actions at the table's beliefs.
+        likelihood: of each sight ``[..., P, U]``, see :meth:`HumanModel.log_likelihoods`.
         combinations: numbers ``[M]`` of those that are asked for; all unless given.
     """
-    likelihood = table.log_likelihoods(log_probabilities)
     scores = []
     for person, index in enumerate(table.index):
         index = index[table.real[person]]
@@ -84,6 +108,8 @@ def build_view_table(
     candidates: Sequence[Tensor] | None = None,
     screening: Screening | None = None,
     report: Callable[[int], None] = lambda people: None,
+    likely: Mapping[str, Tensor] | None = None,
+    values: int = VALUES,
 ) -> ViewTable:
     """Every distinct view of the recorded rounds, with the beliefs that they lead to.
 
@@ -94,6 +120,8 @@ def build_view_table(
             :meth:`ViewTable.combination`); all of them unless given.
         screening: when to give up combinations on the way; never unless given.
         report: called with the number of people done.
+        likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`Sightings`.
+        values: of attention that stand for all in a round, see there.
 
     Raises:
         HumanModelError: ``perceive`` reads a site that cannot be enumerated, or there are too many
@@ -101,7 +129,11 @@ def build_view_table(
     """
     tables = []
     for person in range(demonstrations.num_people):
-        sightings = Sightings(human, screening, None if candidates is None else candidates[person])
+        own = None
+        if likely is not None:
+            own = {name: value[:, person : person + 1] for name, value in likely.items()}
+        some = None if candidates is None else candidates[person]
+        sightings = Sightings(human, screening, some, own, values)
         for one_round in rounds_of(demonstrations, person):
             sightings.add(*one_round)
         tables.append(sightings.table())
@@ -111,15 +143,32 @@ def build_view_table(
 
 def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> ViewTable:
     """The table of P people of the tables of each of them."""
-    rounds = demonstrations.shape[1]
+    rounds, views = demonstrations.shape[1], [views_of(table, 0) for table in tables]
+    own = [table.attention for table in tables if table.attention is not None]
+    attention = None
+    if own:
+
+        def padded(parts: Sequence[Tensor], fill: float = 0) -> Tensor:
+            most = max(part.shape[-1] for part in parts)
+            parts = [pad(part[0], [0, most - part.shape[-1]], value=fill) for part in parts]
+            return torch.stack([_pad(part, rounds) for part in parts])
+
+        attention = Attention(
+            values={name: padded([one.values[name] for one in own]) for name in own[0].values},
+            log_weights=padded([one.log_weights for one in own], -torch.inf),
+            kept=padded([one.kept for one in own]),
+            log_kept=padded([one.log_kept for one in own], torch.inf),
+            **_padded_sights(views),
+        )
     return ViewTable(
         sites=tables[0].sites,
         sizes=tables[0].sizes,
         index=torch.stack([_pad(table.index[0], rounds, NO_VIEW) for table in tables]),
-        **_padded([views_of(table, 0) for table in tables]),
+        **_padded(views),
         recorded=demonstrations.actions.clamp(min=0),
         steps=demonstrations.mask,
         view_counts=torch.cat([table.view_counts for table in tables]),
+        attention=attention,
     )
 
 
@@ -143,4 +192,4 @@ def rounds_of(
 
 def _pad(value: Tensor, length: int, fill: int = 0) -> Tensor:
     missing = length - len(value)
-    return torch.nn.functional.pad(value, [0, 0] * (value.dim() - 1) + [0, missing], value=fill)
+    return pad(value, [0, 0] * (value.dim() - 1) + [0, missing], value=fill)

@@ -3,7 +3,8 @@
 Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a person ``p``::
 
     psi_p      ~ prior                                     inside pyro.plate("person", P)
-    n_t        = natural visibility of each item           perceptual implants
+    m_b        ~ what differs from round to round          inside pyro.plate("round", B); or nothing
+    n_t        = natural visibility of each item           perceptual implants and attention m_b
     k_t        = what follows from everything seen and told up to t
     v_t        = n_t or told_t or k_t                      what was communicated is overlaid
     u_t        = what psi_p takes for granted about the rest
@@ -11,9 +12,9 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
     a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
     z_t, x_t, r_t ~ the self-model's transition, observation and reward likelihoods
 
-To change the model, derive from :class:`HumanModel` and override one of ``prior``, ``sees``,
-``perceive``, ``believe`` and ``act``, in Pyro's syntax; fitting, predicting and simulating call
-those methods.
+To change the model, derive from :class:`HumanModel` and override one of ``prior``, ``attend``,
+``sees``, ``perceive``, ``believe`` and ``act``, in Pyro's syntax; fitting, predicting and
+simulating call those methods.
 
 Departures from the supplement: thresholds are inferred by the bin between distances that can occur;
 a person may take things for granted (``assumes_clear``, ``assumes_closing``); actions may be
@@ -29,6 +30,7 @@ from typing import Any
 
 import pyro
 import torch
+from pyro import poutine
 from torch import Tensor, nn
 
 from mirror_ppl.distinct import as_whole_numbers, random_keys
@@ -39,6 +41,10 @@ from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.view_table import RecordedActions, ViewTable
 
 Implants = Mapping[str, Tensor]
+SPARE = 6
+"""Dimensions that draws and enumeration may take to the left of people and rounds."""
+SPARED = 3
+"""Dimensions of people, rounds and values of their attention."""
 
 
 @dataclass(frozen=True)
@@ -148,13 +154,65 @@ class HumanModel(nn.Module):
             self.domain, like
         ) | implant_priors.policy_implants(self.domain, self.self_model.latent, like)
 
-    def sees(self, implants: Implants, observation: Observation) -> Visibility:
+    def attend(self, implants: Implants) -> dict[str, Tensor]:
+        """Sample what differs from round to round in what somebody sees: their attention ``m_b``.
+
+        Runs inside ``pyro.plate("person", P, dim=-2)`` and ``pyro.plate("round", B, dim=-1)``. Its
+        sites are discrete with finite support, and :meth:`perceive` reads them like those of
+        :meth:`prior`; nothing differs unless this is overridden.
+
+        Args:
+            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
+        """
+        del implants
+        return {}
+
+    @property
+    def attends(self) -> bool:
+        """Whether something differs from round to round."""
+        return type(self).attend is not HumanModel.attend
+
+    def log_attention(
+        self, implants: Implants, values: Mapping[str, Tensor], log_weights: Tensor
+    ) -> Tensor:
+        """``log p(m_b | psi_p)`` of G values that stand for all in a round, ``[..., P, B, G]``.
+
+        Runs inside the person plate. Probabilities add up to 1 over the values.
+
+        Args:
+            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
+            values: of the sites of :meth:`attend`, ``[P, B, G]``.
+            log_weights: for how many each of them stands, ``[P, B, G]``.
+        """
+        # Far to the left of whatever dimensions draws and enumeration take.
+        given = {
+            name: value.movedim(-1, 0).view(value.shape[-1], *(1,) * SPARE, *value.shape[:-1])
+            for name, value in values.items()
+        }
+        rounds = next(iter(values.values())).shape[1]
+        with (
+            poutine.block(),
+            poutine.trace() as trace,
+            poutine.condition(data=given),
+            pyro.plate("round", rounds, dim=-1),
+        ):
+            self.attend(implants)
+        nodes = [trace.trace.nodes[name] for name in given]
+        total = sum(node["fn"].log_prob(node["value"]) for node in nodes)
+        total = torch.as_tensor(total).movedim(0, -1)
+        while total.dim() > SPARED and total.shape[0] == 1:
+            total = total.squeeze(0)
+        return torch.log_softmax(total + log_weights, -1)
+
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """What a person sees by themselves at one step, masks ``[..., K]``: ``n_t``.
 
         Args:
-            implants: the discrete sites of :meth:`prior`, ``[...]``.
+            implants: the discrete sites of :meth:`prior` and :meth:`attend`, ``[...]``.
             observation: everything that could be seen at this step, ``[..., K, F]``.
+            step: the number of the step in its round, from 0.
         """
+        del step
         direction, distance = self.domain.distance(observation)
         reach = implant_priors.reach(self.domain, implants)  # [..., D]
         batch = torch.broadcast_shapes(reach.shape[:-1], direction.shape[:-1])
@@ -167,23 +225,29 @@ class HumanModel(nn.Module):
         }
 
     def look(
-        self, implants: Implants, knowledge: Any, observation: Observation, told: Visibility
+        self,
+        implants: Implants,
+        knowledge: Any,
+        observation: Observation,
+        told: Visibility,
+        step: int,
     ) -> tuple[View, Any]:
         """One step of :meth:`perceive`.
 
         Args:
-            implants: the discrete sites of :meth:`prior`, ``[...]``.
+            implants: the discrete sites of :meth:`prior` and :meth:`attend`, ``[...]``.
             knowledge: the domain's, of the step before.
             observation: everything that could be seen at this step, ``[..., K, F]``.
             told: what is communicated at this step, ``[..., K]``.
+            step: the number of the step in its round, from 0.
 
         Returns:
             The view of this step, and the knowledge after it.
         """
         domain = self.domain
-        seen = self.sees(implants, observation)
-        visible = {name: mask | told[name] for name, mask in seen.items()}
-        knowledge = domain.learn(knowledge, observation, visible, partial(self.sees, implants))
+        sees = partial(self.sees, implants, step=step)
+        visible = {name: mask | told[name] for name, mask in sees(observation).items()}
+        knowledge = domain.learn(knowledge, observation, visible, sees)
         visible = {name: visible[name] | mask for name, mask in domain.known(knowledge).items()}
         items, imagined = domain.assume(knowledge, observation)
         taken = {name: torch.zeros_like(mask) for name, mask in visible.items()}
@@ -200,7 +264,7 @@ class HumanModel(nn.Module):
         """What a person sees, is told, remembers and takes for granted, masks ``[..., T, K]``.
 
         Args:
-            implants: the discrete sites of :meth:`prior`, ``[...]``.
+            implants: the discrete sites of :meth:`prior` and :meth:`attend`, ``[...]``.
             observation: everything that could be seen, ``[..., T, K, F]``.
             told: what is communicated, ``[..., T, K]``.
         """
@@ -212,7 +276,7 @@ class HumanModel(nn.Module):
                 for name, value in observation.items()
             }
             heard = {name: mask[..., step, :] for name, mask in told.items()}
-            view, knowledge = self.look(implants, knowledge, now, heard)
+            view, knowledge = self.look(implants, knowledge, now, heard, step)
             views.append(view)
         return View.stack(views)
 
@@ -265,6 +329,22 @@ class HumanModel(nn.Module):
         aware = torch.log1p(-lapse) + torch.log_softmax(logits, -1)
         return torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
 
+    def log_likelihoods(self, implants: Implants, table: ViewTable) -> Tensor:
+        """Of the recorded actions under each sight of a round, ``[..., P, U]``.
+
+        Runs inside the person plate. What people attended to is summed out.
+
+        Args:
+            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
+            table: the rounds of P people and the distinct views of them.
+        """
+        log_probabilities = self.act(implants, table.belief, table.values)
+        attention = table.attention
+        if attention is None:
+            return table.log_likelihoods(log_probabilities)
+        weights = self.log_attention(implants, attention.values, attention.log_weights)
+        return table.log_likelihoods(log_probabilities, weights)
+
     def model(self, table: ViewTable, world: Rounds | None = None) -> None:
         """The program, conditioned on the recorded actions of a table of views.
 
@@ -276,8 +356,7 @@ class HumanModel(nn.Module):
         """
         with pyro.plate("person", table.people, dim=-2):
             implants = self.prior()
-            log_probabilities = self.act(implants, table.belief, table.values)
-            scores = table.scores(table.log_likelihoods(log_probabilities))
+            scores = table.scores(self.log_likelihoods(implants, table))
             pyro.sample(
                 "actions",
                 RecordedActions(scores, table.place_of(implants), table.recorded.shape[1:]),

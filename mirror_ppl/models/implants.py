@@ -20,6 +20,10 @@ SIGHT = "sight_"
 """Prefix of the sites of directional sight thresholds, one for each direction of the domain."""
 ASSUMES = "assumes_"
 """Prefix of the sites of what a person takes for granted, one for each assumption of the domain."""
+NOTICES, NOTICED = "notices_", "noticed_"
+"""Prefixes of the sites of how probably each item is noticed at a step, and of when it was."""
+LEAST_PROBABILITY = 1e-6
+"""So near to 0 or 1 probabilities count as this far away, so that logarithms are finite."""
 RESIDUAL_HIDDEN = 8
 
 
@@ -49,6 +53,50 @@ def reach_implant(site: str, domain: Domain, like: Tensor) -> Tensor:
     """Sample how far somebody sees, as an index into the domain's ``reach_bins``; uniform."""
     bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
     return pyro.sample(site, dist.Categorical(bins / bins.sum()))
+
+
+def noticed_sites(domain: Domain) -> tuple[str, ...]:
+    """Names of the sites of when items are noticed, in the order of the visual items."""
+    return tuple(NOTICED + item for item in _visual_items(domain))
+
+
+def notice_implants(domain: Domain, like: Tensor) -> dict[str, Tensor]:
+    """Sample how probably somebody notices each item at a step: ``notices_<item>``, uniform."""
+    one = like.new_ones(())
+    return {
+        site: pyro.sample(site, dist.Beta(one, one))
+        for site in (NOTICES + item for item in _visual_items(domain))
+    }
+
+
+def notice_times(domain: Domain, implants: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Sample at which step of a round each item is noticed: ``noticed_<item>``, from 0.
+
+    Geometric, cut off at the domain's horizon, which stands for never.
+    """
+    return {
+        NOTICED + item: pyro.sample(
+            NOTICED + item, first_success(implants[NOTICES + item], domain.horizon)
+        )
+        for item in _visual_items(domain)
+    }
+
+
+def first_success(probability: Tensor, trials: int) -> dist.Categorical:
+    """Failures before the first success: geometric, cut off at a number that stands for none.
+
+    Args:
+        probability: of success of a trial, ``[...]``.
+        trials: number of trials; the support is from 0 to this number.
+    """
+    probability = probability.clamp(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)[..., None]
+    failures = torch.arange(trials + 1, device=probability.device)
+    success = torch.where(failures < trials, torch.log(probability), 0.0)
+    return dist.Categorical(logits=failures * torch.log1p(-probability) + success)
+
+
+def _visual_items(domain: Domain) -> tuple[str, ...]:
+    return next(m.items for m in domain.modalities if m.name == "visual")
 
 
 def assumption_implants(

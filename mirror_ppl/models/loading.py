@@ -11,9 +11,10 @@ from pathlib import Path
 import pyro
 import torch
 from pyro import poutine
+from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError, MirrorError
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.variants import VARIANTS
@@ -105,6 +106,8 @@ def check_contract(human: HumanModel) -> None:
                 raise HumanModelError(
                     f"prior returned {type(implants).__name__}, expected a dict of sites by name"
                 )
+            method = "attend"
+            attention = _attention(human, implants, people)
             sampled = latent_values(trace.trace)
             discrete = {
                 name: sampled[name].flatten()[:people].expand(people)
@@ -112,7 +115,7 @@ def check_contract(human: HumanModel) -> None:
                 if name in discrete_names(trace.trace)
             }
             method = "perceive"
-            view = human.perceive(Readable(discrete), observation, told)
+            view = human.perceive(Readable(discrete | attention), observation, told)
             method = "believe"
             belief = human.believe(view, observation, done)[:, None]
             method = "act"
@@ -134,6 +137,25 @@ def check_contract(human: HumanModel) -> None:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
         where = _where(error, None if file is None else Path(file))
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
+
+
+def _attention(human: HumanModel, implants: Implants, people: int) -> dict[str, Tensor]:
+    """What differs from round to round, in one round of each ``[people]``."""
+    with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
+        returned = human.attend(implants)
+    sites = latent_sites(trace.trace)
+    if not isinstance(returned, Mapping) or set(returned) != set(sites):
+        raise HumanModelError("attend has to return a dict of the sites that it samples, by name")
+    for name, site in sites.items():
+        if not site["fn"].has_enumerate_support:
+            raise HumanModelError(f'"{name}" of attend has no finite support')
+        if tuple(site["fn"].batch_shape) != (people, 1) or site["fn"].event_shape:
+            raise HumanModelError(
+                f'"{name}" of attend has shape {tuple(site["fn"].batch_shape)} and event shape '
+                f"{tuple(site['fn'].event_shape)}, expected ({people}, 1) and () for {people} "
+                "people with one round"
+            )
+    return {name: site["value"].flatten()[:people].expand(people) for name, site in sites.items()}
 
 
 def _check_sites(trace: poutine.Trace, people: int) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants
 
@@ -27,12 +27,44 @@ class OneRadius(HumanModel):
             | implant_priors.policy_implants(domain, self.self_model.latent, like)
         )
 
-    def sees(self, implants: Implants, observation: Observation) -> Visibility:
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """The same reach in each direction."""
         radius = implants[self.RADIUS]
-        return super().sees(
-            dict.fromkeys(implant_priors.sight_sites(self.domain), radius), observation
+        reach = dict.fromkeys(implant_priors.sight_sites(self.domain), radius)
+        return super().sees(reach, observation, step)
+
+
+class PerItem(HumanModel):
+    """Notices each item sooner or later: the family of bomb defusal (supplement, section C).
+
+    At every step of a round somebody notices an item ``k`` that they have not noticed with their
+    own probability ``notices_k``, and from there on they see it, wherever it is::
+
+        notices_k   ~ Beta(1, 1)                          probability at a step
+        noticed_k,b ~ Geometric(notices_k), from step 0   in each round b; the horizon for never
+        n_t,k       = noticed_k,b <= t
+    """
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample the probabilities, what is taken for granted, and how people decide."""
+        domain, like = self.domain, next(self.self_model.parameters())
+        return (
+            implant_priors.notice_implants(domain, like)
+            | implant_priors.assumption_implants(domain, like)
+            | implant_priors.policy_implants(domain, self.self_model.latent, like)
         )
+
+    def attend(self, implants: Implants) -> dict[str, Tensor]:
+        """Sample when each item is noticed."""
+        return implant_priors.notice_times(self.domain, implants)
+
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
+        """What was noticed at this step or before."""
+        times = [implants[site] for site in implant_priors.noticed_sites(self.domain)]
+        noticed = torch.stack(torch.broadcast_tensors(*times), -1) <= step
+        direction, _ = self.domain.distance(observation)
+        noticed = noticed.expand(torch.broadcast_shapes(noticed.shape, direction.shape))
+        return _by_eye(self.domain, noticed)
 
 
 class PerceptualOnly(HumanModel):
@@ -53,14 +85,10 @@ class NoImplants(HumanModel):
         """Sample how strictly people choose."""
         return implant_priors.choice_implants(next(self.self_model.parameters()))
 
-    def sees(self, implants: Implants, observation: Observation) -> Visibility:
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """Everything that could be seen."""
         direction, _ = self.domain.distance(observation)
-        everything = torch.ones_like(direction, dtype=torch.bool)
-        return {
-            modality.name: everything if modality.name == "visual" else ~everything
-            for modality in self.domain.modalities
-        }
+        return _by_eye(self.domain, torch.ones_like(direction, dtype=torch.bool))
 
 
 class PolicyOnly(NoImplants):
@@ -75,8 +103,18 @@ class PolicyOnly(NoImplants):
 VARIANTS: dict[str, type[HumanModel]] = {
     "mirror": HumanModel,
     "one-radius": OneRadius,
+    "per-item": PerItem,
     "perceptual-only": PerceptualOnly,
     "policy-only": PolicyOnly,
     "no-implants": NoImplants,
 }
 """Human models of the package by the names that commands take; the first is what they fit."""
+
+
+def _by_eye(domain: Domain, seen: Tensor) -> Visibility:
+    """Items seen ``[..., K]``, and nothing heard."""
+    nothing = torch.zeros_like(seen)
+    return {
+        modality.name: seen if modality.name == "visual" else nothing
+        for modality in domain.modalities
+    }

@@ -54,6 +54,52 @@ def log_likelihoods(log_probabilities: Tensor, acted: Tensor, moments: Tensor) -
 
 
 @dataclass(frozen=True)
+class Attention:
+    """Values of what differs from round to round, G a round, that stand for all there could be.
+
+    A combination of a person's implants then has not one view of a round, but one under each of
+    these values. Those views together are a *sight* of the round; there are U.
+
+    Attributes:
+        values: of the sites of ``attend``, ``[P, B, G]``.
+        log_weights: for how many of all that there could be each of them stands, ``[P, B, G]``;
+            minus infinity in padding.
+        kept: those that could explain what was done, ``[P, B, G']``, an index into the G.
+        log_kept: log-probability with which each of these was kept, ``[P, B, G']``; infinity in
+            padding.
+        sights: the view of each sight under each value kept, ``[P, U, G']``, an index into the V
+            views.
+        rounds: the round that each sight is of, ``[P, U]``.
+    """
+
+    values: Mapping[str, Tensor]
+    log_weights: Tensor
+    kept: Tensor
+    log_kept: Tensor
+    sights: Tensor
+    rounds: Tensor
+
+    def marginal(self, likelihoods: Tensor, log_weights: Tensor) -> Tensor:
+        """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.
+
+        Args:
+            likelihoods: of the recorded actions under each view.
+            log_weights: log-probability of each value, ``[..., P, B, G]``.
+        """
+        shape = self.sights.shape[1:]
+        views = self.sights.flatten(1).expand(*likelihoods.shape[:-1], -1)
+        found = likelihoods.gather(-1, views).unflatten(-1, shape)
+        shares = self.shares(log_weights)
+        rounds = self.rounds[..., None].expand(*shares.shape[:-2], *shape)
+        return torch.logsumexp(found + shares.gather(-2, rounds), -1)
+
+    def shares(self, log_weights: Tensor) -> Tensor:
+        """Log-probabilities ``[..., P, B, G']`` of what is kept, of those of all values."""
+        kept = self.kept.expand(*log_weights.shape[:-1], -1)
+        return log_weights.gather(-1, kept) - self.log_kept
+
+
+@dataclass(frozen=True)
 class ViewTable:
     """Distinct views of the rounds of P people, V a person (padded), with the beliefs they lead to.
 
@@ -63,8 +109,9 @@ class ViewTable:
     Attributes:
         sites: names of the discrete sites that views depend on.
         sizes: number of values of each of those sites.
-        index: view of each person, round and combination of those sites' values, ``[P, B, M]``, an
-            index into the person's V views or ``NO_VIEW``.
+        index: sight of each person, round and combination of those sites' values, ``[P, B, M]``,
+            an index into the person's U sights or ``NO_VIEW``. Where attention does not differ
+            from round to round a sight is a view, and U is V.
         moments: of each step of a view, which of the N T' beliefs it is, ``[P, V, T]``; ``NO_VIEW``
             in padding.
         belief: ``[P, N, T', Z]``.
@@ -73,6 +120,7 @@ class ViewTable:
         recorded: actions ``[P, B, T]``, 0 in padding.
         steps: which steps are real ``[P, B, T]``.
         view_counts: number of real views of each person ``[P]``.
+        attention: values of what differs from round to round, if anything does.
     """
 
     sites: tuple[str, ...]
@@ -85,6 +133,7 @@ class ViewTable:
     recorded: Tensor
     steps: Tensor
     view_counts: Tensor
+    attention: Attention | None = None
 
     @property
     def people(self) -> int:
@@ -101,8 +150,8 @@ class ViewTable:
         """Which rounds are real, ``[P, B]``."""
         return self.steps.any(-1)
 
-    def view_of(self, implants: Implants) -> Tensor:
-        """The view that implants ``[..., P, 1]`` lead to in each round, ``[..., P, B]``."""
+    def sight_of(self, implants: Implants) -> Tensor:
+        """The sight that implants ``[..., P, 1]`` lead to in each round, ``[..., P, B]``."""
         people = torch.arange(self.people, device=self.index.device)[:, None]
         rounds = torch.arange(self.rounds, device=self.index.device)
         begin = (people * self.rounds + rounds) * self.index.shape[-1]
@@ -129,8 +178,8 @@ class ViewTable:
         return first[:, :number].T
 
     @cached_property
-    def _views(self) -> Tensor:
-        """Views of the C possible combinations in each round, ``[P, B, C]``; 0 in padding."""
+    def _sights(self) -> Tensor:
+        """Sights of the C possible combinations in each round, ``[P, B, C]``; 0 in padding."""
         numbers = self.possible_numbers.T[:, None].expand(-1, self.rounds, -1)
         return self.index.gather(-1, numbers).clamp(min=0)
 
@@ -141,22 +190,29 @@ class ViewTable:
         return self._places.reshape(-1)[begin + self.combination(implants)]
 
     def scores(self, likelihoods: Tensor) -> Tensor:
-        """Log-likelihood ``[..., P, C]`` of the possible combinations, of views ``[..., P, V]``."""
-        views = self._views.flatten(1).expand(*likelihoods.shape[:-1], -1)
-        found = likelihoods.gather(-1, views).unflatten(-1, self._views.shape[1:])
+        """Log-likelihood ``[..., P, C]`` of possible combinations, of sights ``[..., P, U]``."""
+        sights = self._sights.flatten(1).expand(*likelihoods.shape[:-1], -1)
+        found = likelihoods.gather(-1, sights).unflatten(-1, self._sights.shape[1:])
         return torch.where(self.real[..., None], found, 0.0).sum(-2)
 
     def combination(self, implants: Implants) -> Tensor:
         """Number of the combination that implants ``[...]`` are, row-major over ``sizes``."""
         return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
 
-    def log_likelihoods(self, log_probabilities: Tensor) -> Tensor:
-        """Log-likelihood ``[..., P, V]`` of the recorded actions under each view.
+    def log_likelihoods(
+        self, log_probabilities: Tensor, log_attention: Tensor | None = None
+    ) -> Tensor:
+        """Log-likelihood ``[..., P, U]`` of the recorded actions under each sight.
 
         Args:
             log_probabilities: of actions ``[..., P, N, T', A]``.
+            log_attention: log-probability of each value of attention ``[..., P, B, G]``, where
+                there are such.
         """
-        return log_likelihoods(log_probabilities, self.acted, self.moments)
+        found = log_likelihoods(log_probabilities, self.acted, self.moments)
+        if self.attention is None or log_attention is None:
+            return found
+        return self.attention.marginal(found, log_attention)
 
 
 class RecordedActions(TorchDistribution):

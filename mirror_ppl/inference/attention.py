@@ -1,0 +1,199 @@
+"""Values of what differs from round to round, chosen to stand for all there could be.
+
+A person's attention ``m`` in a round cannot be enumerated: its sites have too many combinations of
+values. Sums over them, ``sum_m p(m | psi) f(m)``, are estimated from G values, the same for all
+``psi``, so that what is estimated is smooth in ``psi``. Values are drawn without replacement from a
+product ``q`` of one distribution for each site, and each is weighted by the inverse of the
+probability ``pi(m)`` with which it is among those drawn::
+
+    sum_m p(m | psi) f(m)  ~=  sum_g w_g f(m_g) / sum_g w_g,    w_g = p(m_g | psi) / pi(m_g)
+
+which is right in the limit whatever ``q`` is, and exact where the combinations are no more than G.
+Probable values are taken for certain and the improbable by systematic resampling (Fearnhead and
+Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by site.
+Of the G values, those that could explain what was done are kept in the same way; the sum in the
+denominator, which needs no beliefs, is over all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.inference.combinations import attention_nodes, attention_sites
+from mirror_ppl.models.human import HumanModel
+
+VALUES, KEPT = 512, 96
+"""Values of attention that stand for all in a round, and how many are kept for what was done."""
+ANY_WAY, ANY_VALUE = 0.08, 0.02
+"""Shares of ``q`` for what is probable of anybody, and for everything alike."""
+ANY_USE = 0.05
+"""Share of what is kept that goes to everything alike."""
+
+
+@dataclass(frozen=True)
+class AttentionValues:
+    """G values of what differs from round to round.
+
+    Attributes:
+        values: of each site ``[G]``.
+        log_weights: ``-log pi``, ``[G]``.
+        kept: which of them are looked at ``[G']``.
+        log_kept: log-probability with which each of these was kept ``[G']``.
+    """
+
+    values: dict[str, Tensor]
+    log_weights: Tensor
+    kept: Tensor
+    log_kept: Tensor
+
+    def __len__(self) -> int:
+        return len(self.log_weights)
+
+    def thinned(self, useful: Tensor, number: int, seed: int) -> AttentionValues:
+        """With only so many kept, by how useful each of the G is, ``[G]``, adding up to 1."""
+        generator = torch.Generator(useful.device).manual_seed(seed)
+        shares = (1 - ANY_USE) * useful + ANY_USE / len(self)
+        kept, log_kept = _resampled(shares.double().log(), number, generator)
+        return replace(self, kept=kept, log_kept=log_kept.to(useful.dtype))
+
+
+def site_probabilities(
+    human: HumanModel, ways: Mapping[str, Tensor], weights: Tensor | None = None
+) -> dict[str, Tensor]:
+    """How probable each value of each site of attention is, ``[n]``.
+
+    Args:
+        human: the model of people.
+        ways: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
+        weights: of each of them ``[W]``; alike unless given.
+    """
+    number = len(next(iter(ways.values())))
+    with (
+        poutine.block(),
+        poutine.condition(data=dict(ways)),
+        pyro.plate("way", number, dim=-3),
+        pyro.plate("person", 1, dim=-2),
+    ):
+        nodes = attention_nodes(human, human.prior())
+    found = {}
+    for name, node in nodes.items():
+        support = node["fn"].enumerate_support(expand=False)
+        chances = node["fn"].log_prob(support).exp().reshape(len(support), -1)  # [n, W]
+        chances = chances.expand(-1, number)
+        found[name] = chances.mean(-1) if weights is None else chances @ weights
+    return found
+
+
+def choose_values(
+    supports: Mapping[str, Tensor],
+    chances: Mapping[str, Tensor],
+    number: int,
+    generator: torch.Generator,
+) -> AttentionValues:
+    """Draw values from the product of distributions, without replacement.
+
+    Args:
+        supports: of each site ``[n]``.
+        chances: probabilities of these values ``[n]``, none of them 0.
+        number: of values G; fewer if there are no more combinations.
+        generator: source of the draws.
+    """
+    device = generator.device
+    places = torch.zeros(1, 0, dtype=torch.long, device=device)
+    log_mass = torch.zeros(1, dtype=torch.double, device=device)
+    log_chosen = torch.zeros(1, dtype=torch.double, device=device)
+    for own in chances.values():
+        size = len(own)
+        places = torch.cat(
+            [
+                places.repeat_interleave(size, 0),
+                torch.arange(size, device=device).repeat(len(places))[:, None],
+            ],
+            1,
+        )
+        log_mass = (log_mass[:, None] + own.double().log()).flatten()
+        log_chosen = log_chosen.repeat_interleave(size)
+        kept, log_kept = _resampled(log_mass - log_chosen, number, generator)
+        places, log_mass = places[kept], log_mass[kept]
+        log_chosen = log_chosen[kept] + log_kept
+    values = {
+        name: support[place]
+        for (name, support), place in zip(supports.items(), places.T, strict=True)
+    }
+    log_weights = -log_chosen.to(next(iter(chances.values())).dtype)
+    everything = torch.arange(len(log_weights), device=device)
+    return AttentionValues(values, log_weights, everything, torch.zeros_like(log_weights))
+
+
+def _resampled(
+    log_weights: Tensor, number: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Which of N are kept, ``number`` of them, and the log-probability with which each was."""
+    if len(log_weights) <= number:
+        return torch.arange(len(log_weights), device=log_weights.device), log_weights * 0
+    weights = torch.softmax(log_weights, 0)
+    # The probability is min(1, scale * weight), with the scale that adds up to the number.
+    ordered = weights.sort(descending=True).values
+    certain = torch.arange(number, device=weights.device)
+    rest = 1 - ordered.cumsum(0)[:number] + ordered[:number]  # what is left with so many certain
+    scale = (number - certain) / rest
+    enough = scale * ordered[:number] <= 1
+    scale = scale[int(enough.long().argmax())] if bool(enough.any()) else scale[-1]
+    probability = (scale * weights).clamp(max=1)
+    ladder = probability.cumsum(0) + torch.rand((), generator=generator, device=weights.device)
+    steps = ladder.floor()
+    kept = (steps.diff(prepend=steps.new_zeros(1)) >= 1).nonzero().squeeze(-1)
+    return kept, probability[kept].log()
+
+
+class Proposal:
+    """Proposes values of attention for round after round of a person.
+
+    Args:
+        human: the model of people; it attends.
+        anybody: draws ``[W, 1, 1, ...]`` of implants from the prior.
+        likely: draws of what this person may be like; unknown unless given.
+        number: of values G.
+    """
+
+    def __init__(
+        self,
+        human: HumanModel,
+        anybody: Mapping[str, Tensor],
+        likely: Mapping[str, Tensor] | None,
+        number: int = VALUES,
+    ) -> None:
+        self.human = human
+        self.supports = attention_sites(human)
+        self.number = number
+        self.anybody = dict(anybody)
+        self._prior = site_probabilities(human, anybody)
+        self._likely = None if likely is None else site_probabilities(human, likely)
+
+    def values(self, weights: Tensor | None, seed: int) -> AttentionValues:
+        """Values for a round.
+
+        Args:
+            weights: of the draws from the prior, as the rounds so far have it, ``[W]``; looked at
+                unless it is known what the person may be like.
+            seed: of the draws.
+        """
+        likely = self._likely
+        if likely is None:
+            likely = self._prior
+            if weights is not None:
+                likely = site_probabilities(self.human, self.anybody, weights)
+        chances = {
+            name: (1 - ANY_WAY - ANY_VALUE) * own
+            + ANY_WAY * self._prior[name]
+            + ANY_VALUE / len(own)
+            for name, own in likely.items()
+        }
+        generator = torch.Generator(next(iter(chances.values())).device).manual_seed(seed)
+        return choose_values(self.supports, chances, self.number, generator)
