@@ -19,7 +19,7 @@ from mirror_ppl.inference.views import combination_scores
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
-CHUNK = 2**23
+CHUNK = 2**21
 """Steps of views, of all draws together, that are worked out at once; bounds memory."""
 
 TRIED_VIEWS = 16

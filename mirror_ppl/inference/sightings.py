@@ -192,7 +192,8 @@ class Sightings:
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
         attended, number, seed = None, len(alive), 0
         if self._proposal is not None:
-            seed = _number_of({**observation, "actions": actions}) % 2**62
+            recorded = {**observation, "actions": actions}
+            seed = _number_of({name: value[:, real] for name, value in recorded.items()})
             attended = self._proposal.values(self._weights(), seed)
             each = len(attended)
             candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
@@ -392,12 +393,12 @@ def _views(
 
 
 def _number_of(values: Mapping[str, Tensor]) -> int:
-    """A whole number that tells recordings from others."""
+    """A seed that tells recordings from others."""
     total = 0
     for value in values.values():
         whole = as_whole_numbers(value).flatten()
         total += int((whole * random_keys(len(whole), whole.device)).sum())
-    return total
+    return total % 2**62
 
 
 def _stacked(parts: list[Tensor], fill: float = 0) -> Tensor:

@@ -182,10 +182,21 @@ def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
 
 def _layer(weights: Tensor, inputs: Tensor) -> Tensor:
     """Per-person linear layer: weights ``[..., I + 1, O]`` on inputs ``[..., T, I]``."""
-    if weights.dim() > 2 and weights.shape[-3] == 1 and inputs.dim() > 3:
-        # Views of a person share the weights: one product for all of them, not one for each.
-        weights = weights.squeeze(-3)
-        product = inputs.flatten(-3, -2) @ weights[..., :-1, :]
-        product = product.unflatten(-2, inputs.shape[-3:-1])
-        return product + weights[..., None, -1:, :]
-    return inputs @ weights[..., :-1, :] + weights[..., -1:, :]
+    if weights.dim() <= 2 or weights.shape[-3] != 1 or inputs.dim() <= 3:
+        return inputs @ weights[..., :-1, :] + weights[..., -1:, :]
+    # Views of a person share the weights: one product for all of them, not one for each.
+    weights = weights.squeeze(-3)
+    views = inputs.flatten(-3, -2)
+    if weights.dim() == views.dim() + 1:
+        product = _of_all_draws(weights, views)
+    else:
+        product = views @ weights[..., :-1, :] + weights[..., -1:, :]
+    return product.unflatten(-2, inputs.shape[-3:-1])
+
+
+def _of_all_draws(weights: Tensor, inputs: Tensor) -> Tensor:
+    """S draws of weights ``[S, ..., I + 1, O]`` on the same inputs ``[..., V, I]``: one product."""
+    draws, outputs = weights.shape[0], weights.shape[-1]
+    joined = weights.movedim(0, -2).flatten(-2)  # [..., I + 1, S O]
+    product = inputs @ joined[..., :-1, :] + joined[..., -1:, :]
+    return product.unflatten(-1, (draws, outputs)).movedim(-2, 0)

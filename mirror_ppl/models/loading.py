@@ -147,14 +147,16 @@ def _attention(human: HumanModel, implants: Implants, people: int) -> dict[str, 
     if not isinstance(returned, Mapping) or set(returned) != set(sites):
         raise HumanModelError("attend has to return a dict of the sites that it samples, by name")
     for name, site in sites.items():
+        if not site["fn"].support.is_discrete:
+            raise HumanModelError(f'"{name}" of attend is not discrete')
+        shape, event = tuple(site["fn"].batch_shape), tuple(site["fn"].event_shape)
+        if event or torch.broadcast_shapes(shape, (people, 1)) != (people, 1):
+            raise HumanModelError(
+                f'"{name}" of attend has shape {shape} and event shape {event}, expected '
+                f"({people}, 1) and () for {people} people with one round"
+            )
         if not site["fn"].has_enumerate_support:
             raise HumanModelError(f'"{name}" of attend has no finite support')
-        if tuple(site["fn"].batch_shape) != (people, 1) or site["fn"].event_shape:
-            raise HumanModelError(
-                f'"{name}" of attend has shape {tuple(site["fn"].batch_shape)} and event shape '
-                f"{tuple(site['fn'].event_shape)}, expected ({people}, 1) and () for {people} "
-                "people with one round"
-            )
     return {name: site["value"].flatten()[:people].expand(people) for name, site in sites.items()}
 
 
