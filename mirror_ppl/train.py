@@ -40,7 +40,7 @@ class Options:
     people: int = 1000
     """Of a guide: people to learn from, simulated in the true domain."""
     human_model: str | None = None
-    """Of a guide: another human model: one-radius, perceptual-only, policy-only or no-implants, or
+    """Of a guide: another human model: one-radius, per-item, perceptual-only and so on, or
     one of your own, path/to/file.py:Class (see docs/extending.md)."""
     self_model: Path | None = None
     """Of a guide: weights of the robot's self-model; those that ship unless given."""

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from pathlib import Path
 
 import pyro
 import pyro.distributions as dist
@@ -34,7 +35,7 @@ from mirror_ppl.inference.views import (
 )
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import first_success, noticed_sites, policy_implants
-from mirror_ppl.models.loading import check_contract
+from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import PerItem
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -410,6 +411,34 @@ def test_rounds_that_come_in_are_those_that_were_there(self_model, recordings):
     assert at_once.rounds == one_by_one.rounds == 3
     for site, value in at_once.draws(20).items():
         assert torch.equal(value, one_by_one.draws(20)[site])
+
+
+def test_the_example_is_a_mixture_of_seeing_and_not(self_model, recordings):
+    """Of rounds of somebody who is away with some probability; by the package's own model."""
+    example = Path(__file__).parents[1] / "docs" / "examples" / "distracted.py"
+    human = load_human_model(f"{example}:DistractedPerson", self_model)
+    check_contract(human)
+    one = recordings.select_people([0]).select_rounds([0])
+    implants = {name: value[0] for name, value in drawn(human, 1).items()}
+    some = [torch.arange(0, 9604, 97)]
+
+    def scores(model):
+        table = build_view_table(model, one, some)
+        return combination_scores(table, model.log_likelihoods(implants, table))[0][some[0]]
+
+    seeing, blind = scores(HumanModel(self_model)), scores(Blind(self_model))
+    away = float(implants["distracted"])
+    expected = torch.logaddexp(math.log1p(-away) + seeing, math.log(away) + blind)
+    torch.testing.assert_close(scores(human), expected, rtol=1e-4, atol=1e-4)
+    assert (seeing - blind).abs().max() > 0.5
+
+
+class Blind(HumanModel):
+    """Sees nothing by themselves."""
+
+    def sees(self, implants, observation, step):
+        seen = super().sees(implants, observation, step)
+        return {name: torch.zeros_like(mask) for name, mask in seen.items()}
 
 
 # --- in communication
