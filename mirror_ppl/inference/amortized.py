@@ -19,12 +19,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor, nn
 
+from mirror_ppl.inference.alike import Alike
 from mirror_ppl.inference.importance import Sampler, Weighted, places, scalar_sites
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.models.human import HumanModel
@@ -49,13 +51,15 @@ class Evidence:
 
     Attributes:
         log_evidence: of each way ``[W]``.
-        joint: log joint of combinations under each way, ``[W, C]``.
+        alike: combinations of what the person sees, those still possible.
+        joint: log joint of these G sets under each way, ``[W, G]``.
         ways: the ways, draws ``[W, 1, 1, ...]`` of the sites that perception does not read.
         table: views of the rounds.
         steps: number of recorded actions.
     """
 
     log_evidence: Tensor
+    alike: Alike
     joint: Tensor
     ways: dict[str, Tensor]
     table: ViewTable
@@ -64,20 +68,18 @@ class Evidence:
 
 def log_evidence(sightings: Sightings) -> Tensor:
     """Log-evidence ``[W]`` of a person's rounds so far under each way to decide."""
-    return _joint(sightings).logsumexp(-1)
-
-
-def _joint(sightings: Sightings) -> Tensor:
-    """Log joint ``[W, C]`` of the combinations that are left, in increasing order."""
-    alive = sightings.alive.sort().values
-    return sightings.score[:, alive] + sightings.log_prior[:, alive]
+    alive = sightings.alive
+    return (sightings.score[:, alive] + sightings.log_prior[:, alive]).logsumexp(-1)
 
 
 def evidence_of(sightings: Sightings) -> Evidence:
     """What a person's rounds so far say."""
-    table, joint = sightings.table(), _joint(sightings)
+    table = sightings.table()
+    alike = Alike.of(table, sightings.log_prior)
+    prior = alike.log_prior if alike.fixed else sightings.log_prior[:, alike.first]
+    joint = sightings.score[:, alike.first] + prior
     ways = {name: way for name, way in sightings.ways.items() if name not in table.sites}
-    return Evidence(joint.logsumexp(-1), joint, ways, table, int(table.steps.sum()))
+    return Evidence(joint.logsumexp(-1), alike, joint, ways, table, int(table.steps.sum()))
 
 
 class AmortizedGuide(nn.Module):
@@ -174,7 +176,7 @@ def sample_amortized(
     proposals: int = 64,
     stages: int = 16,
     prune_margin: float = 12.0,
-    checked: bool = False,
+    sites: Mapping[str, Any] | None = None,
 ) -> Weighted:
     """Weighted draws of one person: the guide's, and the ways that evidence is about.
 
@@ -186,12 +188,12 @@ def sample_amortized(
         proposals: draws from the guide of a stage.
         stages: the largest number of stages.
         prune_margin: see :class:`ImportanceOptions`.
-        checked: see :class:`Sampler`.
+        sites: see :class:`Sampler`.
     """
     if stages < 1:
         raise ValueError(f"stages must be at least 1, not {stages}")
     evidence = evidence_of(sightings)
-    sampler = Sampler(human, evidence.table, checked)
+    sampler = Sampler(human, evidence.table, evidence.alike, sites)
     sampler.take(evidence.ways, evidence.joint)
     sampler.prune(prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)

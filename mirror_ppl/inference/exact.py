@@ -63,14 +63,17 @@ def log_joints(
     table: ViewTable,
     draws: Mapping[str, Tensor],
     combinations: Tensor | None = None,
+    log_prior: Tensor | None = None,
 ) -> Tensor:
     """As :func:`log_joint` for each of S draws ``[S, P, 1, ...]``: ``[S, P, M]``.
 
     Right for models in which :func:`acts_on_beliefs`. Of all combinations unless ``combinations``
-    ``[M]`` says of which.
+    ``[M]`` says of which, and with their prior unless there is another ``log_prior`` ``[M]``.
     """
     number = len(next(iter(draws.values()))) if draws else 1
-    grid = combination_values(human, table)
+    grid = {}
+    if log_prior is None:
+        grid = combination_values(human, table)
     if combinations is not None:
         grid = {site: value[combinations] for site, value in grid.items()}
     size = max(1, CHUNK // max(1, table.moments.numel()))
@@ -86,7 +89,10 @@ def log_joints(
         ):
             likelihoods = human.log_likelihoods(human.prior(), table)
         scores = combination_scores(table, likelihoods, combinations)
-        parts.append(log_priors(human, grid, some, table.people) + scores)
+        if log_prior is None:
+            parts.append(log_priors(human, grid, some, table.people) + scores)
+        else:
+            parts.append(log_prior[None, None] + scores)
     return torch.cat(parts)
 
 

@@ -21,11 +21,17 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, biject_to
 
-from mirror_ppl.inference.exact import log_joints, require_acting_on_beliefs
+from mirror_ppl.inference.alike import Alike
+from mirror_ppl.inference.combinations import log_priors
+from mirror_ppl.inference.exact import (
+    combination_values,
+    log_joints,
+    require_acting_on_beliefs,
+)
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import restricted
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import NO_VIEW, ViewTable
+from mirror_ppl.models.view_table import ViewTable
 
 PRUNING_DRAWS = 64
 """Draws from the prior after which combinations of discrete sites are given up."""
@@ -62,15 +68,15 @@ class Weighted:
 
     Attributes:
         policy: values of the sites that perception does not read, ``[S, 1, 1, ...]``.
-        combinations: of the discrete sites that it reads, numbers ``[C]`` of those still possible.
-        log_joint: log-probability of each of them and of the recorded actions under each draw,
-            ``[S, C]``, up to what all combinations share.
+        alike: combinations of the discrete sites that it reads, those still possible; G sets.
+        log_joint: log-probability of each of these sets and of the recorded actions under each
+            draw, ``[S, G]``, up to what all of them share.
         log_weights: normalized and Pareto-smoothed, ``[S]``.
         pareto_k: of the weights.
     """
 
     policy: Draws
-    combinations: Tensor
+    alike: Alike
     log_joint: Tensor
     log_weights: Tensor
     pareto_k: float
@@ -92,10 +98,10 @@ class Weighted:
         place = torch.searchsorted(self.log_weights.exp().cumsum(0), ladder.to(self.log_weights))
         place = place.clamp(max=len(self.log_weights) - 1)[torch.randperm(number)]
         # By the inverse of their distribution; multinomial is slow where there are many.
-        ladder = torch.softmax(self.log_joint[place].double(), -1).cumsum(-1)
+        distinct, which = place.unique(return_inverse=True)
+        ladder = torch.softmax(self.log_joint[distinct].double(), -1).cumsum(-1)[which]
         chosen = torch.searchsorted(ladder, ladder[:, -1:] * torch.rand_like(ladder[:, :1]))
-        chosen = chosen.clamp(max=ladder.shape[-1] - 1)
-        combination = self.combinations[chosen]
+        combination = self.alike.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))[:, None]
         discrete = {site: value[combination][..., None] for site, value in values.items()}
         return {name: value[place] for name, value in self.policy.items()} | discrete
 
@@ -122,24 +128,35 @@ class Sampler:
     Args:
         human: the model of people.
         table: views of one person's rounds.
-        checked: whether the model is known to act on beliefs alone.
+        alike: the possible combinations, if they are known.
+        sites: see :func:`scalar_sites`, of a model that is known to act on beliefs alone; looked
+            up and checked unless given.
 
     Raises:
         HumanModelError: actions depend on what is seen otherwise than through beliefs.
 
     Attributes:
-        combinations: those of the discrete sites that are still possible, ``[C]``.
+        alike: combinations of the discrete sites that are still possible.
         place: the scalar sites of all draws, in unconstrained space ``[S, D]``.
     """
 
-    def __init__(self, human: HumanModel, table: ViewTable, checked: bool = False) -> None:
-        if not checked:
+    def __init__(
+        self,
+        human: HumanModel,
+        table: ViewTable,
+        alike: Alike | None = None,
+        sites: Mapping[str, Any] | None = None,
+    ) -> None:
+        if sites is None:
             require_acting_on_beliefs(human, table)
         self.human = human
         self.table = table
-        self.sites = scalar_sites(human)
-        possible = (table.index[0] != NO_VIEW).all(0) | ~table.real.any()
-        self.combinations = possible.nonzero().squeeze(-1)
+        self.sites = scalar_sites(human) if sites is None else sites
+        if alike is None:
+            two, _ = complete(human, table, {}, 2)
+            grid = combination_values(human, table)
+            alike = Alike.of(table, log_priors(human, grid, two, 1)[:, 0])
+        self.alike = alike
         self.place = torch.zeros(0, len(self.sites), device=table.index.device)
         self._from_prior = 0
         self._proposals: list[tuple[int, Proposal]] = []
@@ -153,7 +170,7 @@ class Sampler:
         self.take(policy, self._joint(policy, number))
 
     def take(self, policy: Draws, joint: Tensor) -> None:
-        """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, C]``."""
+        """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
         place = places(self.sites, policy, len(joint))
         given = {name: policy[name] for name in self.sites}
         _, log_prior = complete(self.human, self.table, given, len(joint))
@@ -164,11 +181,11 @@ class Sampler:
         """Give up combinations that are behind the best by more than that under every draw."""
         joint = torch.cat(self._joints)
         keep = (joint - joint.max()).amax(0) >= -margin
-        self.combinations = self.combinations[keep]
+        self.alike = self.alike.kept(keep)
         self._joints = [joint[:, keep] for joint in self._joints]
         if self.table.real.any():
             alive = torch.zeros_like(self.table.index[:, 0], dtype=torch.bool)
-            alive[0, self.combinations] = True
+            alive[0, self.alike.members] = True
             self.table = restricted(self.table, alive)
 
     def propose(self, proposal: Proposal, number: int) -> None:
@@ -199,10 +216,12 @@ class Sampler:
         policy = {
             name: torch.cat([one[name] for one in self._policies]) for name in self._policies[0]
         }
-        return Weighted(policy, self.combinations, joint, log_weights, pareto_k)
+        return Weighted(policy, self.alike, joint, log_weights, pareto_k)
 
     def _joint(self, policy: Draws, number: int) -> Tensor:
-        joint = log_joints(self.human, self.table, policy, self.combinations)[:, 0]
+        alike = self.alike
+        prior = alike.log_prior if alike.fixed else None
+        joint = log_joints(self.human, self.table, policy, alike.first, prior)[:, 0]
         return joint.expand(number, -1)
 
 

@@ -9,14 +9,19 @@ import torch
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
-from mirror_ppl.inference.importance import ImportanceOptions, Weighted, sample_exactly
+from mirror_ppl.inference.importance import (
+    ImportanceOptions,
+    Weighted,
+    sample_exactly,
+    scalar_sites,
+)
 from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.second_look import Round, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models.human import HumanModel
 
-ENOUGH = 110.0
+ENOUGH = 64.0
 """Effective draws at which a guide proposes no more: enough for an answer that cannot wait."""
 
 
@@ -50,6 +55,9 @@ class OnlinePosterior:
         self.seconds = 0.0, 0.0
         self._screening = Screening() if network is None else guide_screening()
         self._sightings = Sightings(human, self._screening)
+        self._sites = scalar_sites(human)
+        with torch.random.fork_rng(devices=[]):
+            self._order = tuple(sample_sites(human, 1))
 
     @property
     def rounds(self) -> int:
@@ -91,10 +99,9 @@ class OnlinePosterior:
             torch.manual_seed(self.seed * 1_000_003 + self.rounds)
             found = self._weighted()
             drawn = found.sample(number, self._sightings.grid)
-            order = sample_sites(self.human, 1)
         self.pareto_k = found.pareto_k
         self.seconds = self.seconds[0], monotonic() - began
-        return {name: drawn[name] for name in order}
+        return {name: drawn[name] for name in self._order}
 
     def _weighted(self) -> Weighted:
         human, options = self.human, ImportanceOptions()
@@ -103,8 +110,8 @@ class OnlinePosterior:
             found = sample_exactly(human, self._sightings.table(), first)
         else:
             # What the first asking has checked need not be checked again.
-            checked = not math.isnan(self.pareto_k)
-            found = sample_amortized(human, self.network, self._sightings, ENOUGH, checked=checked)
+            sites = None if math.isnan(self.pareto_k) else self._sites
+            found = sample_amortized(human, self.network, self._sightings, ENOUGH, sites=sites)
         if human.attends:
             _, found = second_look(
                 human, self._rounds, self._screening, options, self._sightings, found

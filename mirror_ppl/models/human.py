@@ -103,10 +103,11 @@ class View:
             imagined = self.imagined[name]
             key = keys.pop(0).view(imagined.shape[-2:])
             # Few items are taken for granted, and only those count.
-            value = as_whole_numbers(imagined.expand(*mask.shape, -1)[mask])
-            value = (value * key.expand(*mask.shape, -1)[mask]).sum(-1)
-            each = torch.zeros(mask.shape, dtype=torch.long, device=device)
-            total = total + each.masked_scatter(mask, value).sum(-1)
+            place = mask.nonzero(as_tuple=True)
+            value = as_whole_numbers(imagined.expand(*mask.shape, -1)[place])
+            value = (value * key[place[-1]]).sum(-1)
+            each = torch.zeros(mask.shape[:-1], dtype=torch.long, device=device)
+            total = total + each.index_put(place[:-1], value, accumulate=True)
         return total
 
 
