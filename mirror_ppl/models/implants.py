@@ -166,10 +166,11 @@ def residual_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Te
 
 def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
     """Sight thresholds ``[..., D]`` in the domain's unit of distance."""
-    bins = torch.tensor(domain.reach_bins, device=implants[sight_sites(domain)[0]].device)
-    return torch.stack(
-        torch.broadcast_tensors(*(bins[implants[site]] for site in sight_sites(domain))), -1
-    )
+    sites = [implants[site] for site in sight_sites(domain)]
+    bins = torch.tensor(domain.reach_bins, device=sites[0].device)
+    # Stacked in front, which copies whole blocks; a hundred thousand combinations are looked up.
+    found = [bins.index_select(0, site.flatten()).view(site.shape) for site in sites]
+    return torch.stack(torch.broadcast_tensors(*found)).movedim(0, -1)
 
 
 def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
