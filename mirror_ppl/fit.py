@@ -60,6 +60,8 @@ class Options:
     see; 0 leaves it out."""
     steps: int = 300
     """Gradient steps of svi."""
+    refine: int = 0
+    """Gradient steps of svi that start at what amortized or exact found; none unless given."""
     draws: int = 200
     """Posterior draws."""
     seed: int = 0
@@ -72,7 +74,9 @@ class Options:
             raise OptionError("--guide-file is for --guide amortized")
         if self.prior_from is not None and self.pooling != "none":
             raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
-        least_of = {"steps": 1, "draws": 1, "train_rounds": 0, "explore": 0}
+        if self.refine and self.guide not in ("amortized", "exact"):
+            raise OptionError("--refine is for --guide amortized and exact")
+        least_of = {"steps": 1, "draws": 1, "train_rounds": 0, "explore": 0, "refine": 0}
         for name, least in least_of.items():
             number = getattr(self, name)
             if number is not None and number < least:
@@ -105,7 +109,9 @@ def main(options: Options) -> None:
 
     device = usable_device(options.device)
     svi = FitOptions(steps=options.steps)
-    settings = InferenceOptions(options.guide, options.draws, svi, pooling=options.pooling)
+    settings = InferenceOptions(
+        options.guide, options.draws, svi, pooling=options.pooling, refine=options.refine
+    )
     weights = options.self_model or shipped_weights(demonstrations.domain)
     self_model, _ = load_self_model(weights, demonstrations.domain)
     human = load_human_model(options.human_model, self_model.to(device))

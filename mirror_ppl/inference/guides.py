@@ -42,6 +42,8 @@ from mirror_ppl.models.weights import fingerprint
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
 PEOPLE_AT_ONCE = 50
 """People whose views are in memory together; they do not depend on each other."""
+REFINING_RATE = 0.02
+"""Learning rate of Adam where it starts near the end."""
 GUIDES = ("amortized", "exact", "svi", "nuts")
 OWN_DRAWS = {"amortized": 4000, "exact": 4000, "svi": 1000, "nuts": 1000}
 """Draws of each person under the human model's own prior from which pooling chooses."""
@@ -79,6 +81,7 @@ class InferenceOptions:
             amortized guide is its own.
         pooling: ``none``, or ``partial`` to infer with the people the population that they are
             from (:mod:`mirror_ppl.inference.pooling`).
+        refine: gradient steps of ``svi`` that start at what ``amortized`` or ``exact`` found.
     """
 
     guide: str = "exact"
@@ -87,6 +90,7 @@ class InferenceOptions:
     exact: ImportanceOptions = ImportanceOptions()
     screening: Screening | None = Screening()
     pooling: str = "none"
+    refine: int = 0
 
     def __post_init__(self) -> None:
         if self.guide not in GUIDES:
@@ -95,6 +99,10 @@ class InferenceOptions:
             raise UnknownNameError.of("pooling", self.pooling, POOLINGS)
         if self.draws < 1:
             raise ValueError(f"draws must be at least 1, not {self.draws}")
+        if self.refine < 0:
+            raise ValueError(f"refine must be at least 0, not {self.refine}")
+        if self.refine and self.guide not in ("amortized", "exact"):
+            raise ValueError(f"refining starts at what amortized or exact found, not {self.guide}")
 
 
 def infer(
@@ -155,7 +163,14 @@ def _each(
             network = None
         elif network is None:
             raise ValueError("the amortized guide needs its network")
-        return _by_importance(human, demonstrations, options, seed, network, report, checkpoint)
+        found = _by_importance(human, demonstrations, options, seed, network, report, checkpoint)
+        if not options.refine:
+            return found
+        svi = replace(options.svi, steps=options.refine, learning_rate=REFINING_RATE)
+        options = replace(options, guide="svi", svi=svi, refine=0)
+        if checkpoint is not None:
+            checkpoint = checkpoint[0].with_name(f"{checkpoint[0].name}.refined"), checkpoint[1]
+        return _in_batches(human, demonstrations, options, seed, report, checkpoint, found.draws)
     return _in_batches(human, demonstrations, options, seed, report, checkpoint)
 
 
@@ -166,8 +181,12 @@ def _in_batches(
     seed: int,
     report: Report,
     checkpoint: tuple[Path, str] | None,
+    start: Mapping[str, Tensor] | None = None,
 ) -> Inferred:
-    """``svi`` and ``nuts``: of so many people at once that their views fit into memory."""
+    """``svi`` and ``nuts``: of so many people at once that their views fit into memory.
+
+    ``svi`` starts at draws ``[S, P, 1, ...]``, if there are any.
+    """
     people, found = demonstrations.num_people, []
     files = {}
     if checkpoint is not None:
@@ -179,12 +198,15 @@ def _in_batches(
     for begin in range(0, people, PEOPLE_AT_ONCE):
         some = range(begin, min(begin + PEOPLE_AT_ONCE, people))
         own = demonstrations.select_people(some) if len(some) < people else demonstrations
+        near = None
+        if start is not None:
+            near = {name: value[:, some.start : some.stop] for name, value in start.items()}
         table = build_view_table(
             human,
             own,
             screening=options.screening,
             report=lambda done, begin=begin: report("views", begin + done, people, "people"),
-            likely=_likely(human, own, options, seed + begin, report),
+            likely=near or _likely(human, own, options, seed + begin, report),
         )
         if options.guide == "nuts":
             drawn = sample_nuts(human, table, options.draws, seed + begin, report)
@@ -192,7 +214,7 @@ def _in_batches(
             continue
         file = None if checkpoint is None else (files[begin], checkpoint[1])
         svi = replace(options.svi, draws=options.draws)
-        posterior = fit_implants(human, table, svi, seed + begin, report, file)
+        posterior = fit_implants(human, table, svi, seed + begin, report, file, near)
         found.append(Inferred(posterior.draws, losses=posterior.losses))
     draws = {name: torch.cat([one.draws[name] for one in found], 1) for name in found[0].draws}
     losses = tuple(sum(step) for step in zip(*(one.losses for one in found), strict=True))

@@ -42,6 +42,8 @@ def silent(name: str, done: int, total: int, message: str) -> None:
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100
+LEAST_WIDTH = 0.01
+"""Of a site where draws say that nothing is open, on the unconstrained scale."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,25 @@ class PriorScaledNormal(AutoNormal):
             )
             deep_setattr(self.scales, name, parameter)
 
+    def start_at(self, draws: Mapping[str, Tensor]) -> None:
+        """Take location and width of each site of one number from draws ``[S, P, 1, ...]``.
 
-def continuous_guide(human: HumanModel, table: ViewTable) -> AutoGuide:
+        Of hundreds of weights, draws say less than the prior does.
+        """
+        assert self.prototype_trace is not None
+        for name, site in self.prototype_trace.iter_stochastic_nodes():
+            if site["fn"].event_dim:
+                continue
+            place = biject_to(site["fn"].support).inv(draws[name])
+            loc, scale = self._get_loc_and_scale(name)
+            with torch.no_grad():
+                loc.copy_(place.mean(0))
+            width = place.std(0).clamp(min=LEAST_WIDTH) if len(place) > 1 else scale.detach()
+            parameter = PyroParam(width.clone(), self.scale_constraint, site["fn"].event_dim)
+            deep_setattr(self.scales, name, parameter)
+
+
+def continuous_guide(human: HumanModel, table: ViewTable) -> PriorScaledNormal:
     """A mean-field guide over the continuous sites of a human model, one factor a person."""
     model = poutine.block(human.model, hide=list(_enumerated(human, table)))
     guide = PriorScaledNormal(model, init_loc_fn=init_to_median)
@@ -123,6 +142,7 @@ def fit_implants(
     seed: int,
     report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
+    start: Mapping[str, Tensor] | None = None,
 ) -> ImplantPosterior:
     """Posterior of the implants of P people.
 
@@ -134,6 +154,7 @@ def fit_implants(
         report: told of gradient steps and of draws.
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused).
+        start: draws ``[S, P, 1, ...]`` at which the guide starts; the prior unless given.
 
     Raises:
         CheckpointError: the checkpoint is damaged or of another run.
@@ -141,6 +162,8 @@ def fit_implants(
     with torch.random.fork_rng(devices=[]), pyro.settings.context(module_local_params=True):
         torch.manual_seed(seed)
         guide = continuous_guide(human, table)
+        if start is not None:
+            guide.start_at(start)
         table, losses = _optimize(human, table, guide, options, report, checkpoint)
         draws = draw_implants(human, table, guide, options.draws, report)
         draws = {name: draws[name] for name in sample_sites(human, 1)}
