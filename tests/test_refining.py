@@ -41,18 +41,17 @@ def test_the_guide_starts_at_the_draws(human):
     torch.testing.assert_close(loc.flatten(), draws["consistency"].log().mean(0).flatten())
     spread = draws["consistency"].log().std(0).flatten().clamp(min=0.01)
     torch.testing.assert_close(scale.flatten(), spread)
-    assert guide._get_loc_and_scale("lapse")[0].flatten().tolist() == pytest.approx([-2.1972, 0.0], abs=1e-4)
+    loc, _ = guide._get_loc_and_scale("lapse")
+    assert loc.flatten().tolist() == pytest.approx([-2.1972, 0.0], abs=1e-4)
     # Of weights the prior is better than draws.
-    for name in before:
-        if "residual" in name:
-            assert torch.equal(guide.state_dict()[name], before[name])
+    after = guide.state_dict()
+    weights = [name for name in before if "residual" in name]
+    assert weights and all(torch.equal(after[name], before[name]) for name in weights)
 
 
 def test_refining_starts_near_the_end(human, recordings):
     found = infer(human, recordings, InferenceOptions(draws=50, refine=30), seed=0)
-    fresh = infer(
-        human, recordings, InferenceOptions("svi", 50, svi=FitOptions(steps=200)), seed=0
-    )
+    fresh = infer(human, recordings, InferenceOptions("svi", 50, svi=FitOptions(steps=200)), seed=0)
     assert len(found.losses) == 30
     assert found.pareto_k is None
     begun, ended = sum(fresh.losses[:5]) / 5, sum(fresh.losses[-20:]) / 20

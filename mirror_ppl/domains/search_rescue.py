@@ -1,0 +1,527 @@
+"""Search and rescue: a burning house in nine portions (supplement, sections A and E, Table I).
+
+Description
+    A firefighter looks for a victim and brings them back to the entrance. The house is a map of 9
+    by 9 cells, in 3 by 3 portions of 3 by 3 cells::
+
+        . . . . . . . . .      three rooms, a potential place of the victim (v) in the middle of
+        . v . . v . . v .      each
+        . . . . . . . . .
+        # o # # # # # o #      two corridors; an obstacle (o) may block one of them
+        # o # # # # # o #
+        # o # # # # # o #
+        . . . . . . . . .      the hall, with the entrance (e)
+        . . . . . . . . .
+        . . . . e . . . .
+
+    A scenario says where the victim is (three places) and which corridor is blocked, in its middle
+    (none, left or right): nine in all. The house itself is known to everybody.
+
+Actions
+    0 up, 1 down, 2 left, 3 right: one cell, if there is neither wall nor obstacle.
+
+Observations
+    ========  ============  =======  ===============================================================
+    ego       row, column   cells    where the firefighter is, 0 at the top and left; always known
+    ego       carrying      0 or 1   whether they have the victim with them
+    visual    27 numbers    0 to 1   pixels of each portion of the map: row, column, red-green-blue
+    verbal    holds         0 or 1   whether what an utterance is about is so: the corridor is
+                                     blocked, the victim is in that room
+    ========  ============  =======  ===============================================================
+
+    Pixels are a cell each: light floor, dark walls, a yellow entrance, a red obstacle in the left
+    corridor and a purple one in the right, a green victim. A victim who was found is no longer on
+    the map. In clear air everything is seen, and heard; in smoke the portions whose centre is at
+    most 1.5 cells away, which is the one that the firefighter is in, and nothing is heard.
+
+Rewards, of the action and the state that it leads to
+    =========  ====  ================================================
+    found      +1    for coming to where the victim is
+    returned   +15   for being back at the entrance with the victim
+    collision  -10   for walking into the obstacle
+    time       -0.1  for each step until then
+    =========  ====  ================================================
+
+Start and end
+    A round begins at the entrance and lasts 48 steps; whoever is back with the victim stays there.
+
+Version history
+    1: first version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.rescue_knowledge import (
+    CORRIDOR_PORTIONS,
+    ROOM_PORTIONS,
+    HouseKnowledge,
+)
+
+SIDE, PORTION = 9, 3
+"""Cells along a side of the map, and of a portion of it."""
+HOUSE = (
+    ".........",
+    ".........",
+    ".........",
+    "#.#####.#",
+    "#.#####.#",
+    "#.#####.#",
+    ".........",
+    ".........",
+    ".........",
+)
+ENTRANCE = (8, 4)
+ROOMS = {"top-left": (1, 1), "top-middle": (1, 4), "top-right": (1, 7)}
+"""Where the victim may be, by room."""
+CORRIDORS = {"left": (4, 1), "right": (4, 7)}
+"""Where an obstacle may be, by corridor."""
+MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
+SMOKE_REACH = 1.5
+"""How far a firefighter sees in smoke, in cells to the centre of a portion."""
+FOUND, RETURNED, COLLISION, TIME = 1.0, 15.0, -10.0, -0.1
+
+FLOOR, WALL, DOOR, VICTIM = (0.9, 0.9, 0.9), (0.2, 0.2, 0.2), (0.9, 0.8, 0.2), (0.1, 0.7, 0.2)
+OBSTACLES = ((0.8, 0.2, 0.2), (0.6, 0.2, 0.7))
+"""Colours of pixels; of obstacles in the left and the right corridor."""
+
+PORTIONS = tuple(
+    f"{row}-{column}"
+    for row in ("top", "middle", "bottom")
+    for column in ("left", "middle", "right")
+)
+UTTERANCES: Mapping[str, tuple[str, str]] = {
+    **{
+        f"{side} corridor": (f"{side} corridor clear", f"{side} corridor blocked")
+        for side in CORRIDORS
+    },
+    **{room: (f"victim not in {room}", f"victim in {room}") for room in ROOMS},
+}
+"""What is said of each verbal item if it does not hold, and if it does."""
+
+
+@dataclass(frozen=True)
+class RescueState:
+    """State of a batch of rounds.
+
+    Attributes:
+        place: row and column of the firefighter ``[..., 2]``, in cells.
+        found: whether the victim was found ``[...]``.
+        home: whether they are back at the entrance ``[...]``.
+        blocked: corridor that is blocked ``[...]``: 0 none, 1 left, 2 right.
+        victim: room of the victim ``[...]``, an index into ``ROOMS``.
+    """
+
+    place: Tensor
+    found: Tensor
+    home: Tensor
+    blocked: Tensor
+    victim: Tensor
+
+
+class SearchRescue:
+    """The domain of search and rescue; see the module's description."""
+
+    name = "search_rescue"
+    version = "1"
+    modalities: tuple[Modality, ...] = (
+        Modality(
+            "visual",
+            PORTIONS,
+            tuple(
+                f"pixel {row} {column} {colour}"
+                for row in range(PORTION)
+                for column in range(PORTION)
+                for colour in ("red", "green", "blue")
+            ),
+            ("intensity",) * 3 * PORTION**2,
+            (1.0,) * 3 * PORTION**2,
+            0.02,
+        ),
+        Modality("verbal", tuple(UTTERANCES), ("holds",), ("truth",), (1.0,), 0.1),
+    )
+    ego_features: tuple[str, ...] = ("row", "column", "carrying")
+    symbol_sizes: Mapping[str, int] = {"ego": 2 * SIDE + 1, "visual": 3 * PORTION**2, "verbal": 2}
+    actions: tuple[str, ...] = tuple(MOVES)
+    horizon = 48
+    settings: tuple[str, ...] = ("clear", "smoke")
+    scenarios: tuple[str, ...] = tuple(
+        f"victim {room}, {blocked}"
+        for blocked in ("no corridor blocked", "left corridor blocked", "right corridor blocked")
+        for room in ROOMS
+    )
+    reward_terms: tuple[str, ...] = ("found", "returned", "collision", "time")
+    directions: tuple[str, ...] = ("radius",)
+    direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
+    assumptions: tuple[str, ...] = ()
+
+    @property
+    def reach_bins(self) -> tuple[float, ...]:
+        """Lower edges in cells of the bins of a radius: the distances that can occur.
+
+        From any cell that can be walked on to the centre of any portion whose content is not the
+        same in all scenarios.
+        """
+        return _reach_bins()
+
+    def initial(
+        self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
+    ) -> RescueState:
+        """States ``[batch]`` at the entrance.
+
+        Args:
+            batch: number of rounds.
+            generator: source of randomness; its device is where the states live.
+            scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
+        """
+        device = generator.device
+        if scenario is None:
+            scenario = torch.randint(
+                len(self.scenarios), (batch,), generator=generator, device=device
+            )
+        never = torch.zeros(batch, dtype=torch.bool, device=device)
+        return RescueState(
+            place=torch.tensor(ENTRANCE, device=device).expand(batch, 2),
+            found=never,
+            home=never,
+            blocked=scenario // len(ROOMS),
+            victim=scenario % len(ROOMS),
+        )
+
+    def transition(self, state: RescueState, action: Tensor) -> RescueState:
+        """State at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
+        moves = torch.tensor(list(MOVES.values()), device=state.place.device)
+        target = state.place + moves[action]
+        stays = state.home | ~_walkable(target) | self._obstructed(state, target)
+        place = torch.where(stays[..., None], state.place, target)
+        found = state.found | self._at_victim(state, place)
+        return replace(state, place=place, found=found, home=state.home | (found & _at(place)))
+
+    def rewards(
+        self, state: RescueState, action: Tensor, following: RescueState
+    ) -> dict[str, Tensor]:
+        """Reward terms ``[...]`` by name, in units of reward."""
+        moves = torch.tensor(list(MOVES.values()), device=state.place.device)
+        into = self._obstructed(state, state.place + moves[action]) & ~state.home
+        dtype = torch.get_default_dtype()
+        return {
+            "found": FOUND * (following.found & ~state.found).to(dtype),
+            "returned": RETURNED * (following.home & ~state.home).to(dtype),
+            "collision": COLLISION * into.to(dtype),
+            "time": TIME * (~state.home).to(dtype),
+        }
+
+    def _at_victim(self, state: RescueState, place: Tensor) -> Tensor:
+        rooms = torch.tensor(list(ROOMS.values()), device=place.device)
+        return (place == rooms[state.victim]).all(-1)
+
+    def _obstructed(self, state: RescueState, place: Tensor) -> Tensor:
+        corridors = torch.tensor([(-1, -1), *CORRIDORS.values()], device=place.device)
+        return (place == corridors[state.blocked]).all(-1)
+
+    def observe(self, state: RescueState) -> Observation:
+        """Everything there is to observe: ego ``[..., 3]``, visual ``[..., 9, 27]`` and so on."""
+        dtype = torch.get_default_dtype()
+        device = state.place.device
+        ego = torch.cat([state.place.to(dtype), state.found[..., None].to(dtype)], -1)
+        rooms = torch.arange(len(ROOMS), device=device)
+        sides = torch.arange(1, 1 + len(CORRIDORS), device=device)
+        there = (state.victim[..., None] == rooms) & ~state.found[..., None]
+        blocked = state.blocked[..., None] == sides
+        holds = torch.cat([blocked, there], -1)
+        return {"ego": ego, "visual": _portions(holds), "verbal": holds[..., None].to(dtype)}
+
+    def visibility(self, setting: str, observation: Observation) -> Visibility:
+        """What the setting lets an unaided person see, and hear.
+
+        Raises:
+            UnknownNameError: if the setting is neither ``clear`` nor ``smoke``.
+        """
+        require_known(setting, "setting", self.settings)
+        _, distance = self.distance(observation)
+        everything = torch.ones_like(observation["verbal"][..., 0], dtype=torch.bool)
+        if setting == "clear":
+            return {"visual": torch.ones_like(distance, dtype=torch.bool), "verbal": everything}
+        return {"visual": distance <= SMOKE_REACH, "verbal": ~everything}
+
+    def communicable(self, observation: Observation) -> Visibility:
+        """Every portion can be shown, and of every corridor and room can be spoken."""
+        return {
+            name: torch.ones_like(observation[name][..., 0], dtype=torch.bool)
+            for name in ("visual", "verbal")
+        }
+
+    def faults(self, observation: Observation) -> dict[str, Tensor]:
+        """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
+        place, carrying = observation["ego"][..., :2], observation["ego"][..., 2]
+        holds = observation["verbal"][..., 0]
+        known = (holds == 0) | (holds == 1)
+        whole = (place == place.round()).all(-1)
+        pixels = _portions(holds == 1)
+        return {
+            "row and column have to be those of a cell that can be walked on": ~(
+                whole & _walkable(place.long())
+            ),
+            "carrying has to be 0 or 1": (carrying != 0) & (carrying != 1),
+            "holds has to be 0 or 1": ~known.all(-1),
+            "at most one corridor can be blocked": holds[..., :2].sum(-1) > 1,
+            "the victim has to be in one room, or carried": (
+                holds[..., 2:].sum(-1) + carrying != 1
+            ),
+            "pixels have to show what utterances say": (
+                (observation["visual"] - pixels).abs() > 1e-3  # noqa: PLR2004 - of rounding
+            ).any((-1, -2)),
+        }
+
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> HouseKnowledge:
+        """Knowledge ``[*batch]`` before anything was observed."""
+        return HouseKnowledge.nothing(*batch, device=device)
+
+    def learn(
+        self,
+        knowledge: HouseKnowledge,
+        observation: Observation,
+        visible: Visibility,
+        sees: Callable[[Observation], Visibility],
+    ) -> HouseKnowledge:
+        """What a portion shows and what is said stays known, and what follows from it."""
+        del sees
+        return knowledge.learn(observation, visible)
+
+    def known(self, knowledge: HouseKnowledge) -> Visibility:
+        """Portions ``[..., 9]`` and utterances ``[..., 5]`` whose content is known."""
+        return knowledge.items()
+
+    def assume(
+        self, knowledge: HouseKnowledge, observation: Observation
+    ) -> tuple[dict[str, Visibility], Observation]:
+        """Nothing is taken for granted."""
+        del knowledge
+        return {}, observation
+
+    def supposed(
+        self, state: RescueState, knowledge: HouseKnowledge, assumes: Mapping[str, Tensor]
+    ) -> RescueState:
+        """The state as it is: nothing is taken for granted."""
+        del knowledge, assumes
+        return state
+
+    def symbols(self, observation: Observation) -> dict[str, Tensor]:
+        """Observations in the form in which networks read them.
+
+        Returns:
+            ego ``[..., 19]``, one-hot row and column, and whether they carry the victim; visual
+            ``[..., 9, 27]``, raw pixels; verbal ``[..., 5, 2]``, one-hot which of the two
+            utterances about an item is true.
+        """
+        place = observation["ego"][..., :2].long()
+        parts = [
+            one_hot(place, SIDE).flatten(-2).to(observation["ego"]),
+            observation["ego"][..., 2:],
+        ]
+        said = one_hot(observation["verbal"][..., 0].long(), 2).to(observation["ego"])
+        return {"ego": torch.cat(parts, -1), "visual": observation["visual"], "verbal": said}
+
+    def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
+        """Direction (there is one) and distance in cells to the centre of each portion."""
+        place = observation["ego"][..., None, :2]
+        distance = (place - _centres().to(place)).pow(2).sum(-1).sqrt()
+        return torch.zeros_like(distance, dtype=torch.long), distance
+
+    def state_behind(self, observation: Observation) -> RescueState:
+        """The state ``[...]`` that gives this observation of everything.
+
+        Of a victim who is carried it cannot be observed where they were, and no longer matters.
+        """
+        holds = observation["verbal"][..., 0].round().bool()
+        place = observation["ego"][..., :2].round().long()
+        found = observation["ego"][..., 2].round().bool()
+        sides = torch.arange(1, 1 + len(CORRIDORS), device=place.device)
+        rooms = torch.arange(len(ROOMS), device=place.device)
+        return RescueState(
+            place=place,
+            found=found,
+            home=found & _at(place),
+            blocked=(holds[..., : len(sides)] * sides).sum(-1),
+            victim=(holds[..., len(sides) :] * rooms).sum(-1),
+        )
+
+    def nearest(self, observation: Observation) -> Observation:
+        """The observation that can be and is nearest to decoded values.
+
+        Places are rounded to the nearest floor. What is in the house is the scenario whose pixels
+        and utterances are nearest.
+        """
+        place = observation["ego"][..., :2]
+        cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
+        cells = cells[_walkable(cells)].to(place.device)
+        apart = (place[..., None, :] - cells.to(place)).pow(2).sum(-1)
+        carrying = observation["ego"][..., 2] >= 0.5  # noqa: PLR2004 - between no and yes
+        corridors, rooms = 1 + len(CORRIDORS), len(ROOMS)
+        blocked, victim = torch.cartesian_prod(torch.arange(corridors), torch.arange(rooms)).T.to(
+            place.device
+        )
+        batch = carrying.shape
+        candidates = RescueState(
+            place=cells[apart.argmin(-1)][..., None, :].expand(*batch, len(victim), 2),
+            found=carrying[..., None].expand(*batch, len(victim)),
+            home=torch.zeros(*batch, len(victim), dtype=torch.bool, device=place.device),
+            blocked=blocked.expand(*batch, -1),
+            victim=victim.expand(*batch, -1),
+        )
+        possible = self.observe(candidates)
+        unlike = sum(
+            (possible[name] - observation[name][..., None, :, :]).pow(2).flatten(-2).sum(-1)
+            for name in ("visual", "verbal")
+        )
+        best = torch.as_tensor(unlike).argmin(-1)
+
+        def chosen(part: Tensor) -> Tensor:
+            index = best.view(*batch, 1, *(1,) * (part.dim() - len(batch) - 1))
+            return part.take_along_dim(index, len(batch)).squeeze(len(batch))
+
+        return {name: chosen(part) for name, part in possible.items()}
+
+    def relevance(self, observation: Observation) -> dict[str, Visibility]:
+        """Where the victim is, and the obstacle (supplement, section F)."""
+        holds = observation["verbal"][..., 0] == 1
+        portions = torch.zeros_like(observation["visual"][..., 0], dtype=torch.bool)
+        portions[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = holds
+        return {"goal_and_obstacle": {"visual": portions, "verbal": holds}}
+
+    def describe(self, observation: Observation, modality: str, item: str) -> str:
+        """Such as "victim in top-right", or "the middle-left of the map"."""
+        if modality == "visual":
+            return f"the {item} of the map"
+        holds = observation["verbal"][tuple(UTTERANCES).index(item), 0]
+        return UTTERANCES[item][int(holds)]
+
+    def deed(self, observation: Observation, item: str | None, action: int) -> str:
+        """Where they would go."""
+        del observation, item
+        return f"go {self.actions[action]}"
+
+    def reference_values(self, state: RescueState, discount: float) -> Tensor:
+        """Exact action values ``[..., 4]`` with everything known, for as long as it takes."""
+        table = _action_values(discount).to(state.place.device)
+        row, column = state.place.unbind(-1)
+        found, home = state.found.long(), state.home
+        values = table[state.blocked, state.victim, found, row, column]
+        return torch.where(home[..., None], 0.0, values)
+
+    def render(self, state: RescueState) -> np.ndarray:
+        """Picture ``uint8 [height, width, 3]`` of one state: the map, the firefighter in blue."""
+        cell = 12
+        pixels = as_image(self.observe(state)["visual"]).numpy()
+        picture = (255 * pixels).round().astype(np.uint8).repeat(cell, 0).repeat(cell, 1)
+        row, column = (int(part) * cell for part in state.place)
+        picture[row + 2 : row + cell - 2, column + 2 : column + cell - 2] = (40, 90, 200)
+        return picture
+
+
+def as_image(portions: Tensor) -> Tensor:
+    """The map ``[..., 9, 9, 3]``, rows, columns and colours, of its portions ``[..., 9, 27]``."""
+    blocks = portions.unflatten(-1, (PORTION, PORTION, 3)).unflatten(-4, (PORTION, PORTION))
+    return blocks.transpose(-4, -3).flatten(-5, -4).flatten(-3, -2)
+
+
+def as_portions(image: Tensor) -> Tensor:
+    """Portions ``[..., 9, 27]`` of a map ``[..., 9, 9, 3]``."""
+    blocks = image.unflatten(-2, (PORTION, PORTION)).unflatten(-4, (PORTION, PORTION))
+    return blocks.transpose(-4, -3).flatten(-5, -4).flatten(-3, -1)
+
+
+def _portions(holds: Tensor) -> Tensor:
+    """Pixels ``[..., 9, 27]`` of what is so ``[..., 5]``: obstacles, and victims in rooms."""
+    empty, with_all = (portions.to(holds.device) for portions in _house())
+    shown = torch.zeros(*holds.shape[:-1], len(PORTIONS), dtype=torch.bool, device=holds.device)
+    shown[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = holds
+    return torch.where(shown[..., None], with_all, empty)
+
+
+@cache
+def _house() -> tuple[Tensor, Tensor]:
+    """Portions ``[9, 27]`` with nothing in them, and with everything that may be in them."""
+    image = torch.tensor([[WALL if cell == "#" else FLOOR for cell in row] for row in HOUSE])
+    image[ENTRANCE] = torch.tensor(DOOR)
+    full = image.clone()
+    for place, colour in zip(CORRIDORS.values(), OBSTACLES, strict=True):
+        full[place] = torch.tensor(colour)
+    for place in ROOMS.values():
+        full[place] = torch.tensor(VICTIM)
+    return as_portions(image), as_portions(full)
+
+
+def _centres() -> Tensor:
+    """Row and column of the centre of each portion, ``[9, 2]``."""
+    middle = torch.arange(PORTION) * PORTION + PORTION // 2
+    return torch.cartesian_prod(middle, middle)
+
+
+def _walkable(place: Tensor) -> Tensor:
+    """Whether there is floor at rows and columns ``[..., 2]``."""
+    floor = torch.tensor([[cell != "#" for cell in row] for row in HOUSE], device=place.device)
+    inside = ((place >= 0) & (place < SIDE)).all(-1)
+    row, column = place.clamp(0, SIDE - 1).unbind(-1)
+    return inside & floor[row, column]
+
+
+def _at(place: Tensor) -> Tensor:
+    """Whether places ``[..., 2]`` are the entrance."""
+    return (place == torch.tensor(ENTRANCE, device=place.device)).all(-1)
+
+
+@cache
+def _reach_bins() -> tuple[float, ...]:
+    cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
+    cells = cells[_walkable(cells)]
+    centres = _centres()[[*CORRIDOR_PORTIONS, *ROOM_PORTIONS]]
+    squares = (cells[:, None] - centres).pow(2).sum(-1).unique()
+    # Of rounding to 32 bits no cell may be lost at the edge of a bin.
+    return tuple(float(square) ** 0.5 + 1e-4 for square in squares)
+
+
+@cache
+def _action_values(discount: float) -> Tensor:
+    """``[blocked 3, victim 3, found 2, row 9, column 9, action 4]`` by value iteration."""
+    world = SearchRescue()
+    shape = (1 + len(CORRIDORS), len(ROOMS), 2, SIDE, SIDE)
+    grid = torch.cartesian_prod(*(torch.arange(size) for size in shape))
+    blocked, victim, found, row, column = grid.unbind(-1)
+    number, actions = len(grid), len(MOVES)
+    state = RescueState(
+        torch.stack([row, column], -1), found.bool(), torch.zeros(number).bool(), blocked, victim
+    )
+    outcomes = []
+    for action in range(actions):
+        chosen = torch.full((number,), action)
+        after = world.transition(state, chosen)
+        reward = torch.stack(list(world.rewards(state, chosen, after).values())).sum(0)
+        strides = torch.tensor([shape[1] * 2 * SIDE**2, 2 * SIDE**2, SIDE**2, SIDE, 1])
+        parts = [after.blocked, after.victim, after.found.long(), *after.place.unbind(-1)]
+        outcomes.append((reward.double(), (torch.stack(parts, -1) * strides).sum(-1), after.home))
+    # From inside of walls nothing leads anywhere.
+    floor = _walkable(state.place)
+    values = torch.zeros(number, dtype=torch.double)
+    while True:
+        following = torch.stack(
+            [
+                reward + discount * torch.where(home, 0.0, values[index])
+                for reward, index, home in outcomes
+            ],
+            -1,
+        )
+        following = torch.where(floor[:, None], following, 0.0)
+        best = following.amax(-1)
+        if torch.equal(best, values):
+            return following.view(*shape, actions).to(torch.get_default_dtype())
+        values = best
