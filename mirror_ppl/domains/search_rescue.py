@@ -211,7 +211,7 @@ class SearchRescue:
     ) -> dict[str, Tensor]:
         """Reward terms ``[...]`` by name, in units of reward."""
         moves = torch.tensor(list(MOVES.values()), device=state.place.device)
-        into = self._obstructed(state, state.place + moves[action]) & ~state.home
+        into = self._obstructed(state, state.place + moves[action])
         dtype = torch.get_default_dtype()
         return {
             "found": FOUND * (following.found & ~state.found).to(dtype),
