@@ -23,6 +23,10 @@ from mirror_ppl.domains.search_rescue import (
     as_portions,
 )
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.loading import check_contract
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.views import draw_views
 
 WORLD: Domain = SearchRescue()
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -372,3 +376,40 @@ def test_what_cannot_be_is_told():
     fault("in one room", put("verbal", (slice(2, 5), 0), 0.0))
     fault("in one room", put("ego", (2,), 1.0))
     fault("pixels", put("visual", (8, 0), 0.0))
+
+
+# --- models of people in it
+
+
+def test_a_person_sees_as_far_as_their_radius_and_remembers():
+    """An encoder that was not trained is enough to see."""
+    torch.manual_seed(0)
+    human = HumanModel(SelfModel(WORLD))
+    state = alone(5)  # top-right, left corridor blocked
+    states, _ = walk(state, [RIGHT] * 3 + [UP] * 7)
+    observed = [WORLD.observe(one) for one in states]
+    observation = {name: torch.stack([one[name] for one in observed])[None] for name in observed[0]}
+    steps = len(states)
+    told = {m.name: torch.zeros(1, steps, len(m.items), dtype=torch.bool) for m in WORLD.modalities}
+    smoke = next(place for place, edge in enumerate(WORLD.reach_bins) if 1.4 < edge < 1.5)
+    everything = len(WORLD.reach_bins) - 1
+    view = human.perceive({"sight_radius": torch.tensor([smoke, everything])}, observation, told)
+    assert view.visible["visual"].shape == (2, steps, 9)
+    assert view.visible["verbal"].shape == (2, steps, 5)
+    assert not view.taken and not view.imagined
+    assert view.visible["visual"][1].all() and view.visible["verbal"][1].all()
+    seen = [{PORTIONS[k] for k in row.nonzero().flatten()} for row in view.visible["visual"][0]]
+    assert seen[0] == ALWAYS
+    assert seen[6] == ALWAYS | {"middle-right"}  # row 5 of the corridor
+    assert seen[9] == ALWAYS | {"middle-right"} | set(ROOMS)  # the victim: no other room has one
+    check_contract(human)
+
+
+def test_views_to_train_on_have_the_items_of_each_modality():
+    generator = torch.Generator().manual_seed(0)
+    plan = draw_views(WORLD, 20, 3, generator)
+    state = start(number=20)
+    observation = {name: value[:, None] for name, value in WORLD.observe(state).items()}
+    visible, knowledge = plan.look(WORLD, WORLD.nothing_known(20, 1), observation, 0)
+    assert visible["visual"].shape == (20, 1, 9) and visible["verbal"].shape == (20, 1, 5)
+    assert not any(mask.any() for mask in plan.taken(WORLD, knowledge, observation).values())

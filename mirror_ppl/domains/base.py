@@ -228,3 +228,15 @@ def require_known(name: str, kind: str, known: Sequence[str]) -> str:
     if name not in known:
         raise UnknownNameError.of(kind, name, known)
     return name
+
+
+def by_eye(domain: Domain, seen: Tensor) -> Visibility:
+    """What somebody sees who hears nothing: visual items ``[..., K]``, and none of the others."""
+    return {
+        modality.name: seen
+        if modality.name == "visual"
+        else torch.zeros(
+            *seen.shape[:-1], len(modality.items), dtype=torch.bool, device=seen.device
+        )
+        for modality in domain.modalities
+    }

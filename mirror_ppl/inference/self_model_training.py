@@ -197,7 +197,11 @@ class _Trainer:
             report(self.phase, message)
 
     def _save(self, path: Path) -> None:
-        starts = [map_state(lambda part: part.to(torch.int16), start) for start in self.starts]
+        # Whole numbers of a world are small.
+        starts = [
+            map_state(lambda part: part.short() if part.dtype == torch.long else part, start)
+            for start in self.starts
+        ]
         content = {
             "run": self.run_id,
             "phase": self.phase,
@@ -220,7 +224,12 @@ class _Trainer:
         self.schedule.load_state_dict(content["schedule"])
         kind = type(self.domain.initial(1, torch.Generator(self.generator.device)))
         self.starts = [
-            kind(**{name: part.long() for name, part in start.items()})
+            kind(
+                **{
+                    name: part.long() if part.dtype == torch.int16 else part
+                    for name, part in start.items()
+                }
+            )
             for start in content["starts"]
         ]
         self.actions = [actions.long() for actions in content["actions"]]

@@ -34,7 +34,7 @@ from pyro import poutine
 from torch import Tensor, nn
 
 from mirror_ppl.distinct import as_whole_numbers, random_keys
-from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import Rounds, SelfModel
@@ -218,12 +218,7 @@ class HumanModel(nn.Module):
         reach = implant_priors.reach(self.domain, implants)  # [..., D]
         batch = torch.broadcast_shapes(reach.shape[:-1], direction.shape[:-1])
         own = reach.expand(*batch, -1).gather(-1, direction.expand(*batch, -1))
-        visual = distance <= own
-        unseen = torch.zeros_like(visual)
-        return {
-            modality.name: visual if modality.name == "visual" else unseen
-            for modality in self.domain.modalities
-        }
+        return by_eye(self.domain, distance <= own)
 
     def look(
         self,
@@ -251,6 +246,8 @@ class HumanModel(nn.Module):
         knowledge = domain.learn(knowledge, observation, visible, sees)
         visible = {name: visible[name] | mask for name, mask in domain.known(knowledge).items()}
         items, imagined = domain.assume(knowledge, observation)
+        if not items:
+            return View(visible), knowledge
         taken = {name: torch.zeros_like(mask) for name, mask in visible.items()}
         for assumption, about in items.items():
             site = implant_priors.ASSUMES + assumption

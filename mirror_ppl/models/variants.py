@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.domains.base import Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants
 
@@ -64,7 +64,7 @@ class PerItem(HumanModel):
         noticed = torch.stack(torch.broadcast_tensors(*times), -1) <= step
         direction, _ = self.domain.distance(observation)
         noticed = noticed.expand(torch.broadcast_shapes(noticed.shape, direction.shape))
-        return _by_eye(self.domain, noticed)
+        return by_eye(self.domain, noticed)
 
 
 class PerceptualOnly(HumanModel):
@@ -88,7 +88,7 @@ class NoImplants(HumanModel):
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """Everything that could be seen."""
         direction, _ = self.domain.distance(observation)
-        return _by_eye(self.domain, torch.ones_like(direction, dtype=torch.bool))
+        return by_eye(self.domain, torch.ones_like(direction, dtype=torch.bool))
 
 
 class PolicyOnly(NoImplants):
@@ -109,12 +109,3 @@ VARIANTS: dict[str, type[HumanModel]] = {
     "no-implants": NoImplants,
 }
 """Human models of the package by the names that commands take; the first is what they fit."""
-
-
-def _by_eye(domain: Domain, seen: Tensor) -> Visibility:
-    """Items seen ``[..., K]``, and nothing heard."""
-    nothing = torch.zeros_like(seen)
-    return {
-        modality.name: seen if modality.name == "visual" else nothing
-        for modality in domain.modalities
-    }

@@ -57,8 +57,9 @@ class ViewPlan:
         direction, distance = domain.distance(observation)
         batch = torch.arange(len(self.reach), device=self.reach.device)[:, None, None]
         seen = {
-            modality.name: torch.ones_like(distance, dtype=torch.bool)
-            for modality in domain.modalities
+            name: torch.ones_like(value[..., 0], dtype=torch.bool)
+            for name, value in observation.items()
+            if name != "ego"
         }
         seen["visual"] = distance <= self.reach[batch, direction]
         steps = slice(first, first + distance.shape[1])
@@ -103,7 +104,11 @@ class ViewPlan:
     def taken(self, domain: Domain, knowledge: Any, observation: Observation) -> Visibility:
         """Items ``[B, T', K]`` that are taken for granted, given knowledge ``[B, T']``."""
         items, _ = domain.assume(knowledge, observation)
-        taken = {name: torch.zeros_like(mask) for name, mask in items[next(iter(items))].items()}
+        taken = {
+            name: torch.zeros_like(value[..., 0], dtype=torch.bool)
+            for name, value in observation.items()
+            if name != "ego"
+        }
         for assumption, about in items.items():
             for name, mask in about.items():
                 taken[name] = taken[name] | (mask & self.assumes[assumption][:, None, None])
