@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import pyro
@@ -23,12 +24,13 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.attention import AttentionValues, Proposal
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.sites import latent_sites
 
-ATTENTION_VALUES = 16
-"""Values of what differs from round to round, of which each draw gets one."""
+ATTENTION_VALUES = 64
+"""Values that stand for all that somebody may attend to in a round, of which each draw gets one."""
 
 
 class Person:
@@ -80,46 +82,51 @@ class Person:
     def in_round(self, past: RoundSoFar) -> Person:
         """The person in a round under way, with what they attend to as their actions tell it.
 
-        Each draw gets one of a few values of attention from ``p(m | psi)``, by how probable it
-        makes what was done so far. Nothing changes if no attention differs from round to round.
+        Each draw gets one value of attention from ``p(m | psi, what was done so far)``, of all
+        there are or of some that stand for them (:mod:`mirror_ppl.models.attention`). Nothing
+        changes if no attention differs from round to round.
         """
         if not self.human.attends:
             return self
-        plate = pyro.plate("round", ATTENTION_VALUES, dim=-1)
+        values = self._attention
+        log_chances = self._log_chances(values.values, past)
+        with self._conditioned():
+            log_chances = log_chances + self.human.log_attention(
+                self.implants,
+                {name: value[None, None] for name, value in values.values.items()},
+                values.log_weights[None, None],
+            ).view(-1, len(values))
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # the same values at every step of a round
-            with self._conditioned(), plate:
-                drawn = self.human.attend(self.implants)
-            drawn = {
-                name: value.expand(self.number, 1, ATTENTION_VALUES)[:, 0]
-                for name, value in drawn.items()
-            }
-            chances = self._log_chances(drawn, past).softmax(-1)
-            chosen = torch.multinomial(chances, 1).squeeze(-1)
-        each = torch.arange(self.number, device=self.device)
-        own = {name: value[each, chosen] for name, value in drawn.items()}
+            torch.manual_seed(past.time)
+            chosen = torch.multinomial(log_chances.softmax(-1), 1).squeeze(-1)
+        own = {name: value[chosen] for name, value in values.values.items()}
         person = copy(self)
         person.eyes, person.eye = self._distinct_eyes({**self._discrete, **own}, self.number)
         person.eye_count = int(person.eye.max()) + 1
         return person
 
+    @cached_property
+    def _attention(self) -> AttentionValues:
+        """Values of attention that stand for all that this person may attend to."""
+        return Proposal(self.human, self.draws, self.draws, ATTENTION_VALUES).values(None, 0)
+
     def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
-        """Log-probability ``[S, J]`` of what was done so far under values of attention alike."""
-        number = next(iter(attention.values())).shape[-1]
+        """Log-probability ``[S, G]`` of what was done so far under values of attention ``[G]``."""
+        number = len(next(iter(attention.values())))
         if not past.time:
             return torch.zeros(self.number, number, device=self.device)
-        own = {name: value.repeat_interleave(number) for name, value in self._discrete.items()}
-        own |= {name: value.flatten() for name, value in attention.items()}
-        eyes, which = self._distinct_eyes(own, self.number * number)
-        count = int(which.max()) + 1
+        eyes = {name: value.repeat_interleave(number) for name, value in self.eyes.items()}
+        eyes |= {name: value.repeat(self.eye_count) for name, value in attention.items()}
+        count = self.eye_count * number
         observation, told, actions = _history(past, count)
         view = self.human.perceive(eyes, observation, told)
         view = view.map(lambda part: part.expand(count, *part.shape[1:]))
         belief = self.human.believe(view, observation, actions)
         values = self.human.self_model.action_values(belief)
-        which = which.view(self.number, 1, number)
+        which = self.eye[:, None] * number + torch.arange(number, device=self.device)
         with self._conditioned():
-            found = self.human.act(self.implants, belief[which], values[which])[:, 0]
+            found = self.human.act(self.implants, belief[which][:, None], values[which][:, None])
+        found = found.expand(self.number, *found.shape[1:])[:, 0]
         return found.gather(-1, past.actions.expand(*found.shape[:-1])[..., None]).sum((-1, -2))
 
     def _conditioned(self) -> ExitStack:

@@ -6,13 +6,41 @@ After few rounds there are far fewer sets of them than combinations.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from mirror_ppl.distinct import distinct_rows
+from mirror_ppl.inference.combinations import log_priors
+from mirror_ppl.inference.prior import sample_sites, values_of
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
+
+TRIED = 64
+"""Draws of the other implants under which priors of combinations are compared."""
+
+
+@torch.no_grad()
+def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
+    """Log prior ``[M]`` of combinations; ``None`` if it hangs on the other implants.
+
+    Args:
+        human: the model of people.
+        grid: values ``[M]`` of the discrete sites that perception reads.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        nodes = sample_sites(human, 1, TRIED)
+        others = {name: value for name, value in values_of(nodes).items() if name not in grid}
+        for name, value in others.items():
+            if nodes[name]["fn"].has_enumerate_support:  # every value, however improbable
+                support = nodes[name]["fn"].enumerate_support(expand=False).flatten()
+                each = torch.arange(TRIED, device=value.device) % len(support)
+                others[name] = support[each].view(TRIED, 1, 1).to(value)
+        found = log_priors(human, grid, others, 1)[:, 0]
+    return found[0] if bool((found == found[:1]).all()) else None
 
 
 @dataclass(frozen=True)
@@ -37,26 +65,25 @@ class Alike:
     end: Tensor
 
     @classmethod
-    def of(cls, table: ViewTable, log_priors: Tensor) -> Alike:
+    def of(cls, table: ViewTable, log_prior: Tensor | None) -> Alike:
         """Of the possible combinations of a table of one person.
 
         Args:
             table: views of the person's rounds.
-            log_priors: log prior probabilities under draws of the other implants, ``[S, M]``.
+            log_prior: see :func:`fixed_prior`, ``[M]``.
         """
         possible = (table.index[0] != NO_VIEW).all(0) | ~table.real.any()
         combinations = possible.nonzero().squeeze(-1)
-        own = log_priors[:, combinations]
-        fixed = bool((own == own[:1]).all())
-        if not fixed:
+        if log_prior is None:
             number = torch.arange(1, len(combinations) + 1, device=combinations.device)
-            none = own.new_zeros(len(combinations))
+            none = table.values.new_zeros(len(combinations))
             return cls(combinations, none, False, combinations, number.double(), number)
+        own = log_prior[combinations]
         first, which = distinct_rows(table.index[0][:, combinations].T)
         # In the order of combinations, however views are numbered.
         first, place = first.sort()
         which = place.argsort()[which]
-        prior = own[0].double().exp()
+        prior = own.double().exp()
         order = which.argsort(stable=True)
         total = prior.new_zeros(len(first)).index_add(0, which, prior)
         return cls(

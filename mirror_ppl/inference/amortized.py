@@ -75,7 +75,7 @@ def log_evidence(sightings: Sightings) -> Tensor:
 def evidence_of(sightings: Sightings) -> Evidence:
     """What a person's rounds so far say."""
     table = sightings.table()
-    alike = Alike.of(table, sightings.log_prior)
+    alike = Alike.of(table, sightings.fixed_prior)
     prior = alike.log_prior if alike.fixed else sightings.log_prior[:, alike.first]
     joint = sightings.score[:, alike.first] + prior
     ways = {name: way for name, way in sightings.ways.items() if name not in table.sites}

@@ -13,6 +13,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.attention import attention_nodes, attention_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 
@@ -33,22 +34,35 @@ def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
     }
 
 
-def attention_sites(human: HumanModel) -> dict[str, Tensor]:
-    """Supports ``[n]`` of the sites of a human model's ``attend``, by name."""
-    if not human.attends:
-        return {}
-    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
-        nodes = attention_nodes(human, human.prior())
-    return {
-        name: node["fn"].enumerate_support(expand=False).flatten() for name, node in nodes.items()
-    }
+def require_own_attention(human: HumanModel, sites: Mapping[str, Tensor]) -> None:
+    """Refuse models whose attention depends on what people see otherwise.
 
+    Args:
+        human: the model of people.
+        sites: supports ``[n]`` of the discrete sites that ``perceive`` reads.
 
-def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Nodes of the sites of attention in one round; runs inside the person plate."""
-    with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-        human.attend(implants)
-    return latent_sites(trace.trace)
+    Raises:
+        HumanModelError: it does.
+    """
+    found = []
+    for place in (0, -1):
+        ends = {name: support[place].view(1, 1) for name, support in sites.items()}
+        with torch.random.fork_rng(devices=[]), poutine.block():
+            torch.manual_seed(0)
+            with poutine.condition(data=ends), pyro.plate("person", 1, dim=-2):
+                nodes = attention_nodes(human, human.prior())
+        found.append(
+            {
+                name: node["fn"].log_prob(node["fn"].enumerate_support(expand=False)).flatten()
+                for name, node in nodes.items()
+            }
+        )
+    for name, one in found[0].items():
+        if not torch.equal(one, found[1].get(name, one[:0])):
+            raise HumanModelError(
+                f'"{name}" of attend depends on a discrete site that perceive() reads; let it '
+                "depend on others only"
+            )
 
 
 def perceived_sites(human: HumanModel) -> dict[str, Tensor]:

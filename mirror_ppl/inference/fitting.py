@@ -182,6 +182,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         "human_model": type(human).__name__,
         "self_model": fingerprint(human.self_model),
         "guide": options.guide,
+        "refined": options.refine,
         "pooling": options.pooling if population is None else "known population",
         "version": __version__,
         "seed": seed,

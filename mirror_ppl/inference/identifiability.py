@@ -43,7 +43,9 @@ POLICIES = 48
 COMBINATIONS = 128
 """Combinations of what they may see between which rounds are to tell, at most."""
 FEW = 64
-"""Combinations among the draws up to which no others are looked at."""
+"""Combinations among the draws up to which no others are looked at, if there are ..."""
+ENOUGH = 3
+"""... so many times as many draws."""
 
 VALUES = 64
 """Values of attention in a round, where it differs from round to round."""
@@ -131,7 +133,7 @@ def identify(
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
         drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes)
         candidates, one = drawn.unique(), train.select_people([person])
-        if len(candidates) <= FEW:
+        if len(candidates) <= FEW and ENOUGH * len(candidates) <= held:
             table = build_view_table(human, one, [candidates], likely=own, values=VALUES)
         else:  # draws are too few to tell how many there are
             table = build_view_table(human, one, screening=Screening(), likely=own, values=VALUES)
@@ -142,8 +144,11 @@ def identify(
         joint = log_joints(human, table, policy, candidates)[:, 0]
         grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
         if population is not None:
-            # The draws are of people from one draw of the population each.
-            chances = {site: value[chosen] for site, value in population.chances.items()}
+            # On average: which population it is says nothing of how this person decides.
+            chances = {
+                site: value.mean(0, keepdim=True).expand(len(chosen), *value.shape[1:])
+                for site, value in population.chances.items()
+            }
             joint = joint + _instead_of_prior(human, grid, policy, chances, supports)
         weights = torch.log_softmax(joint, -1)  # [S, C]
         told = (weights.new_zeros(0),) * 2

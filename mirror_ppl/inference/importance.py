@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, biject_to
 
-from mirror_ppl.inference.alike import Alike
-from mirror_ppl.inference.combinations import log_priors
+from mirror_ppl.inference.alike import Alike, fixed_prior
 from mirror_ppl.inference.exact import (
     combination_values,
     log_joints,
@@ -153,9 +152,7 @@ class Sampler:
         self.table = table
         self.sites = scalar_sites(human) if sites is None else sites
         if alike is None:
-            two, _ = complete(human, table, {}, 2)
-            grid = combination_values(human, table)
-            alike = Alike.of(table, log_priors(human, grid, two, 1)[:, 0])
+            alike = Alike.of(table, fixed_prior(human, combination_values(human, table)))
         self.alike = alike
         self.place = torch.zeros(0, len(self.sites), device=table.index.device)
         self._from_prior = 0

@@ -1,7 +1,7 @@
 """Going through a person's rounds twice, where what they attend to differs from round to round.
 
 What stands for all that they may have attended to is chosen by who they are
-(:mod:`mirror_ppl.inference.attention`), which is not known when their rounds are seen for the first
+(:mod:`mirror_ppl.models.attention`), which is not known when their rounds are seen for the first
 time. The first look tells roughly; the second chooses by that.
 """
 

@@ -21,10 +21,16 @@ from torch.nn.functional import pad
 
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.attention import KEPT, VALUES, AttentionValues, Proposal
-from mirror_ppl.inference.combinations import grid_of, log_priors, perceived_sites
+from mirror_ppl.inference.alike import fixed_prior
+from mirror_ppl.inference.combinations import (
+    grid_of,
+    log_priors,
+    perceived_sites,
+    require_own_attention,
+)
 from mirror_ppl.inference.courses import CHUNK, beliefs_and_values
 from mirror_ppl.inference.prior import draw_prior
+from mirror_ppl.models.attention import KEPT, VALUES, AttentionValues, Proposal
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, log_likelihoods
 
@@ -133,7 +139,7 @@ class Sightings:
         values: of attention that stand for all in a round.
 
     Raises:
-        HumanModelError: see :func:`perceived_sites`.
+        HumanModelError: see :func:`perceived_sites` and :func:`require_own_attention`.
 
     Attributes:
         grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
@@ -172,6 +178,7 @@ class Sightings:
         self._attended: list[AttentionValues] = []
         self._proposal: Proposal | None = None
         if human.attends:
+            require_own_attention(human, supports)
             known = {} if likely is not None else self.draw_ways()
             anybody = known or draw_prior(human, 1, PROPOSING_WAYS, 0)
             self._proposal = Proposal(human, anybody, likely, values)
@@ -292,6 +299,11 @@ class Sightings:
         """Recorded actions (0) or real steps (1) of all rounds, ``[B, T]``."""
         parts = [recorded[which] for recorded in self._recorded]
         return torch.stack([pad(part, [0, steps - len(part)]) for part in parts])
+
+    @cached_property
+    def fixed_prior(self) -> Tensor | None:
+        """Log prior ``[M]`` of each combination; ``None`` if it hangs on the other implants."""
+        return fixed_prior(self.human, self.grid)
 
     @cached_property
     def log_prior(self) -> Tensor:

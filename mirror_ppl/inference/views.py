@@ -11,8 +11,8 @@ from torch.nn.functional import pad
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.attention import VALUES
 from mirror_ppl.inference.sightings import RoundViews, Screening, Sightings
+from mirror_ppl.models.attention import VALUES
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
 

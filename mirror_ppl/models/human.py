@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import pyro
@@ -168,10 +168,18 @@ class HumanModel(nn.Module):
         del implants
         return {}
 
-    @property
+    @cached_property
     def attends(self) -> bool:
         """Whether something differs from round to round."""
-        return type(self).attend is not HumanModel.attend
+        if type(self).attend is HumanModel.attend:
+            return False
+        with (
+            torch.random.fork_rng(devices=[]),
+            poutine.block(),
+            pyro.plate("person", 1, dim=-2),
+            pyro.plate("round", 1, dim=-1),
+        ):
+            return bool(self.attend(self.prior()))
 
     def log_attention(
         self, implants: Implants, values: Mapping[str, Tensor], log_weights: Tensor

@@ -108,6 +108,8 @@ def check_contract(human: HumanModel) -> None:
                 )
             method = "attend"
             attention = _attention(human, implants, people)
+            for name in set(attention) & set(latent_sites(trace.trace)):
+                raise HumanModelError(f'"{name}" is a site of prior() and of attend()')
             sampled = latent_values(trace.trace)
             discrete = {
                 name: sampled[name].flatten()[:people].expand(people)
@@ -146,6 +148,9 @@ def _attention(human: HumanModel, implants: Implants, people: int) -> dict[str, 
     sites = latent_sites(trace.trace)
     if not isinstance(returned, Mapping) or set(returned) != set(sites):
         raise HumanModelError("attend has to return a dict of the sites that it samples, by name")
+    for name, site in trace.trace.nodes.items():
+        if site["type"] == "param":
+            raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
     for name, site in sites.items():
         if not site["fn"].support.is_discrete:
             raise HumanModelError(f'"{name}" of attend is not discrete')

@@ -41,7 +41,7 @@ class Readable(Mapping[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         if name not in self.known:
             raise HumanModelError(
-                f'perceive() reads "{name}", which is not a discrete site of prior(); '
+                f'perceive() reads "{name}", which is not a discrete site of prior() or attend(); '
                 f"it can read: {', '.join(self.known) or 'none'}"
             )
         self.read.add(name)

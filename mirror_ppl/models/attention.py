@@ -8,25 +8,28 @@ probability ``pi(m)`` with which it is among those drawn::
 
     sum_m p(m | psi) f(m)  ~=  sum_g w_g f(m_g) / sum_g w_g,    w_g = p(m_g | psi) / pi(m_g)
 
-which is right in the limit whatever ``q`` is, and exact where the combinations are no more than G.
+which is right in the limit whatever ``q`` is, and exact where the combinations are no more than are
+kept.
 Probable values are taken for certain and the improbable by systematic resampling (Fearnhead and
 Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by site.
 Of the G values, those that could explain what was done are kept in the same way; the sum in the
-denominator, which needs no beliefs, is over all.
+denominator, which needs no beliefs, is over all. ``pi`` is the product of the probabilities with
+which a value was kept on the way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pyro
 import torch
 from pyro import poutine
 from torch import Tensor
 
-from mirror_ppl.inference.combinations import attention_nodes, attention_sites
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.sites import latent_sites
 
 VALUES, KEPT = 512, 96
 """Values of attention that stand for all in a round, and how many are kept for what was done."""
@@ -63,6 +66,24 @@ class AttentionValues:
         return replace(self, kept=kept, log_kept=log_kept.to(useful.dtype))
 
 
+def attention_sites(human: HumanModel) -> dict[str, Tensor]:
+    """Supports ``[n]`` of the sites of a human model's ``attend``, by name."""
+    if not human.attends:
+        return {}
+    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
+        nodes = attention_nodes(human, human.prior())
+    return {
+        name: node["fn"].enumerate_support(expand=False).flatten() for name, node in nodes.items()
+    }
+
+
+def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Nodes of the sites of attention in one round; runs inside the person plate."""
+    with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
+        human.attend(implants)
+    return latent_sites(trace.trace)
+
+
 def site_probabilities(
     human: HumanModel, ways: Mapping[str, Tensor], weights: Tensor | None = None
 ) -> dict[str, Tensor]:
@@ -75,11 +96,13 @@ def site_probabilities(
     """
     number = len(next(iter(ways.values())))
     with (
+        torch.random.fork_rng(devices=[]),
         poutine.block(),
         poutine.condition(data=dict(ways)),
         pyro.plate("way", number, dim=-3),
         pyro.plate("person", 1, dim=-2),
     ):
+        torch.manual_seed(0)
         nodes = attention_nodes(human, human.prior())
     found = {}
     for name, node in nodes.items():
