@@ -173,6 +173,26 @@ def test_wide_posteriors_are_looked_at_as_a_whole(toy, rounds):
     assert all(one["error"] is None and one["expected"] > 0 for one in told.values())
 
 
+def test_few_draws_do_not_make_a_posterior_narrow(toy, rounds):
+    human = HumanModel(toy.self_model)
+    nobody = rounds.select_people([0]).select_rounds([])
+    draws = infer(human, nobody, InferenceOptions(draws=20), 0).draws
+    found = identify(human, nobody, draws, 0, rounds=0)
+    assert float(found.all_entropy[0]) == pytest.approx(math.log(9604), rel=1e-3)
+
+
+def test_which_population_it_is_hangs_on_no_policy(toy, rounds):
+    """Without a round sight and policy are independent, however populations differ."""
+    nobody = rounds.select_people([0]).select_rounds([])
+    draws = infer(toy, nobody, InferenceOptions(draws=POLICIES), 0).draws
+    chances = torch.distributions.Dirichlet(torch.ones(7)).sample(torch.Size([POLICIES]))
+    rates = ({rate: torch.ones(POLICIES) for rate in RATES} for _ in range(2))
+    found = identify(toy, nobody, draws, 0, Population({"reach": chances}, *rates), rounds=0)
+    assert float(found.all_shared[0]) < 1e-5
+    expected = entropy(chances.mean(0))
+    torch.testing.assert_close(found.all_entropy[0], expected, rtol=1e-3, atol=1e-4)
+
+
 def test_models_without_anything_to_see_have_no_report(toy, rounds):
     human = NoImplants(toy.self_model)
     draws = infer(human, rounds, InferenceOptions(draws=4), 0).draws

@@ -100,8 +100,15 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
 
 def grid_of(supports: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Values ``[M]`` of sites, one for each combination, row-major."""
-    axes = torch.meshgrid(*supports.values(), indexing="ij") if supports else ()
-    return {site: axis.flatten() for site, axis in zip(supports, axes, strict=True)}
+    if not supports:
+        return {}
+    # Of places, since supports may be of different kinds of numbers.
+    places = [torch.arange(len(support), device=support.device) for support in supports.values()]
+    axes = torch.meshgrid(*places, indexing="ij")
+    return {
+        site: support[axis.flatten()]
+        for (site, support), axis in zip(supports.items(), axes, strict=True)
+    }
 
 
 @torch.no_grad()
