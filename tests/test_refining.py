@@ -49,16 +49,19 @@ def test_the_guide_starts_at_the_draws(human):
     assert weights and all(torch.equal(after[name], before[name]) for name in weights)
 
 
-def test_refining_starts_near_the_end(human, recordings):
-    found = infer(human, recordings, InferenceOptions(draws=50, refine=30), seed=0)
-    fresh = infer(human, recordings, InferenceOptions("svi", 50, svi=FitOptions(steps=200)), seed=0)
+def test_refining_starts_near_the_end(human):
+    """Bounds of single draws differ by a few nats, and the fresh start begins dozens behind."""
+    whole = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    rounds = whole.select_people(range(5)).select_rounds(range(20))
+    found = infer(human, rounds, InferenceOptions(draws=50, refine=30), seed=0)
+    options = InferenceOptions("svi", 50, svi=FitOptions(steps=150))
+    fresh = infer(human, rounds, options, seed=0)
     assert len(found.losses) == 30
     assert found.pareto_k is None
-    begun, ended = sum(fresh.losses[:5]) / 5, sum(fresh.losses[-20:]) / 20
-    own = sum(found.losses[:5]) / 5
-    assert own - ended < 0.25 * (begun - ended)
-    assert sum(found.losses[-20:]) / 20 < own + 3
-    assert found.draws["consistency"].shape == (50, 3, 1)
+    begun, ended = fresh.losses[0], sum(fresh.losses[-20:]) / 20
+    assert begun - ended > 20
+    assert sum(found.losses[:10]) / 10 - ended < 0.3 * (begun - ended)
+    assert found.draws["consistency"].shape == (50, 5, 1)
     assert found.draws.keys() == fresh.draws.keys()
 
 

@@ -111,7 +111,7 @@ def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
         given = "--human-model", name
         status = command(
             fit, *given, "--guide", guide, "--train-rounds", 1, "--draws", 8, "--steps", 2,
-            "--out", name,
+            "--explore", 0, "--out", name,
         )  # fmt: skip
         assert status == 0
     people = json.loads((tmp_path / "one-radius" / "summary.json").read_text())["people"]
