@@ -35,7 +35,7 @@ from mirror_ppl.models import HumanModel
 from mirror_ppl.models.attention import KEPT, VALUES, choose_values, site_probabilities
 from mirror_ppl.models.implants import first_success, noticed_sites, policy_implants
 from mirror_ppl.models.loading import check_contract, load_human_model
-from mirror_ppl.models.variants import PerItem
+from mirror_ppl.models.variants import OneRadius, PerItem
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")
@@ -581,16 +581,17 @@ def test_attention_to_nothing_is_none(self_model, recordings):
     assert build_view_table(human, one).attention is None
 
 
-class ReadsSight(PerItem):
-    """Notices by what they assume, which cannot be summed out."""
+class ReadsSight(OneRadius):
+    """Is away only if they see two cells, which cannot be summed out."""
 
     def attend(self, implants):
-        chance = 0.1 + 0.8 * (implants["assumes_clear"] == 1)
-        return {site: pyro.sample(site, first_success(chance, STEPS)) for site in NOTICED}
+        chance = 0.1 + 0.8 * (implants["sight_radius"] == 2)
+        return {"away": pyro.sample("away", dist.Bernoulli(chance))}
 
 
 def test_attention_that_hangs_on_what_is_seen_is_refused(self_model, recordings):
+    """On a value in the middle, too."""
     one = recordings.select_people([0]).select_rounds([0])
-    message = '"noticed_front-left" of attend depends on a discrete site that perceive'
+    message = '"away" of attend depends on a discrete site that perceive'
     with pytest.raises(HumanModelError, match=message):
         build_view_table(ReadsSight(self_model), one)

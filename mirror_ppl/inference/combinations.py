@@ -45,11 +45,12 @@ def require_own_attention(human: HumanModel, sites: Mapping[str, Tensor]) -> Non
         HumanModelError: it does.
     """
     found = []
-    for place in (0, -1):
-        ends = {name: support[place].view(1, 1) for name, support in sites.items()}
+    # Every value of each site once.
+    for place in range(max((len(support) for support in sites.values()), default=1)):
+        some = {name: own[place % len(own)].view(1, 1) for name, own in sites.items()}
         with torch.random.fork_rng(devices=[]), poutine.block():
             torch.manual_seed(0)
-            with poutine.condition(data=ends), pyro.plate("person", 1, dim=-2):
+            with poutine.condition(data=some), pyro.plate("person", 1, dim=-2):
                 nodes = attention_nodes(human, human.prior())
         found.append(
             {
@@ -58,7 +59,7 @@ def require_own_attention(human: HumanModel, sites: Mapping[str, Tensor]) -> Non
             }
         )
     for name, one in found[0].items():
-        if not torch.equal(one, found[1].get(name, one[:0])):
+        if not all(torch.equal(one, other.get(name, one[:0])) for other in found):
             raise HumanModelError(
                 f'"{name}" of attend depends on a discrete site that perceive() reads; let it '
                 "depend on others only"
