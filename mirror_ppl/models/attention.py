@@ -9,11 +9,11 @@ probability ``pi(m)`` with which it is among those drawn::
     sum_m p(m | psi) f(m)  ~=  sum_g w_g f(m_g) / sum_g w_g,    w_g = p(m_g | psi) / pi(m_g)
 
 which is right in the limit whatever ``q`` is, and exact where there are no more combinations than
-are kept. Probable values are taken for certain and the improbable by systematic resampling (Fearnhead and
-Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by site.
-Of the G values, those that could explain what was done are kept in the same way; the sum in the
-denominator, which needs no beliefs, is over all. ``pi`` is the product of the probabilities with
-which a value was kept on the way.
+are kept. Probable values are taken for certain and the improbable by systematic resampling
+(Fearnhead and Clifford, *On-line inference for hidden Markov models via particle filters*, 2003),
+site by site. Of the G values, those that could explain what was done are kept in the same way; the
+sum in the denominator, which needs no beliefs, is over all. ``pi`` is the product of the
+probabilities with which a value was kept on the way.
 """
 
 from __future__ import annotations
