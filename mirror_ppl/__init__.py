@@ -10,3 +10,4 @@ from gymnasium import register as _register
 __version__ = "0.1.0"
 
 _register("mirror_ppl/Driving-v0", "mirror_ppl.domains.driving_environment:DrivingEnv")
+_register("mirror_ppl/SearchRescue-v0", "mirror_ppl.domains.rescue_environment:SearchRescueEnv")

@@ -24,6 +24,7 @@ from mirror_ppl.models.networks import (
     Transition,
 )
 from mirror_ppl.models.self_model import Rounds, SelfModel
+from mirror_ppl.models.sizes import Sizes
 
 DRIVING = get_domain("driving")
 LATENT, ACTIONS, HIDDEN = 48, 2, 64
@@ -42,7 +43,7 @@ def linear_sizes(module):
 
 
 def encoder(dtype=torch.float64):
-    return Encoder(LATENT, ACTIONS, SYMBOLS, ITEMS).to(dtype)
+    return Encoder(DRIVING, Sizes()).to(dtype)
 
 
 def symbols(*batch, dtype=torch.float64):

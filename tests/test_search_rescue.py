@@ -9,19 +9,17 @@ import pytest
 import torch
 
 from mirror_ppl.domains import Domain
-from mirror_ppl.domains.search_rescue import (
+from mirror_ppl.domains.rescue_house import (
     ENTRANCE,
     HOUSE,
     OBSTACLES,
     PORTIONS,
     ROOMS,
-    UTTERANCES,
     VICTIM,
-    RescueState,
-    SearchRescue,
     as_image,
     as_portions,
 )
+from mirror_ppl.domains.search_rescue import UTTERANCES, RescueState, SearchRescue
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import check_contract

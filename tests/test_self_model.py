@@ -28,6 +28,7 @@ from mirror_ppl.inference.self_model_training import (
     train_self_model,
 )
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import Sizes
 from mirror_ppl.models.views import draw_views
 from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
 
@@ -410,7 +411,9 @@ def test_weights_of_something_else_are_refused(tmp_path, monkeypatch):
     save_file({"x": torch.zeros(2)}, path)
     with pytest.raises(AssetError, match="not a self-model"):
         load_self_model(path)
-    save_self_model(SelfModel(DRIVING, latent=8), path, CARD)
+    broken = SelfModel(DRIVING)
+    broken.sizes = Sizes(latent=8)
+    save_self_model(broken, path, CARD)
     with pytest.raises(AssetError, match="does not fit this program"):
         load_self_model(path)
     save_self_model(SelfModel(DRIVING), path, CARD)
@@ -425,6 +428,13 @@ def test_weights_of_something_else_are_refused(tmp_path, monkeypatch):
     monkeypatch.undo()
     with pytest.raises(AssetError, match='unknown domain "flying"'):
         load_self_model(path)
+
+
+def test_weights_know_their_sizes(tmp_path):
+    path, sizes = tmp_path / "a.safetensors", Sizes(latent=8, encoder=16)
+    save_self_model(SelfModel(DRIVING, sizes), path, CARD)
+    model, _ = load_self_model(path)
+    assert (model.sizes, model.latent, model.encoder.ego.out_features) == (sizes, 8, 16)
 
 
 def test_no_weights_ship_for_an_unknown_domain():

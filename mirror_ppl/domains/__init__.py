@@ -2,8 +2,9 @@
 
 from mirror_ppl.domains.base import Domain, Modality, Observation, Visibility, require_known
 from mirror_ppl.domains.driving import Driving
+from mirror_ppl.domains.search_rescue import SearchRescue
 
-DOMAINS: dict[str, Domain] = {domain.name: domain for domain in (Driving(),)}
+DOMAINS: dict[str, Domain] = {domain.name: domain for domain in (Driving(), SearchRescue())}
 """Every domain by name."""
 
 

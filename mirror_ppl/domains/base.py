@@ -21,6 +21,7 @@ V    views of a round: the distinct ways to have seen it
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -49,6 +50,10 @@ class Modality:
         scales: typical size of each feature, by which decoders normalize.
         cost_coefficient: communicating n items in one step costs ``cost_coefficient * n**2``
             units of reward (supplement, Table I).
+        image: rows, columns and colours of an item that is an image; its features are the pixels
+            in that order.
+        utterances: of spoken items, what is said of each by the value of its one feature: U
+            sentences an item, for the values 0 to U - 1.
     """
 
     name: str
@@ -57,14 +62,36 @@ class Modality:
     units: tuple[str, ...]
     scales: tuple[float, ...]
     cost_coefficient: float
+    image: tuple[int, int, int] | None = None
+    utterances: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.features) == len(self.units) == len(self.scales):
             raise ValueError(f"modality {self.name!r}: each feature needs a unit and a scale")
+        if self.image is not None and math.prod(self.image) != len(self.features):
+            raise ValueError(f"modality {self.name!r}: an image's features are its pixels")
+        if self.utterances and len(self.utterances) != len(self.items):
+            raise ValueError(f"modality {self.name!r}: each item needs its utterances")
 
     def cost(self, number: Tensor) -> Tensor:
         """Cost in units of reward of communicating ``number`` items in one step."""
         return self.cost_coefficient * number.to(torch.get_default_dtype()) ** 2
+
+    def understand(self, utterance: str) -> tuple[int, int]:
+        """Which item an utterance is about, and which of the utterances about it was said.
+
+        Args:
+            utterance: one of ``utterances``; upper and lower case count alike.
+
+        Raises:
+            UnknownNameError: it is none of them; lists them.
+        """
+        known = [sentence for about in self.utterances for sentence in about]
+        alike = {sentence.lower(): place for place, sentence in enumerate(known)}
+        heard = " ".join(utterance.lower().split())
+        if heard not in alike:
+            raise UnknownNameError.of("utterance", utterance, known)
+        return divmod(alike[heard], len(self.utterances[0]))
 
 
 class Domain(Protocol):
@@ -72,7 +99,9 @@ class Domain(Protocol):
 
     ``state`` and ``knowledge`` are the domain's own frozen dataclasses of tensors; only the domain
     looks inside. Knowledge is what an observer has learned of the things behind the items from what
-    they saw or were told in a round so far.
+    they saw or were told in a round so far. ``over_at_horizon`` says that nothing is left to win or
+    lose when a round ends; where it does not, the end is only where recording stops.
+    ``partial_views`` are reaches in each direction by name, in which self-models are measured.
     """
 
     name: str
@@ -82,12 +111,14 @@ class Domain(Protocol):
     symbol_sizes: Mapping[str, int]
     actions: tuple[str, ...]
     horizon: int
+    over_at_horizon: bool
     settings: tuple[str, ...]
     scenarios: tuple[str, ...]
     reward_terms: tuple[str, ...]
     directions: tuple[str, ...]
     direction_groups: tuple[tuple[int, ...], ...]
     reach_bins: tuple[float, ...]
+    partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...]
 
     def initial(

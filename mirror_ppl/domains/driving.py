@@ -128,6 +128,7 @@ class Driving:
     symbol_sizes: Mapping[str, int] = {"ego": 2, "visual": 50, "verbal": 53}
     actions: tuple[str, ...] = ("stay", "switch")
     horizon = 15
+    over_at_horizon = True
     settings: tuple[str, ...] = ("clear", "fog")
     scenarios: tuple[str, ...] = tuple(SCENARIO_SPEEDS)
     reward_terms: tuple[str, ...] = ("proximity", "collision", "off_road", "lane_change")
@@ -137,6 +138,10 @@ class Driving:
     reach_bins: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, float(ROAD_END))
     """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
     cells away and none at the next edge. The last bin is the whole road."""
+    partial_views: Mapping[str, tuple[float, ...]] = {
+        "fog": (FOG_REACH, FOG_REACH, 0.0, 0.0),
+        "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),
+    }
     assumptions: tuple[str, ...] = ASSUMPTIONS
 
     def initial(

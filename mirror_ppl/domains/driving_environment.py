@@ -2,24 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
-
-import gymnasium
-import numpy as np
-import torch
-from gymnasium import spaces
-from gymnasium.error import InvalidAction, ResetNeeded
-
-from mirror_ppl.domains.base import require_known, total_reward
-from mirror_ppl.domains.driving import ROAD_END, Driving, DrivingState
-
-RENDER_MODES = ("rgb_array",)
-
-EnvObservation = dict[str, Any]
-"""Numpy arrays by name."""
+from mirror_ppl.domains.driving import ROAD_END, Driving
+from mirror_ppl.domains.environment import DomainEnv
 
 
-class DrivingEnv(gymnasium.Env[EnvObservation, np.int64]):
+class DrivingEnv(DomainEnv):
     """Two lanes, four cars that never yield, and what one person sees of them.
 
     ## Description
@@ -75,119 +62,15 @@ class DrivingEnv(gymnasium.Env[EnvObservation, np.int64]):
         UnknownNameError: if the setting, the scenario or the render mode is not a known one.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 4}
-
     def __init__(
         self,
         setting: str = "clear",
         scenario: str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self.domain = Driving()
-        self.setting = require_known(setting, "setting", self.domain.settings)
-        if scenario is not None:
-            require_known(scenario, "scenario", self.domain.scenarios)
-        self.scenario = scenario
-        if render_mode is not None:
-            require_known(render_mode, "render mode", RENDER_MODES)
-        self.render_mode = render_mode
-
-        self.action_space = spaces.Discrete(len(self.domain.actions))
-        self.observation_space = _observation_space(self.domain)
-        self._state: DrivingState | None = None
-        self._scenario_name = ""
-        self._step = 0
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[EnvObservation, dict[str, Any]]:
-        """Start a round; the same seed gives the same round. There are no ``options``."""
-        super().reset(seed=seed, options=options)
-        scenarios = self.domain.scenarios
-        if self.scenario is None:
-            index = int(self.np_random.integers(len(scenarios)))
-        else:
-            index = scenarios.index(self.scenario)
-        # The domain draws from torch's generators; this one hangs on Gymnasium's seed.
-        generator = torch.Generator().manual_seed(int(self.np_random.integers(2**63 - 1)))
-        self._state = _only(self.domain.initial(1, generator, torch.tensor([index])))
-        self._scenario_name = scenarios[index]
-        self._step = 0
-        return self._observation(self._state), self._info(self._state)
-
-    def step(self, action: np.int64) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
-        """Play one step; see `gymnasium.Env.step`.
-
-        Raises:
-            ResetNeeded: before the first reset, and after the last step of a round.
-            InvalidAction: if the action is not 0 or 1.
-        """
-        if self._state is None or self._step == self.domain.horizon:
-            raise ResetNeeded("call reset() to start a round")
-        if not self.action_space.contains(action):
-            raise InvalidAction(f"expected an action of {self.action_space}, given {action!r}")
-        chosen = torch.tensor(int(action))
-        following = self.domain.transition(self._state, chosen)
-        terms = self.domain.rewards(self._state, chosen, following)
-        self._state = following
-        self._step += 1
-        info = self._info(following)
-        # Adding zero turns the -0.0 of a penalty that does not apply into 0.0.
-        info["rewards"] = {name: term.item() + 0.0 for name, term in terms.items()}
-        reward = total_reward(terms).item() + 0.0
-        truncated = self._step == self.domain.horizon
-        return self._observation(following), reward, False, truncated, info
-
-    def render(self) -> np.ndarray | None:
-        """Picture ``uint8 [height, width, 3]`` of everything on the road, seen or not.
-
-        Returns:
-            The picture, or None if the environment was made without a render mode.
-
-        Raises:
-            ResetNeeded: before the first reset.
-        """
-        if self.render_mode is None:
-            gymnasium.logger.warn('make the environment with render_mode="rgb_array" to render it')
-            return None
-        if self._state is None:
-            raise ResetNeeded("call reset() to start a round")
-        return self.domain.render(self._state)
-
-    def _observation(self, state: DrivingState) -> EnvObservation:
-        """What the person sees of a state, as numpy arrays of their own."""
-        values = self.domain.observe(state)
-        masks = self.domain.visibility(self.setting, values)
-        seen: EnvObservation = {"ego": values["ego"].numpy().astype(np.float32)}
-        for name, mask in masks.items():
-            shown = torch.where(mask[..., None], values[name], 0.0)
-            seen[name] = shown.numpy().astype(np.float32)
-            seen[f"{name}_mask"] = mask.numpy().astype(np.int8)
-        return seen
-
-    def _info(self, state: DrivingState) -> dict[str, Any]:
-        return {
-            "scenario": self._scenario_name,
-            "state": {
-                "lane": int(state.lane),
-                "position": state.position.numpy().copy(),
-                "speed": state.speed.numpy().copy(),
-            },
-        }
-
-
-def _observation_space(domain: Driving) -> spaces.Dict:
-    parts: dict[str, spaces.Space[Any]] = {"ego": spaces.Box(0.0, 1.0, (1,), np.float32)}
-    # Distance ahead, lane offset, relative speed; a modality has the first of them that it names.
-    limits = np.array([ROAD_END, 1, 1], dtype=np.float32)
-    for modality in domain.modalities:
-        shape = (len(modality.items), len(modality.features))
-        high = np.broadcast_to(limits[: shape[1]], shape)
-        parts[modality.name] = spaces.Box(-high, high, dtype=np.float32)
-        parts[f"{modality.name}_mask"] = spaces.MultiBinary(shape[0])
-    return spaces.Dict(parts)
-
-
-def _only(states: DrivingState) -> DrivingState:
-    """The state in a batch of one."""
-    return DrivingState(states.lane[0], states.position[0], states.speed[0])
+        highest = [float(ROAD_END), 1.0, 1.0]
+        limits = {"ego": ([0.0], [1.0])}
+        for modality in Driving.modalities:
+            high = highest[: len(modality.features)]
+            limits[modality.name] = ([-limit for limit in high], high)
+        super().__init__(Driving(), limits, setting, scenario, render_mode)

@@ -61,44 +61,31 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.rescue_house import (
+    CORRIDORS,
+    ENTRANCE,
+    PORTION,
+    PORTIONS,
+    ROOMS,
+    SIDE,
+    as_image,
+    at_entrance,
+    portion_centres,
+    portion_pixels,
+    reach_distances,
+    walkable,
+)
 from mirror_ppl.domains.rescue_knowledge import (
     CORRIDOR_PORTIONS,
     ROOM_PORTIONS,
     HouseKnowledge,
 )
 
-SIDE, PORTION = 9, 3
-"""Cells along a side of the map, and of a portion of it."""
-HOUSE = (
-    ".........",
-    ".........",
-    ".........",
-    "#.#####.#",
-    "#.#####.#",
-    "#.#####.#",
-    ".........",
-    ".........",
-    ".........",
-)
-ENTRANCE = (8, 4)
-ROOMS = {"top-left": (1, 1), "top-middle": (1, 4), "top-right": (1, 7)}
-"""Where the victim may be, by room."""
-CORRIDORS = {"left": (4, 1), "right": (4, 7)}
-"""Where an obstacle may be, by corridor."""
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 SMOKE_REACH = 1.5
 """How far a firefighter sees in smoke, in cells to the centre of a portion."""
 FOUND, RETURNED, COLLISION, TIME = 1.0, 15.0, -10.0, -0.1
 
-FLOOR, WALL, DOOR, VICTIM = (0.9, 0.9, 0.9), (0.2, 0.2, 0.2), (0.9, 0.8, 0.2), (0.1, 0.7, 0.2)
-OBSTACLES = ((0.8, 0.2, 0.2), (0.6, 0.2, 0.7))
-"""Colours of pixels; of obstacles in the left and the right corridor."""
-
-PORTIONS = tuple(
-    f"{row}-{column}"
-    for row in ("top", "middle", "bottom")
-    for column in ("left", "middle", "right")
-)
 UTTERANCES: Mapping[str, tuple[str, str]] = {
     **{
         f"{side} corridor": (f"{side} corridor clear", f"{side} corridor blocked")
@@ -146,13 +133,23 @@ class SearchRescue:
             ("intensity",) * 3 * PORTION**2,
             (1.0,) * 3 * PORTION**2,
             0.02,
+            image=(PORTION, PORTION, 3),
         ),
-        Modality("verbal", tuple(UTTERANCES), ("holds",), ("truth",), (1.0,), 0.1),
+        Modality(
+            "verbal",
+            tuple(UTTERANCES),
+            ("holds",),
+            ("truth",),
+            (1.0,),
+            0.1,
+            utterances=tuple(UTTERANCES.values()),
+        ),
     )
     ego_features: tuple[str, ...] = ("row", "column", "carrying")
     symbol_sizes: Mapping[str, int] = {"ego": 2 * SIDE + 1, "visual": 3 * PORTION**2, "verbal": 2}
     actions: tuple[str, ...] = tuple(MOVES)
     horizon = 48
+    over_at_horizon = False
     settings: tuple[str, ...] = ("clear", "smoke")
     scenarios: tuple[str, ...] = tuple(
         f"victim {room}, {blocked}"
@@ -162,16 +159,11 @@ class SearchRescue:
     reward_terms: tuple[str, ...] = ("found", "returned", "collision", "time")
     directions: tuple[str, ...] = ("radius",)
     direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
+    reach_bins: tuple[float, ...] = reach_distances()
+    """Lower edges in cells of the bins of a radius: the distances that can occur, from any cell
+    that can be walked on to the centre of any portion whose content is not always the same."""
+    partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ()
-
-    @property
-    def reach_bins(self) -> tuple[float, ...]:
-        """Lower edges in cells of the bins of a radius: the distances that can occur.
-
-        From any cell that can be walked on to the centre of any portion whose content is not the
-        same in all scenarios.
-        """
-        return _reach_bins()
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
@@ -201,10 +193,11 @@ class SearchRescue:
         """State at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
         moves = torch.tensor(list(MOVES.values()), device=state.place.device)
         target = state.place + moves[action]
-        stays = state.home | ~_walkable(target) | self._obstructed(state, target)
+        stays = state.home | ~walkable(target) | self._obstructed(state, target)
         place = torch.where(stays[..., None], state.place, target)
         found = state.found | self._at_victim(state, place)
-        return replace(state, place=place, found=found, home=state.home | (found & _at(place)))
+        home = state.home | (found & at_entrance(place))
+        return replace(state, place=place, found=found, home=home)
 
     def rewards(
         self, state: RescueState, action: Tensor, following: RescueState
@@ -238,7 +231,7 @@ class SearchRescue:
         there = (state.victim[..., None] == rooms) & ~state.found[..., None]
         blocked = state.blocked[..., None] == sides
         holds = torch.cat([blocked, there], -1)
-        return {"ego": ego, "visual": _portions(holds), "verbal": holds[..., None].to(dtype)}
+        return {"ego": ego, "visual": portion_pixels(holds), "verbal": holds[..., None].to(dtype)}
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
         """What the setting lets an unaided person see, and hear.
@@ -266,10 +259,10 @@ class SearchRescue:
         holds = observation["verbal"][..., 0]
         known = (holds == 0) | (holds == 1)
         whole = (place == place.round()).all(-1)
-        pixels = _portions(holds == 1)
+        pixels = portion_pixels(holds == 1)
         return {
             "row and column have to be those of a cell that can be walked on": ~(
-                whole & _walkable(place.long())
+                whole & walkable(place.long())
             ),
             "carrying has to be 0 or 1": (carrying != 0) & (carrying != 1),
             "holds has to be 0 or 1": ~known.all(-1),
@@ -334,7 +327,7 @@ class SearchRescue:
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
         """Direction (there is one) and distance in cells to the centre of each portion."""
         place = observation["ego"][..., None, :2]
-        distance = (place - _centres().to(place)).pow(2).sum(-1).sqrt()
+        distance = (place - portion_centres().to(place)).pow(2).sum(-1).sqrt()
         return torch.zeros_like(distance, dtype=torch.long), distance
 
     def state_behind(self, observation: Observation) -> RescueState:
@@ -350,7 +343,7 @@ class SearchRescue:
         return RescueState(
             place=place,
             found=found,
-            home=found & _at(place),
+            home=found & at_entrance(place),
             blocked=(holds[..., : len(sides)] * sides).sum(-1),
             victim=(holds[..., len(sides) :] * rooms).sum(-1),
         )
@@ -363,7 +356,7 @@ class SearchRescue:
         """
         place = observation["ego"][..., :2]
         cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
-        cells = cells[_walkable(cells)].to(place.device)
+        cells = cells[walkable(cells)].to(place.device)
         apart = (place[..., None, :] - cells.to(place)).pow(2).sum(-1)
         carrying = observation["ego"][..., 2] >= 0.5  # noqa: PLR2004 - between no and yes
         corridors, rooms = 1 + len(CORRIDORS), len(ROOMS)
@@ -428,68 +421,6 @@ class SearchRescue:
         return picture
 
 
-def as_image(portions: Tensor) -> Tensor:
-    """The map ``[..., 9, 9, 3]``, rows, columns and colours, of its portions ``[..., 9, 27]``."""
-    blocks = portions.unflatten(-1, (PORTION, PORTION, 3)).unflatten(-4, (PORTION, PORTION))
-    return blocks.transpose(-4, -3).flatten(-5, -4).flatten(-3, -2)
-
-
-def as_portions(image: Tensor) -> Tensor:
-    """Portions ``[..., 9, 27]`` of a map ``[..., 9, 9, 3]``."""
-    blocks = image.unflatten(-2, (PORTION, PORTION)).unflatten(-4, (PORTION, PORTION))
-    return blocks.transpose(-4, -3).flatten(-5, -4).flatten(-3, -1)
-
-
-def _portions(holds: Tensor) -> Tensor:
-    """Pixels ``[..., 9, 27]`` of what is so ``[..., 5]``: obstacles, and victims in rooms."""
-    empty, with_all = (portions.to(holds.device) for portions in _house())
-    shown = torch.zeros(*holds.shape[:-1], len(PORTIONS), dtype=torch.bool, device=holds.device)
-    shown[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = holds
-    return torch.where(shown[..., None], with_all, empty)
-
-
-@cache
-def _house() -> tuple[Tensor, Tensor]:
-    """Portions ``[9, 27]`` with nothing in them, and with everything that may be in them."""
-    image = torch.tensor([[WALL if cell == "#" else FLOOR for cell in row] for row in HOUSE])
-    image[ENTRANCE] = torch.tensor(DOOR)
-    full = image.clone()
-    for place, colour in zip(CORRIDORS.values(), OBSTACLES, strict=True):
-        full[place] = torch.tensor(colour)
-    for place in ROOMS.values():
-        full[place] = torch.tensor(VICTIM)
-    return as_portions(image), as_portions(full)
-
-
-def _centres() -> Tensor:
-    """Row and column of the centre of each portion, ``[9, 2]``."""
-    middle = torch.arange(PORTION) * PORTION + PORTION // 2
-    return torch.cartesian_prod(middle, middle)
-
-
-def _walkable(place: Tensor) -> Tensor:
-    """Whether there is floor at rows and columns ``[..., 2]``."""
-    floor = torch.tensor([[cell != "#" for cell in row] for row in HOUSE], device=place.device)
-    inside = ((place >= 0) & (place < SIDE)).all(-1)
-    row, column = place.clamp(0, SIDE - 1).unbind(-1)
-    return inside & floor[row, column]
-
-
-def _at(place: Tensor) -> Tensor:
-    """Whether places ``[..., 2]`` are the entrance."""
-    return (place == torch.tensor(ENTRANCE, device=place.device)).all(-1)
-
-
-@cache
-def _reach_bins() -> tuple[float, ...]:
-    cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
-    cells = cells[_walkable(cells)]
-    centres = _centres()[[*CORRIDOR_PORTIONS, *ROOM_PORTIONS]]
-    squares = (cells[:, None] - centres).pow(2).sum(-1).unique()
-    # Of rounding to 32 bits no cell may be lost at the edge of a bin.
-    return tuple(float(square) ** 0.5 + 1e-4 for square in squares)
-
-
 @cache
 def _action_values(discount: float) -> Tensor:
     """``[blocked 3, victim 3, found 2, row 9, column 9, action 4]`` by value iteration."""
@@ -510,7 +441,7 @@ def _action_values(discount: float) -> Tensor:
         parts = [after.blocked, after.victim, after.found.long(), *after.place.unbind(-1)]
         outcomes.append((reward.double(), (torch.stack(parts, -1) * strides).sum(-1), after.home))
     # From inside of walls nothing leads anywhere.
-    floor = _walkable(state.place)
+    floor = walkable(state.place)
     values = torch.zeros(number, dtype=torch.double)
     while True:
         following = torch.stack(

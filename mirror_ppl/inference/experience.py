@@ -19,12 +19,12 @@ from mirror_ppl.models.views import ViewPlan
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What one action would lead to at each step, to the best knowledge of the observer.
+    """What one action would lead to at some steps, to the best knowledge of the observer.
 
     Attributes:
-        reward: ``[B, T]``.
-        observation: the next observation ``[B, T, ...]``.
-        visible: what the observer would see of it ``[B, T, K]``.
+        reward: ``[B, T']``.
+        observation: the next observation ``[B, T', ...]``.
+        visible: what the observer would see of it ``[B, T', K]``.
     """
 
     reward: Tensor
@@ -34,10 +34,24 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class Experience:
-    """Rounds under a view: what happened, and the outcomes of every action at every step."""
+    """Rounds under a view: what happened, and the outcomes of every action at some steps.
+
+    Attributes:
+        rounds: what happened.
+        outcomes: of every action.
+        first: first step at which they were worked out.
+        stride: how far these steps are apart.
+    """
 
     rounds: Rounds
     outcomes: tuple[Outcomes, ...]
+    first: int = 0
+    stride: int = 1
+
+    @property
+    def steps(self) -> slice:
+        """At which steps of the rounds there are outcomes."""
+        return slice(self.first, None, self.stride)
 
 
 def map_state(function: Any, *states: Any) -> Any:
@@ -59,7 +73,14 @@ def roll_out(domain: Domain, start: Any, actions: Tensor) -> Any:
     return map_state(lambda *parts: torch.stack(parts, 1), *states)
 
 
-def experience(domain: Domain, start: Any, actions: Tensor, plan: ViewPlan) -> Experience:
+def experience(
+    domain: Domain,
+    start: Any,
+    actions: Tensor,
+    plan: ViewPlan,
+    first: int = 0,
+    stride: int = 1,
+) -> Experience:
     """What an observer with a view gets from rounds.
 
     The world of an observer who takes things for granted is as they believe it to be, and so are
@@ -70,6 +91,8 @@ def experience(domain: Domain, start: Any, actions: Tensor, plan: ViewPlan) -> E
         start: states ``[B]``.
         actions: ``[B, T]``.
         plan: views of B rounds.
+        first: first step at which the outcomes of every action are worked out.
+        stride: how far these steps are apart.
     """
     states = roll_out(domain, start, actions)
     visible, knowledge = follow(domain, plan, domain.observe(states))
@@ -78,13 +101,16 @@ def experience(domain: Domain, start: Any, actions: Tensor, plan: ViewPlan) -> E
         map_state(lambda part: part[:, :-1], whole) for whole in (believed, knowledge)
     )
 
+    steps = slice(first, actions.shape[1], stride)
+    some, known = (map_state(lambda part: part[:, steps], whole) for whole in (current, so_far))
+
     def outcome(action: Tensor) -> Outcomes:
-        following = domain.transition(current, action)
+        following = domain.transition(some, action)
         observation = domain.observe(following)
-        seen, after = plan.look(domain, so_far, observation, 1)
+        seen, after = plan.look(domain, known, observation, 1 + first, stride)
         taken = plan.taken(domain, after, observation)
         return Outcomes(
-            reward=total_reward(domain.rewards(current, action, following)),
+            reward=total_reward(domain.rewards(some, action, following)),
             observation=observation,
             visible={name: mask | taken[name] for name, mask in seen.items()},
         )
@@ -101,8 +127,11 @@ def experience(domain: Domain, start: Any, actions: Tensor, plan: ViewPlan) -> E
             ),
         ),
         outcomes=tuple(
-            outcome(torch.full_like(actions, index)) for index in range(len(domain.actions))
+            outcome(torch.full_like(actions[:, steps], index))
+            for index in range(len(domain.actions))
         ),
+        first=first,
+        stride=stride,
     )
 
 

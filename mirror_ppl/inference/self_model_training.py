@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -49,6 +49,7 @@ class SelfModelOptions:
         discount: discount of rewards per step.
         target_rate: rate at which the target network follows the Q-network, per step.
         world_weight: weight of the negative ELBO per observation.
+        stride: of every so many steps of a round one is learned from for values; which, is drawn.
     """
 
     phases: int = 40
@@ -64,9 +65,21 @@ class SelfModelOptions:
     discount: float = 0.9
     target_rate: float = 0.01
     world_weight: float = 0.01
+    stride: int = 1
+
+    @classmethod
+    def of(cls, domain: str, **changes: Any) -> Self:
+        """The settings for a domain, with changes.
+
+        Args:
+            domain: its name.
+            changes: settings by name; None leaves what is set for the domain.
+        """
+        given = {name: value for name, value in changes.items() if value is not None}
+        return cls(**(BY_DOMAIN.get(domain, {}) | given))
 
     def __post_init__(self) -> None:
-        for name in ("phases", "rounds", "steps", "batch"):
+        for name in ("phases", "rounds", "steps", "batch", "stride"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not (self.learning_rate > 0 and isfinite(self.learning_rate)):
@@ -74,6 +87,19 @@ class SelfModelOptions:
         for name in ("beta", "beta_decay", "epsilon", "epsilon_decay", "epsilon_floor", "discount"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+
+
+BY_DOMAIN: dict[str, dict[str, Any]] = {
+    "search_rescue": {
+        "beta": 1.0,
+        "beta_decay": 0.98,
+        "epsilon_decay": 0.9,
+        "discount": 0.95,
+        "world_weight": 0.001,
+        "stride": 4,
+    },
+}
+"""Settings that differ by domain; beta and epsilon are the supplement's."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +137,7 @@ def self_model_loss(
     if on_means:
         evidence = self_model.evidence(rounds.observation, rounds.visible, rounds.actions)
         belief = self_model.believe(evidence[:, :-1])
+    belief = belief[:, lived.steps]
     goals = []
     with torch.no_grad():
         for action, outcome in enumerate(lived.outcomes):
@@ -118,8 +145,8 @@ def self_model_loss(
             evidence = self_model.encoder.combine(embedded, outcome.visible)
             evidence = evidence + self_model.encoder.action.weight[action]
             value = target(self_model.encoder(belief, evidence).mean).amax(-1)
-            # The encounter is over after the last step: every car has left or is leaving.
-            value[:, -1] = 0.0
+            if self_model.domain.over_at_horizon:
+                value[:, (torch.arange(steps) == steps - 1)[lived.steps]] = 0.0
             goals.append(outcome.reward + options.discount * value)
     error = self_model.action_values(belief) - torch.stack(goals, -1)
     bellman = error.pow(2).mean()
@@ -270,7 +297,9 @@ class _Trainer:
             )
             plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
             start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
-            lived = experience(self.domain, start, actions[chosen], plan)
+            lived = experience(
+                self.domain, start, actions[chosen], plan, self._first(), options.stride
+            )
             loss = self_model_loss(
                 self.self_model, self.target, lived, options, on_means=step % 2 == 1
             )
@@ -283,6 +312,13 @@ class _Trainer:
             elbo -= float(loss.negative_elbo) / options.steps
             bellman += float(loss.bellman) / options.steps
         return f"elbo {elbo:.2f} per observation, bellman error {bellman:.3f}"
+
+    def _first(self) -> int:
+        """At which step the first of every ``stride`` steps is from which values are learned."""
+        if self.options.stride == 1:
+            return 0
+        device = self.generator.device
+        return int(torch.randint(self.options.stride, (), generator=self.generator, device=device))
 
     @torch.no_grad()
     def _follow(self) -> None:

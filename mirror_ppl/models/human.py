@@ -301,11 +301,11 @@ class HumanModel(nn.Module):
     def evidence(self, view: View, observation: Observation) -> Tensor:
         """What views ``[..., K]`` of observations tell the encoder at each step, ``[..., H]``."""
         encoder, domain = self.self_model.encoder, self.domain
-        evidence = encoder.combine(encoder.embed(domain.symbols(observation)), view.visible)
+        embedded = encoder.embed(domain.symbols(observation))
         if not view.taken:
-            return evidence
+            return encoder.combine(embedded, view.visible)
         imagined = encoder.embed(domain.symbols(view.imagined))
-        return encoder.combine({**imagined, "ego": evidence}, view.taken)
+        return encoder.combine(embedded, view.visible, imagined, view.taken)
 
     def advance(self, belief: Tensor, evidence: Tensor, action: Tensor) -> Gaussian:
         """One step of :meth:`believe`: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.

@@ -1,20 +1,34 @@
 """The small networks of the self-model, each named by the density that it parameterizes.
 
-Sizes are those of the supplement, section D; shape letters those of ``mirror_ppl.domains.base``.
+Sizes are those of `mirror_ppl.models.sizes`; shape letters those of ``mirror_ppl.domains.base``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Mapping
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from mirror_ppl.domains.base import Visibility
+from mirror_ppl.domains.base import Domain, Visibility
+from mirror_ppl.models.readers import (
+    ImageReader,
+    ItemEmbedding,
+    JoinedReader,
+    Reader,
+    Source,
+    SpeechReader,
+    image_patches,
+    layers,
+)
+from mirror_ppl.models.sizes import Sizes
 
 MIN_SCALE = 0.01
+PIXEL_SCALE = 0.1
+"""Least scale of a pixel: of hundreds that are always the same none may count for much."""
 
 
 class Gaussian(NamedTuple):
@@ -22,14 +36,6 @@ class Gaussian(NamedTuple):
 
     mean: Tensor
     scale: Tensor
-
-
-def layers(sizes: Sequence[int]) -> nn.Sequential:
-    """Fully connected layers of the given sizes, each followed by a rectifier."""
-    blocks: list[nn.Module] = []
-    for before, after in zip(sizes[:-1], sizes[1:], strict=True):
-        blocks += [nn.Linear(before, after), nn.ReLU()]
-    return nn.Sequential(*blocks)
 
 
 class GaussianHead(nn.Module):
@@ -50,7 +56,7 @@ class GaussianHead(nn.Module):
 
 
 class Transition(nn.Module):
-    """``p(z_t | z_{t-1}, a_{t-1})``: three layers of 32 to a diagonal Gaussian."""
+    """``p(z_t | z_{t-1}, a_{t-1})``: three layers to a diagonal Gaussian."""
 
     def __init__(self, latent: int, actions: int, hidden: int = 32) -> None:
         super().__init__()
@@ -67,28 +73,36 @@ class Transition(nn.Module):
 
 
 class Encoder(nn.Module):
-    """``q(z_t | z_{t-1}, v_t * x_t, v_t, a_{t-1})``: three layers of 64 to a diagonal Gaussian.
+    """``q(z_t | z_{t-1}, v_t * x_t, v_t, a_{t-1})``: three layers to a diagonal Gaussian.
 
-    The first layer reads every item through weights of its own, and an item that is not visible
-    adds nothing. This is the usual linear layer on masked values and masks, written as a sum, so
-    that the many views of one round share the work (see :meth:`embed`).
+    The first layer reads every symbolic item through weights of its own, and an item that is not
+    visible adds nothing. This is the usual linear layer on masked values and masks, written as a
+    sum, so that the many views of one round share the work (see :meth:`embed`). Images and speech
+    have readers of their own, see `mirror_ppl.models.readers`.
+
+    Args:
+        domain: what there is to read.
+        sizes: of the layers.
+        codes: of the utterances of each modality that has some, ``[K, U, C]``.
     """
 
     def __init__(
-        self,
-        latent: int,
-        actions: int,
-        symbols: Mapping[str, int],
-        items: Mapping[str, int],
-        hidden: int = 64,
+        self, domain: Domain, sizes: Sizes, codes: Mapping[str, Tensor] | None = None
     ) -> None:
         super().__init__()
+        latent, actions, hidden = sizes.latent, len(domain.actions), sizes.encoder
+        symbols, codes = domain.symbol_sizes, codes or {}
         self.latent = latent
         self.actions = actions
         self.ego = nn.Linear(symbols["ego"], hidden)
-        self.items = nn.ModuleDict(
-            {name: ItemEmbedding(number, symbols[name], hidden) for name, number in items.items()}
-        )
+        self.items = nn.ModuleDict()
+        for m in domain.modalities:
+            if m.image is not None:
+                self.items[m.name] = ImageReader(len(m.items), m.image, sizes)
+            elif m.name in codes:
+                self.items[m.name] = SpeechReader(codes[m.name], sizes)
+            else:
+                self.items[m.name] = ItemEmbedding(len(m.items), symbols[m.name], hidden)
         # The row beyond the actions is "no action yet", for the first observation.
         self.action = nn.Embedding(actions + 1, hidden)
         self.previous = nn.Linear(latent, hidden, bias=False)
@@ -96,18 +110,39 @@ class Encoder(nn.Module):
         self.head = GaussianHead(hidden, latent, 0.5)
 
     def embed(self, symbols: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """First-layer contribution of the ego ``[..., H]`` and of each item ``[..., K, H]``."""
+        """First-layer contribution of the ego ``[..., H]``, and each item by itself."""
         embedded = {"ego": self.ego(symbols["ego"])}
-        embedded |= {name: module(symbols[name]) for name, module in self.items.items()}
+        for name, reader in self.items.items():
+            embedded[name] = cast(Reader, reader).embed(symbols[name])
         return embedded
 
-    @staticmethod
-    def combine(embedded: Mapping[str, Tensor], visible: Visibility) -> Tensor:
-        """What a view ``[..., K]`` of the embedded observation tells, ``[..., H]``."""
+    def combine(
+        self,
+        embedded: Mapping[str, Tensor],
+        visible: Visibility,
+        imagined: Mapping[str, Tensor] | None = None,
+        taken: Visibility | None = None,
+    ) -> Tensor:
+        """What a view ``[..., K]`` of the embedded observation tells, ``[..., H]``.
+
+        Args:
+            embedded: the observation, from :meth:`embed`.
+            visible: which of its items there are.
+            imagined: another embedded observation from which items are taken.
+            taken: which; none of those that are visible.
+        """
+        sources = [(embedded, visible)]
+        if imagined is not None and taken:
+            sources.append((imagined, taken))
         total = embedded["ego"]
-        for name, mask in visible.items():
-            weights = mask.to(total.dtype)
-            total = total + (weights[..., None, :] @ embedded[name]).squeeze(-2)
+        for items, masks in sources:
+            for name, reader in self.items.items():
+                if isinstance(reader, ItemEmbedding):
+                    total = total + reader.join(items[name], masks[name])
+        for name, reader in self.items.items():
+            if isinstance(reader, JoinedReader):
+                each = [Source(items[name], masks[name]) for items, masks in sources]
+                total = total + reader.join(each)
         return total
 
     def previous_actions(self, actions: Tensor) -> Tensor:
@@ -122,22 +157,8 @@ class Encoder(nn.Module):
         return Gaussian(previous + change.mean, change.scale)
 
 
-class ItemEmbedding(nn.Module):
-    """A linear map for each of K items, from symbols ``[..., K, D]`` to ``[..., K, H]``."""
-
-    def __init__(self, items: int, symbols: int, hidden: int) -> None:
-        super().__init__()
-        bound = (items * 3) ** -0.5
-        self.weight = nn.Parameter(torch.empty(items, symbols, hidden).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.zeros(items, hidden))
-
-    def forward(self, symbols: Tensor) -> Tensor:
-        """Of ``symbols`` ``[..., K, D]``; contributions ``[..., K, H]``."""
-        return torch.einsum("...kd,kdh->...kh", symbols, self.weight) + self.bias
-
-
 class Decoder(nn.Module):
-    """``p(x^m_t | z_t)`` of one modality: three layers of 32 to a diagonal Gaussian over items."""
+    """``p(x^m_t | z_t)`` of one modality: three layers to a diagonal Gaussian over items."""
 
     def __init__(self, latent: int, items: int, features: int, hidden: int = 32) -> None:
         super().__init__()
@@ -152,8 +173,47 @@ class Decoder(nn.Module):
         return Gaussian(mean.reshape(shape), scale.reshape(shape))
 
 
+class ImageDecoder(nn.Module):
+    """``p(x^m_t | z_t)`` of images: layers, and a deconvolution to a diagonal Gaussian of pixels.
+
+    What is the same in every image is a mean of its own for each pixel; the deconvolution, whose
+    kernel and stride are those of the encoder's convolution, adds what differs.
+    """
+
+    patches: Tensor
+
+    def __init__(self, items: int, image: tuple[int, int, int], sizes: Sizes) -> None:
+        super().__init__()
+        patches, numbers = image_patches(image, sizes.stride)
+        self.items, self.pixels = items, math.prod(image)
+        self.channels = sizes.channels
+        self.body = layers((sizes.latent, *(sizes.image,) * 3))
+        self.head = nn.Linear(sizes.image, items * patches.shape[0] * sizes.channels)
+        bound = sizes.channels**-0.5
+        self.mean = nn.Parameter(torch.empty(sizes.channels, numbers).uniform_(-bound, bound))
+        self.raw = nn.Parameter(torch.empty(sizes.channels, numbers).uniform_(-bound, bound))
+        self.same = nn.Parameter(torch.full((items, self.pixels), 0.5))
+        self.same_raw = nn.Parameter(torch.full((items, self.pixels), -0.4))
+        self.register_buffer("patches", patches, persistent=False)
+
+    def forward(self, latent: Tensor) -> Gaussian:
+        """Of ``latent`` ``[..., Z]``; mean and scale ``[..., K, F]`` of intensities."""
+        shape = (*latent.shape[:-1], self.items, -1)
+        channels = self.head(self.body(latent)).view(shape)
+        mean = self.same + channels @ self._kernels(self.mean)
+        raw = self.same_raw + channels @ self._kernels(self.raw)
+        return Gaussian(mean, softplus(raw) + PIXEL_SCALE)
+
+    def _kernels(self, kernel: Tensor) -> Tensor:
+        """The deconvolution as one matrix ``[places * channels, pixels]``."""
+        places = len(self.patches)
+        matrix = kernel.new_zeros(places, self.channels, self.pixels)
+        index = self.patches[:, None].expand(-1, self.channels, -1)
+        return matrix.scatter(2, index, kernel.expand(places, -1, -1)).flatten(0, 1)
+
+
 class Reward(nn.Module):
-    """``p(r_t | z_t, a_t)``: three layers of 32 to a Gaussian."""
+    """``p(r_t | z_t, a_t)``: three layers to a Gaussian."""
 
     def __init__(self, latent: int, actions: int, hidden: int = 32) -> None:
         super().__init__()
@@ -170,7 +230,7 @@ class Reward(nn.Module):
 
 
 class QNetwork(nn.Module):
-    """``Q(z_t, a_t)``: three layers of 128 to the discounted return of an action."""
+    """``Q(z_t, a_t)``: three layers to the discounted return of an action."""
 
     def __init__(self, latent: int, actions: int, hidden: int = 128) -> None:
         super().__init__()

@@ -30,13 +30,14 @@ from mirror_ppl.models.networks import (
     Decoder,
     Encoder,
     Gaussian,
+    ImageDecoder,
     QNetwork,
     Reward,
     Transition,
 )
 from mirror_ppl.models.sites import latent_values
-
-LATENT = 48
+from mirror_ppl.models.sizes import Sizes, sizes_of
+from mirror_ppl.models.speech import Embedding, hashed_words, utterance_codes
 
 
 @dataclass(frozen=True)
@@ -60,24 +61,37 @@ class SelfModel(nn.Module):
     """Networks and probabilistic program of the robot.
 
     Args:
-        domain: the domain that the networks are sized for.
-        latent: number of latent dimensions Z.
+        domain: the domain that the networks are for.
+        sizes: of the networks; the domain's own unless given.
+        embedding: from utterances to vectors, which an autoencoder compresses to codes.
     """
 
-    def __init__(self, domain: Domain, latent: int = LATENT) -> None:
+    def __init__(
+        self, domain: Domain, sizes: Sizes | None = None, embedding: Embedding = hashed_words
+    ) -> None:
         super().__init__()
         self.domain = domain
-        self.latent = latent
+        self.sizes = sizes = sizes or sizes_of(domain)
+        self.latent = latent = sizes.latent
         actions = len(domain.actions)
-        items = {modality.name: len(modality.items) for modality in domain.modalities}
-        self.encoder = Encoder(latent, actions, domain.symbol_sizes, items)
-        self.transition = Transition(latent, actions)
+        codes = {
+            m.name: utterance_codes(m, sizes.code, embedding)
+            for m in domain.modalities
+            if m.utterances
+        }
+        self.encoder = Encoder(domain, sizes, codes)
+        self.transition = Transition(latent, actions, sizes.transition)
         self.decoders = nn.ModuleDict(
-            {"ego": Decoder(latent, 1, len(domain.ego_features))}
-            | {m.name: Decoder(latent, len(m.items), len(m.features)) for m in domain.modalities}
+            {"ego": Decoder(latent, 1, len(domain.ego_features), sizes.decoder)}
         )
-        self.reward = Reward(latent, actions)
-        self.q_network = QNetwork(latent, actions)
+        for m in domain.modalities:
+            self.decoders[m.name] = (
+                Decoder(latent, len(m.items), len(m.features), sizes.decoder)
+                if m.image is None
+                else ImageDecoder(len(m.items), m.image, sizes)
+            )
+        self.reward = Reward(latent, actions, sizes.reward)
+        self.q_network = QNetwork(latent, actions, sizes.q_network)
         self.scales: dict[str, tuple[float, ...]] = {"ego": (1.0,) * len(domain.ego_features)} | {
             modality.name: modality.scales for modality in domain.modalities
         }

@@ -52,7 +52,9 @@ class ViewPlan:
     assumes: dict[str, Tensor]
     noise: dict[str, Tensor]
 
-    def sees(self, domain: Domain, observation: Observation, first: int = 0) -> Visibility:
+    def sees(
+        self, domain: Domain, observation: Observation, first: int = 0, stride: int = 1
+    ) -> Visibility:
         """What is seen unaided ``[B, T', K]`` of observations ``[B, T', ...]`` from a step on."""
         direction, distance = domain.distance(observation)
         batch = torch.arange(len(self.reach), device=self.reach.device)[:, None, None]
@@ -62,23 +64,25 @@ class ViewPlan:
             if name != "ego"
         }
         seen["visual"] = distance <= self.reach[batch, direction]
-        steps = slice(first, first + distance.shape[1])
+        steps = slice(first, first + stride * distance.shape[1], stride)
         return {
             name: near & (self.noise[name][:, steps, :, 0] < self.keep[name][:, None, None])
             for name, near in seen.items()
         }
 
-    def visibility(self, domain: Domain, observation: Observation, first: int = 0) -> Visibility:
+    def visibility(
+        self, domain: Domain, observation: Observation, first: int = 0, stride: int = 1
+    ) -> Visibility:
         """What is seen or told ``[B, T', K]`` of observations from step ``first``."""
         communicable = domain.communicable(observation)
-        visible = self.sees(domain, observation, first)
+        visible = self.sees(domain, observation, first, stride)
         for name, seen in visible.items():
-            luck = self.noise[name][:, first : first + seen.shape[1], :, 1]
+            luck = self.noise[name][:, first : first + stride * seen.shape[1] : stride, :, 1]
             visible[name] = seen | (communicable[name] & (luck < self.told[name][:, None, None]))
         return visible
 
     def look(
-        self, domain: Domain, knowledge: Any, observation: Observation, first: int
+        self, domain: Domain, knowledge: Any, observation: Observation, first: int, stride: int = 1
     ) -> tuple[Visibility, Any]:
         """What is visible, all told, and the knowledge after each of some steps.
 
@@ -87,13 +91,17 @@ class ViewPlan:
             knowledge: before each of these steps, ``[B, T']``.
             observation: ``[B, T', ...]``, from step ``first`` on.
             first: number of the first of these steps.
+            stride: how far these steps are apart.
 
         Returns:
             Masks ``[B, T', K]`` of items seen, told of or remembered, and knowledge ``[B, T']``.
         """
-        visible = self.visibility(domain, observation, first)
+        visible = self.visibility(domain, observation, first, stride)
         knowledge = domain.learn(
-            knowledge, observation, visible, lambda supposed: self.sees(domain, supposed, first)
+            knowledge,
+            observation,
+            visible,
+            lambda supposed: self.sees(domain, supposed, first, stride),
         )
         remembered = domain.known(knowledge)
         return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, MirrorError
 from mirror_ppl.files import write_whole
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import Sizes
 
 FORMAT = "mirror_ppl self-model 1"
 
@@ -50,6 +52,7 @@ def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) 
         "format": FORMAT,
         "domain": self_model.domain.name,
         "domain_version": self_model.domain.version,
+        "sizes": json.dumps(asdict(self_model.sizes)),
         "card": json.dumps(card, indent=1),
     }
     tensors = {name: value.contiguous() for name, value in self_model.state_dict().items()}
@@ -106,11 +109,12 @@ def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, d
                 f"{path}: is for version {metadata['domain_version']} of {world.name}, "
                 f"this is version {world.version}"
             )
+        sizes = Sizes(**json.loads(metadata["sizes"])) if "sizes" in metadata else None
         with torch.random.fork_rng(devices=[]):
-            self_model = SelfModel(world)
+            self_model = SelfModel(world, sizes)
         self_model.load_state_dict(tensors)
         card = json.loads(metadata["card"])
-    except (KeyError, RuntimeError, ValueError, MirrorError) as error:
+    except (KeyError, RuntimeError, TypeError, ValueError, MirrorError) as error:
         if isinstance(error, AssetError):
             raise
         raise AssetError(f"{path}: does not fit this program ({error})") from error

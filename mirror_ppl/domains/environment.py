@@ -1,0 +1,157 @@
+"""Domains as Gymnasium environments, one round at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.error import InvalidAction, ResetNeeded
+
+from mirror_ppl.domains.base import Domain, require_known, total_reward
+
+RENDER_MODES = ("rgb_array",)
+
+EnvObservation = dict[str, Any]
+"""Numpy arrays by name."""
+
+
+class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
+    """A round of a domain, seen by an unaided person in one of the domain's settings.
+
+    All mechanics are the domain's: this class only draws the round, hides what the setting hides
+    and counts steps. Each domain has a child of it, which says what is observed.
+
+    Args:
+        domain: the world.
+        limits: least and largest value of each feature by name, ``"ego"`` ``[E]`` and each modality
+            ``[F]``.
+        setting: one of the domain's settings; the first unless given.
+        scenario: a name among its scenarios, or None for a random one in each round.
+        render_mode: "rgb_array" or None.
+
+    Raises:
+        UnknownNameError: if the setting, the scenario or the render mode is not a known one.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 4}
+
+    def __init__(
+        self,
+        domain: Domain,
+        limits: Mapping[str, tuple[list[float], list[float]]],
+        setting: str | None = None,
+        scenario: str | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        self.domain = domain
+        self.setting = require_known(setting or domain.settings[0], "setting", domain.settings)
+        if scenario is not None:
+            require_known(scenario, "scenario", domain.scenarios)
+        self.scenario = scenario
+        if render_mode is not None:
+            require_known(render_mode, "render mode", RENDER_MODES)
+        self.render_mode = render_mode
+
+        self.action_space = spaces.Discrete(len(domain.actions))
+        self.observation_space = _observation_space(domain, limits)
+        self._state: Any = None
+        self._scenario_name = ""
+        self._step = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[EnvObservation, dict[str, Any]]:
+        """Start a round; the same seed gives the same round. There are no ``options``."""
+        super().reset(seed=seed, options=options)
+        scenarios = self.domain.scenarios
+        if self.scenario is None:
+            index = int(self.np_random.integers(len(scenarios)))
+        else:
+            index = scenarios.index(self.scenario)
+        # The domain draws from torch's generators; this one hangs on Gymnasium's seed.
+        generator = torch.Generator().manual_seed(int(self.np_random.integers(2**63 - 1)))
+        self._state = _only(self.domain.initial(1, generator, torch.tensor([index])))
+        self._scenario_name = scenarios[index]
+        self._step = 0
+        return self._observation(), self._info()
+
+    def step(self, action: np.int64) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
+        """Play one step; see `gymnasium.Env.step`.
+
+        Raises:
+            ResetNeeded: before the first reset, and after the last step of a round.
+            InvalidAction: if there is no such action.
+        """
+        if self._state is None or self._step == self.domain.horizon:
+            raise ResetNeeded("call reset() to start a round")
+        if not self.action_space.contains(action):
+            raise InvalidAction(f"expected an action of {self.action_space}, given {action!r}")
+        chosen = torch.tensor(int(action))
+        following = self.domain.transition(self._state, chosen)
+        terms = self.domain.rewards(self._state, chosen, following)
+        self._state = following
+        self._step += 1
+        info = self._info()
+        # Adding zero turns the -0.0 of a penalty that does not apply into 0.0.
+        info["rewards"] = {name: term.item() + 0.0 for name, term in terms.items()}
+        reward = total_reward(terms).item() + 0.0
+        truncated = self._step == self.domain.horizon
+        return self._observation(), reward, False, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """Picture ``uint8 [height, width, 3]`` of everything there is, seen or not.
+
+        Returns:
+            The picture, or None if the environment was made without a render mode.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn('make the environment with render_mode="rgb_array" to render it')
+            return None
+        if self._state is None:
+            raise ResetNeeded("call reset() to start a round")
+        return self.domain.render(self._state)
+
+    def _observation(self) -> EnvObservation:
+        """What the person sees, as numpy arrays of their own."""
+        values = self.domain.observe(self._state)
+        masks = self.domain.visibility(self.setting, values)
+        seen: EnvObservation = {"ego": values["ego"].numpy().astype(np.float32)}
+        for name, mask in masks.items():
+            shown = torch.where(mask[..., None], values[name], 0.0)
+            seen[name] = shown.numpy().astype(np.float32)
+            seen[f"{name}_mask"] = mask.numpy().astype(np.int8)
+        return seen
+
+    def _info(self) -> dict[str, Any]:
+        state = {
+            name: part.numpy().copy() if part.dim() else part.item()
+            for name, part in vars(self._state).items()
+        }
+        return {"scenario": self._scenario_name, "state": state}
+
+
+def _observation_space(
+    domain: Domain, limits: Mapping[str, tuple[list[float], list[float]]]
+) -> spaces.Dict:
+    def box(name: str, *shape: int) -> spaces.Box:
+        low, high = (np.array(limit, dtype=np.float32) for limit in limits[name])
+        return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape))
+
+    parts: dict[str, spaces.Space[Any]] = {"ego": box("ego", len(domain.ego_features))}
+    for modality in domain.modalities:
+        items = len(modality.items)
+        parts[modality.name] = box(modality.name, items, len(modality.features))
+        parts[f"{modality.name}_mask"] = spaces.MultiBinary(items)
+    return spaces.Dict(parts)
+
+
+def _only(states: Any) -> Any:
+    """The state in a batch of one."""
+    return type(states)(**{name: part[0] for name, part in vars(states).items()})

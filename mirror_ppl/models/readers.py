@@ -1,0 +1,143 @@
+"""How the encoder reads a modality: lists of symbols, images, and speech.
+
+Each reader has two halves. ``embed`` looks at every item by itself, so that the many views of one
+round share that work; ``join`` makes one vector of those items that a view has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mirror_ppl.models.sizes import Sizes
+
+KERNEL = 3
+"""Rows and columns of a convolution's kernel."""
+
+
+class Source(NamedTuple):
+    """Items ``[..., K, H]`` as ``embed`` gave them, and which of them there are ``[..., K]``."""
+
+    embedded: Tensor
+    mask: Tensor
+
+
+def layers(sizes: Sequence[int]) -> nn.Sequential:
+    """Fully connected layers of the given sizes, each followed by a rectifier."""
+    blocks: list[nn.Module] = []
+    for before, after in zip(sizes[:-1], sizes[1:], strict=True):
+        blocks += [nn.Linear(before, after), nn.ReLU()]
+    return nn.Sequential(*blocks)
+
+
+class Reader(nn.Module):
+    """How one modality is read."""
+
+    def embed(self, symbols: Tensor) -> Tensor:
+        """Each item ``[..., K, H]`` by itself, of its symbols ``[..., K, D]``."""
+        raise NotImplementedError
+
+
+class ItemEmbedding(Reader):
+    """A linear map for each of K items, from symbols ``[..., K, D]`` to ``[..., K, H]``."""
+
+    def __init__(self, items: int, symbols: int, hidden: int) -> None:
+        super().__init__()
+        bound = (items * 3) ** -0.5
+        self.weight = nn.Parameter(torch.empty(items, symbols, hidden).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(items, hidden))
+
+    def embed(self, symbols: Tensor) -> Tensor:
+        """Of ``symbols`` ``[..., K, D]``; contributions ``[..., K, H]``."""
+        return torch.einsum("...kd,kdh->...kh", symbols, self.weight) + self.bias
+
+    @staticmethod
+    def join(embedded: Tensor, mask: Tensor) -> Tensor:
+        """The sum ``[..., H]`` of what is there."""
+        weights = mask.to(embedded.dtype)
+        return (weights[..., None, :] @ embedded).squeeze(-2)
+
+
+class JoinedReader(Reader):
+    """A reader whose items enter side by side, with their masks, and not as a sum."""
+
+    def __init__(self, items: int, each: int, hidden: Sequence[int], encoder: int) -> None:
+        super().__init__()
+        self.body = layers((items * (each + 1), *hidden))
+        self.head = nn.Linear(hidden[-1], encoder, bias=False)
+
+    def join(self, sources: Sequence[Source]) -> Tensor:
+        """What is there, of any of the sources, as the encoder's first layer gets it ``[..., H]``.
+
+        Args:
+            sources: items and masks; no item is there in two of them.
+        """
+        features = torch.as_tensor(0.0)
+        there = torch.as_tensor(0.0)
+        for embedded, mask in sources:
+            weights = mask.to(embedded.dtype)
+            features = features + weights[..., None] * embedded
+            there = there + weights
+        return self.head(self.body(torch.cat([features.flatten(-2), there], -1)))
+
+
+class ImageReader(JoinedReader):
+    """Items that are images: a convolution, three layers, features (supplement, section D)."""
+
+    patches: Tensor
+
+    def __init__(self, items: int, image: tuple[int, int, int], sizes: Sizes) -> None:
+        patches, numbers = image_patches(image, sizes.stride)
+        hidden = (sizes.image,) * 3 + (sizes.features,)
+        super().__init__(items, patches.shape[0] * sizes.channels, hidden, sizes.encoder)
+        self.convolution = nn.Linear(numbers, sizes.channels)
+        self.register_buffer("patches", patches, persistent=False)
+
+    def embed(self, symbols: Tensor) -> Tensor:
+        """Of pixels ``[..., K, D]``; channels of every place ``[..., K, places * channels]``."""
+        return torch.relu(self.convolution(symbols[..., self.patches])).flatten(-2)
+
+
+class SpeechReader(JoinedReader):
+    """Utterances: the code of what is said of each item, and one layer (supplement, section D).
+
+    Args:
+        codes: of the U utterances about each of K items, ``[K, U, C]``; see
+            `mirror_ppl.models.speech`.
+        sizes: of the networks.
+    """
+
+    codes: Tensor
+
+    def __init__(self, codes: Tensor, sizes: Sizes) -> None:
+        super().__init__(codes.shape[0], codes.shape[-1], (sizes.features,), sizes.encoder)
+        self.register_buffer("codes", codes)
+
+    def embed(self, symbols: Tensor) -> Tensor:
+        """Of which utterance is true ``[..., K, U]``, one-hot; its code ``[..., K, C]``."""
+        return torch.einsum("...ku,kuc->...kc", symbols, self.codes)
+
+
+def image_patches(image: tuple[int, int, int], stride: int) -> tuple[Tensor, int]:
+    """Which pixels of an image a convolution's kernel covers at each place.
+
+    Args:
+        image: rows, columns and colours.
+        stride: how far the kernel moves.
+
+    Returns:
+        Numbers of pixels ``[places, 3 * 3 * colours]``, and how many a place has.
+
+    Raises:
+        ValueError: the kernel does not cover the image evenly.
+    """
+    rows, columns, colours = image
+    if (rows - KERNEL) % stride or (columns - KERNEL) % stride or min(rows, columns) < KERNEL:
+        raise ValueError(f"kernels of {KERNEL} at stride {stride} do not cover {rows} x {columns}")
+    numbers = torch.arange(rows * columns * colours).view(image)
+    places = numbers.unfold(0, KERNEL, stride).unfold(1, KERNEL, stride)
+    places = places.movedim(2, -1).flatten(2).flatten(0, 1)
+    return places, places.shape[1]
