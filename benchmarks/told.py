@@ -20,8 +20,8 @@ from torch import Tensor
 
 from mirror_ppl.communication import Person
 from mirror_ppl.domains import Observation, Visibility, get_domain
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import DrivingState
-from mirror_ppl.inference.experience import map_state
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, assumption_sites, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -10,8 +10,9 @@ from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains.driving import CARS, FOG_REACH, Driving, DrivingState, lane_rewards
 from mirror_ppl.domains.lane_values import action_values
 from mirror_ppl.errors import UnknownNameError
-from mirror_ppl.people import POPULATIONS, SIMULATORS, remember, simulate, simulated_drivers
+from mirror_ppl.people import PEOPLE, POPULATIONS, remember, simulate, simulated_drivers
 from mirror_ppl.people.driving import DISCOUNT, HORIZON, Memory, TaskDrivers, in_sight
+from mirror_ppl.people.driving_participants import learned_reward
 from mirror_ppl.people.maximum_entropy import FEATURES
 from mirror_ppl.people.populations import (
     CONSISTENCY_MEDIAN,
@@ -22,7 +23,7 @@ from mirror_ppl.people.populations import (
     derived_generator,
     reaches,
 )
-from mirror_ppl.people.recordings import draw_starts, learned_reward, record
+from mirror_ppl.people.recordings import draw_starts, record
 from mirror_ppl.simulate import DESCRIPTION, PROGRAM, Options, main
 
 DOMAIN = Driving()
@@ -537,7 +538,7 @@ def test_command_that_cannot_write(tmp_path, capsys):
 def test_help_names_every_choice(capsys):
     assert command("--help") == 0
     text = " ".join(capsys.readouterr().out.split())
-    for name in (*SIMULATORS, *DOMAIN.settings, *POPULATIONS):
+    for name in (*PEOPLE, *DOMAIN.settings, *POPULATIONS):
         assert name in text
     for option in fields(Options):
         assert f"--{option.name}" in text

@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 from torch.distributions import Normal
 
 from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import ROAD_END, Driving, DrivingState
 from mirror_ppl.errors import AssetError, CheckpointError
 from mirror_ppl.evaluation.self_model import (
@@ -21,7 +22,7 @@ from mirror_ppl.evaluation.self_model import (
     returns,
     self_model_quality,
 )
-from mirror_ppl.inference.experience import drive, experience, map_state
+from mirror_ppl.inference.experience import drive, experience
 from mirror_ppl.inference.self_model_training import (
     SelfModelOptions,
     self_model_loss,

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import torch
@@ -127,12 +127,20 @@ class Domain(Protocol):
         """States ``[batch]`` at the start of a round, scenarios drawn uniformly unless given."""
         ...
 
+    def anywhere(self, batch: int, generator: torch.Generator) -> Any:
+        """States ``[batch]`` from which the robot learns, wherever a round may lead to."""
+        ...
+
     def transition(self, state: Any, action: Tensor) -> Any:
         """State at t + 1 from the state at t and the action at t, both batched alike."""
         ...
 
     def rewards(self, state: Any, action: Tensor, following: Any) -> dict[str, Tensor]:
         """Reward terms by name, each ``[...]``; the task reward is their sum."""
+        ...
+
+    def over(self, state: Any) -> Tensor:
+        """Where ``[...]`` all is done, and nothing can be won or lost any more."""
         ...
 
     def observe(self, state: Any) -> Observation:
@@ -248,6 +256,17 @@ class Domain(Protocol):
 def total_reward(terms: Mapping[str, Tensor]) -> Tensor:
     """Sum of reward terms ``[...]``."""
     return torch.stack(list(terms.values())).sum(0)
+
+
+def map_state(function: Callable[..., Tensor], *states: Any) -> Any:
+    """Apply a function to each tensor of one or several states, or of any dataclass of tensors."""
+    kind = type(states[0])
+    return kind(
+        **{
+            field.name: function(*(getattr(state, field.name) for state in states))
+            for field in fields(kind)
+        }
+    )
 
 
 def require_known(name: str, kind: str, known: Sequence[str]) -> str:

@@ -169,6 +169,10 @@ class Driving:
             speed=speeds[scenario],
         )
 
+    def anywhere(self, batch: int, generator: torch.Generator) -> DrivingState:
+        """States ``[batch]`` at the start of a round: cars pass by within it."""
+        return self.initial(batch, generator)
+
     def transition(self, state: DrivingState, action: Tensor) -> DrivingState:
         """State at t + 1; ``action`` ``[...]`` is 0 (stay) or 1 (switch)."""
         lane = torch.where(action == SWITCH, 1 - state.lane, state.lane)
@@ -189,6 +193,10 @@ class Driving:
             "off_road": OFF_ROAD * off_road.to(dtype),
             "lane_change": LANE_CHANGE * (action == SWITCH).to(dtype),
         }
+
+    def over(self, state: DrivingState) -> Tensor:
+        """Nowhere ``[...]``: driving goes on to the end of a round."""
+        return torch.zeros_like(state.lane, dtype=torch.bool)
 
     def observe(self, state: DrivingState) -> Observation:
         """Everything there is to observe: ego ``[..., 1]``, visual and verbal ``[..., 4, F]``."""

@@ -86,7 +86,7 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
             ResetNeeded: before the first reset, and after the last step of a round.
             InvalidAction: if there is no such action.
         """
-        if self._state is None or self._step == self.domain.horizon:
+        if self._state is None or self._ended():
             raise ResetNeeded("call reset() to start a round")
         if not self.action_space.contains(action):
             raise InvalidAction(f"expected an action of {self.action_space}, given {action!r}")
@@ -99,8 +99,9 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         # Adding zero turns the -0.0 of a penalty that does not apply into 0.0.
         info["rewards"] = {name: term.item() + 0.0 for name, term in terms.items()}
         reward = total_reward(terms).item() + 0.0
-        truncated = self._step == self.domain.horizon
-        return self._observation(), reward, False, truncated, info
+        terminated = bool(self.domain.over(following))
+        truncated = self._step == self.domain.horizon and not terminated
+        return self._observation(), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Picture ``uint8 [height, width, 3]`` of everything there is, seen or not.
@@ -117,6 +118,9 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         if self._state is None:
             raise ResetNeeded("call reset() to start a round")
         return self.domain.render(self._state)
+
+    def _ended(self) -> bool:
+        return self._step == self.domain.horizon or bool(self.domain.over(self._state))
 
     def _observation(self) -> EnvObservation:
         """What the person sees, as numpy arrays of their own."""

@@ -44,8 +44,7 @@ class SearchRescueEnv(DomainEnv):
     At the entrance, in a random scenario unless one is given.
 
     ## Episode End
-    Truncated after 48 steps; never terminated: whoever is back with the victim stays there, and
-    nothing more is won or lost.
+    Terminated when they are back at the entrance with the victim; else truncated after 48 steps.
 
     ## Arguments
     `setting` ("clear" or "smoke"), `scenario` (a name among `SearchRescue.scenarios`, or None for

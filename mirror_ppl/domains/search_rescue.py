@@ -43,7 +43,8 @@ Rewards, of the action and the state that it leads to
     =========  ====  ================================================
 
 Start and end
-    A round begins at the entrance and lasts 48 steps; whoever is back with the victim stays there.
+    A round begins at the entrance. It is over when they are back there with the victim, where they
+    stay, or after 48 steps.
 
 Version history
     1: first version.
@@ -189,6 +190,19 @@ class SearchRescue:
             victim=scenario % len(ROOMS),
         )
 
+    def anywhere(self, batch: int, generator: torch.Generator) -> RescueState:
+        """States ``[batch]`` anywhere on the floor, with the victim in half of them."""
+        state = self.initial(batch, generator)
+        cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
+        cells = cells[walkable(cells)].to(generator.device)
+        cell = torch.randint(len(cells), (batch,), generator=generator, device=generator.device)
+        place = cells[cell]
+        # Nobody stands on the obstacle.
+        place = torch.where(self._obstructed(state, place)[..., None], state.place, place)
+        carried = torch.rand(batch, generator=generator, device=generator.device) < 0.5  # noqa: PLR2004
+        found = carried | self._at_victim(state, place)
+        return replace(state, place=place, found=found, home=found & at_entrance(place))
+
     def transition(self, state: RescueState, action: Tensor) -> RescueState:
         """State at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
         moves = torch.tensor(list(MOVES.values()), device=state.place.device)
@@ -220,6 +234,10 @@ class SearchRescue:
     def _obstructed(self, state: RescueState, place: Tensor) -> Tensor:
         corridors = torch.tensor([(-1, -1), *CORRIDORS.values()], device=place.device)
         return (place == corridors[state.blocked]).all(-1)
+
+    def over(self, state: RescueState) -> Tensor:
+        """Where they are back at the entrance with the victim ``[...]``."""
+        return state.home
 
     def observe(self, state: RescueState) -> Observation:
         """Everything there is to observe: ego ``[..., 3]``, visual ``[..., 9, 27]`` and so on."""

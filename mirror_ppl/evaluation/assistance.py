@@ -23,10 +23,9 @@ from mirror_ppl.communication.objectives import Divergence, ExpectedUtility
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic
 from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld
-from mirror_ppl.domains.base import Domain, total_reward
+from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.oracle import Oracle
-from mirror_ppl.inference.experience import map_state
 from mirror_ppl.people.driving import Drivers
 from mirror_ppl.people.populations import derived_generator
 from mirror_ppl.people.recordings import Start

@@ -21,6 +21,7 @@ import torch
 from mirror_ppl import __version__
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.domains import Domain, get_domain
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.evaluation.assistance import (
     COMMUNICATORS,
     RATES_FROM,
@@ -31,7 +32,6 @@ from mirror_ppl.evaluation.assistance import (
     speaker,
 )
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.experience import map_state
 from mirror_ppl.inference.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import check_contract, load_human_model

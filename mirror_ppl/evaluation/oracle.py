@@ -16,9 +16,8 @@ from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, every_message
 from mirror_ppl.distinct import distinct_rows
-from mirror_ppl.domains.base import Observation, total_reward
+from mirror_ppl.domains.base import Observation, map_state, total_reward
 from mirror_ppl.domains.driving import Driving, DrivingState
-from mirror_ppl.inference.experience import map_state
 from mirror_ppl.people.driving import Drivers, Memory, remember
 
 CHUNK = 2000

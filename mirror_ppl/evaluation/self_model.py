@@ -13,12 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, total_reward
+from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.inference.experience import (
     drive,
     experience,
     follow,
-    map_state,
     roll_out,
     supposed,
 )

@@ -6,13 +6,13 @@ there on, so observations, views and rewards are made again whenever a round is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, Observation, Visibility, total_reward
+from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, total_reward
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.views import ViewPlan
 
@@ -23,11 +23,13 @@ class Outcomes:
 
     Attributes:
         reward: ``[B, T']``.
+        over: whether nothing can be won or lost from there on ``[B, T']``.
         observation: the next observation ``[B, T', ...]``.
         visible: what the observer would see of it ``[B, T', K]``.
     """
 
     reward: Tensor
+    over: Tensor
     observation: Observation
     visible: Visibility
 
@@ -39,12 +41,14 @@ class Experience:
     Attributes:
         rounds: what happened.
         outcomes: of every action.
+        over: whether nothing could be won or lost any more, at these steps ``[B, T']``.
         first: first step at which they were worked out.
         stride: how far these steps are apart.
     """
 
     rounds: Rounds
     outcomes: tuple[Outcomes, ...]
+    over: Tensor
     first: int = 0
     stride: int = 1
 
@@ -52,17 +56,6 @@ class Experience:
     def steps(self) -> slice:
         """At which steps of the rounds there are outcomes."""
         return slice(self.first, None, self.stride)
-
-
-def map_state(function: Any, *states: Any) -> Any:
-    """Apply a function to each tensor of one or several states of a domain."""
-    kind = type(states[0])
-    return kind(
-        **{
-            field.name: function(*(getattr(state, field.name) for state in states))
-            for field in fields(kind)
-        }
-    )
 
 
 def roll_out(domain: Domain, start: Any, actions: Tensor) -> Any:
@@ -111,6 +104,7 @@ def experience(
         taken = plan.taken(domain, after, observation)
         return Outcomes(
             reward=total_reward(domain.rewards(some, action, following)),
+            over=domain.over(following),
             observation=observation,
             visible={name: mask | taken[name] for name, mask in seen.items()},
         )
@@ -130,6 +124,7 @@ def experience(
             outcome(torch.full_like(actions[:, steps], index))
             for index in range(len(domain.actions))
         ),
+        over=domain.over(some),
         first=first,
         stride=stride,
     )

@@ -22,9 +22,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain
+from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.files import read_checkpoint, write_whole
-from mirror_ppl.inference.experience import Experience, drive, experience, map_state
+from mirror_ppl.inference.experience import Experience, drive, experience
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.views import draw_views
 
@@ -49,6 +49,7 @@ class SelfModelOptions:
         discount: discount of rewards per step.
         target_rate: rate at which the target network follows the Q-network, per step.
         world_weight: weight of the negative ELBO per observation.
+        length: steps of a round that is learned from; as many as a round has, if 0.
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
     """
 
@@ -65,6 +66,7 @@ class SelfModelOptions:
     discount: float = 0.9
     target_rate: float = 0.01
     world_weight: float = 0.01
+    length: int = 0
     stride: int = 1
 
     @classmethod
@@ -96,7 +98,8 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "epsilon_decay": 0.9,
         "discount": 0.95,
         "world_weight": 0.001,
-        "stride": 4,
+        "length": 16,
+        "stride": 2,
     },
 }
 """Settings that differ by domain; beta and epsilon are the supplement's."""
@@ -145,11 +148,13 @@ def self_model_loss(
             evidence = self_model.encoder.combine(embedded, outcome.visible)
             evidence = evidence + self_model.encoder.action.weight[action]
             value = target(self_model.encoder(belief, evidence).mean).amax(-1)
-            if self_model.domain.over_at_horizon:
-                value[:, (torch.arange(steps) == steps - 1)[lived.steps]] = 0.0
-            goals.append(outcome.reward + options.discount * value)
+            over = outcome.over
+            if self_model.domain.over_at_horizon and steps == self_model.domain.horizon:
+                over = over | (torch.arange(steps, device=over.device) == steps - 1)[lived.steps]
+            goals.append(outcome.reward + options.discount * value.masked_fill(over, 0.0))
     error = self_model.action_values(belief) - torch.stack(goals, -1)
-    bellman = error.pow(2).mean()
+    # When all is done it does not matter what one does.
+    bellman = error[~lived.over].pow(2).mean()
     return Loss(
         options.world_weight * negative_elbo + bellman, negative_elbo.detach(), bellman.detach()
     )
@@ -266,8 +271,9 @@ class _Trainer:
 
     def _drive(self) -> None:
         options, domain = self.options, self.domain
-        start = domain.initial(options.rounds, self.generator)
-        plan = draw_views(domain, options.rounds, domain.horizon, self.generator)
+        start = domain.anywhere(options.rounds, self.generator)
+        length = options.length or domain.horizon
+        plan = draw_views(domain, options.rounds, length, self.generator)
         epsilon = options.epsilon * options.epsilon_decay**self.phase
         self.starts.append(start)
         self.actions.append(
@@ -275,7 +281,7 @@ class _Trainer:
                 self.self_model,
                 start,
                 plan,
-                domain.horizon,
+                length,
                 self.generator,
                 epsilon=max(epsilon, options.epsilon_floor),
                 expert=options.beta * options.beta_decay**self.phase,

@@ -10,8 +10,8 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains.base import total_reward
-from mirror_ppl.inference.experience import map_state, roll_out
+from mirror_ppl.domains.base import map_state, total_reward
+from mirror_ppl.inference.experience import roll_out
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_values
 

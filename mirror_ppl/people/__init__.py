@@ -1,37 +1,74 @@
 """Simulated people, and the recordings of them from which models of people are fitted.
 
 A domain's people are in a file of the domain's name; what a new domain has to add is an entry in
-``SIMULATORS``.
+``PEOPLE``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 
 from mirror_ppl.console import Progress
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import require_known
+from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.driving import Drivers, Memory, PlanningDrivers, TaskDrivers, remember
+from mirror_ppl.people.driving_participants import learned_reward, simulated_drivers
 from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_reward, log_policy
 from mirror_ppl.people.populations import POPULATIONS
-from mirror_ppl.people.recordings import (
-    Start,
-    draw_starts,
-    learned_reward,
-    simulate_driving,
-    simulated_drivers,
-)
+from mirror_ppl.people.recordings import Start, draw_starts, record, recorded
+from mirror_ppl.people.rescue_participants import RESCUE_POPULATIONS, simulated_firefighters
+from mirror_ppl.people.search_rescue import Firefighters
 
-SIMULATORS: dict[str, Callable[..., Demonstrations]] = {"driving": simulate_driving}
-"""What records simulated people, by the name of the domain."""
+
+@dataclass(frozen=True)
+class DomainPeople:
+    """The people of a domain.
+
+    Attributes:
+        populations: names of who they may be.
+        simulated: makes them, of setting, population, number, seed and device.
+    """
+
+    populations: tuple[str, ...]
+    simulated: Callable[..., SimulatedPeople]
+
+
+PEOPLE: dict[str, DomainPeople] = {
+    "driving": DomainPeople(tuple(POPULATIONS), simulated_drivers),
+    "search_rescue": DomainPeople(tuple(RESCUE_POPULATIONS), simulated_firefighters),
+}
+"""The people of each domain, by its name."""
+
+
+def simulated_people(
+    domain: str,
+    setting: str,
+    population: str,
+    people: int,
+    seed: int,
+    device: torch.device | str = "cpu",
+) -> SimulatedPeople:
+    """The simulated people of a population, to be stepped by whoever wants to.
+
+    The same seed gives the same people, those whom `simulate` records; see there for arguments.
+
+    Raises:
+        UnknownNameError: there is no such domain, setting or population.
+    """
+    own = PEOPLE[require_known(domain, "domain", tuple(PEOPLE))]
+    require_known(population, "population", own.populations)
+    return own.simulated(setting, population, people, seed, device)
 
 
 def simulate(
     domain: str = "driving",
-    setting: str = "fog",
+    setting: str | None = None,
     population: str = "paper",
     people: int = 10,
     rounds: int = 40,
@@ -43,51 +80,60 @@ def simulate(
 
     Args:
         domain: a domain's name.
-        setting: one of its settings.
-        population: who the people are; of driving ``paper``, sight limited by the setting alone, or
-            ``diverse``, each person's own reach ahead and behind in whatever setting.
+        setting: one of its settings; the last, in which sight is worst, unless given.
+        population: who the people are: ``paper``, sight limited by the setting alone, or
+            ``diverse``, each person's own sight in whatever setting.
         people: number of people P.
         rounds: number of rounds B of each.
         seed: the same seed gives the same people in every setting, and the same call the same
             recordings; each setting has rounds of its own.
         device: where the work is done and the recordings lie. Another kind of device has other
             random numbers, and so the same people in other rounds.
-        progress: is told of every step of the rounds (of driving 15).
+        progress: is told of every step of the rounds.
 
     Returns:
-        P people with B rounds each. Its truths are ``sight_...`` for each of the domain's
-        directions (how far the person sees, in the domain's unit of distance; the last of
-        ``reach_bins`` is everything), ``assumes_...`` for each of the domain's assumptions (1:
-        made) and ``consistency`` (1 / units of reward).
+        P people with B rounds each, which end when all is done. Its truths are ``sight_...`` for
+        each of the domain's directions (how far the person sees, in the domain's unit of distance;
+        the last of ``reach_bins`` is everything), ``assumes_...`` for each of the domain's
+        assumptions (1: made), and of driving ``consistency`` (1 / units of reward), of search and
+        rescue ``lapse`` (probability of a step in any direction).
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
         ValueError: fewer than one person or round.
     """
-    simulator = SIMULATORS[require_known(domain, "domain", tuple(SIMULATORS))]
+    setting = setting or get_domain(domain).settings[-1]
     for name, number in (("people", people), ("rounds", rounds)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, not {number}")
-    return simulator(setting, population, people, rounds, seed, device, progress)
+    own = simulated_people(domain, setting, population, people, seed, device)
+    return recorded(own, setting, population, rounds, seed, device, progress)
 
 
 __all__ = [
+    "PEOPLE",
     "POPULATIONS",
-    "SIMULATORS",
     "CrossEntropyOptions",
     "Decisions",
+    "DomainPeople",
     "Drivers",
+    "Firefighters",
     "LearnedReward",
     "Memory",
     "PlanningDrivers",
+    "SimulatedPeople",
     "Start",
     "TaskDrivers",
+    "act",
     "best_sequences",
     "draw_starts",
     "learn_reward",
     "learned_reward",
     "log_policy",
+    "record",
     "remember",
     "simulate",
     "simulated_drivers",
+    "simulated_firefighters",
+    "simulated_people",
 ]

@@ -22,9 +22,8 @@ Choices that the supplement leaves open, with their reasons, are in ``docs/peopl
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
-from typing import Self
+from abc import abstractmethod
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -40,6 +39,8 @@ from mirror_ppl.domains.driving import (
     known_car_values,
     lane_rewards,
 )
+from mirror_ppl.domains.driving_knowledge import ASSUMPTIONS
+from mirror_ppl.people.base import SimulatedPeople, each
 from mirror_ppl.people.maximum_entropy import LearnedReward
 
 HORIZON = 10
@@ -185,11 +186,8 @@ def remember(
 
 
 @dataclass(frozen=True)
-class Drivers(ABC):
+class Drivers(SimulatedPeople):
     """P people who drive, each with their own sight and consistency; step them with `step`.
-
-    Nothing is kept between calls: the memory goes in and comes out, so that one person can be
-    driven through many courses of a round at once.
 
     Attributes:
         reach: how far each sees, in cells, ``[P, 4]`` for each of ``Driving.directions``.
@@ -199,12 +197,23 @@ class Drivers(ABC):
     reach: Tensor
     consistency: Tensor
 
-    def select(self, index: list[int]) -> Self:
-        """Some of these people, ``[len(index)]``."""
-        return replace(self, reach=self.reach[index], consistency=self.consistency[index])
+    @property
+    def domain(self) -> Driving:
+        """Driving."""
+        return Driving()
 
-    def start(self, *batch: int) -> Memory:
-        """Memory ``[P, *batch, K]`` before a round begins."""
+    def truth(self) -> dict[str, Tensor]:
+        """Their sight in each direction, what they take for granted, and their consistency."""
+        sight = zip(Driving.directions, self.reach.unbind(-1), strict=True)
+        return {
+            **{f"sight_{direction}": reach for direction, reach in sight},
+            **{f"assumes_{name}": torch.ones_like(self.consistency) for name in ASSUMPTIONS},
+            "consistency": self.consistency,
+        }
+
+    def start(self, *batch: int, fate: Tensor | None = None) -> Memory:
+        """Memory ``[P, *batch, K]`` before a round begins; nothing in it is chance."""
+        del fate
         return Memory.empty((len(self.reach), *batch), self.reach.device)
 
     def sees(self, observation: Observation) -> Visibility:
@@ -215,7 +224,7 @@ class Drivers(ABC):
         """
         ahead = observation["visual"][..., 0]
         lane = observation["ego"][..., 0].long()
-        seen = in_sight(self._each(self.reach, ahead.dim() - 2), ahead, lane)
+        seen = in_sight(each(self.reach, ahead.dim() - 2), ahead, lane)
         return {"visual": seen, "verbal": torch.zeros_like(seen)}
 
     def step(
@@ -232,10 +241,10 @@ class Drivers(ABC):
             Probabilities of the actions ``[P, ..., A]`` and the memory at this step.
         """
         seen = self.sees(observation)["visual"]
-        reach = self._each(self.reach, seen.dim() - 2)
+        reach = each(self.reach, seen.dim() - 2)
         memory = remember(memory, observation, seen, told, reach)
         values = self.values(memory, observation["ego"][..., 0].long())
-        consistency = self._each(self.consistency, values.dim() - 1)
+        consistency = each(self.consistency, values.dim() - 1)
         return (consistency * values).softmax(-1), memory
 
     @abstractmethod
@@ -246,11 +255,6 @@ class Drivers(ABC):
             memory: what is known, ``[..., K]``.
             lane: the driver's lane ``[...]``.
         """
-
-    @staticmethod
-    def _each(value: Tensor, dimensions: int) -> Tensor:
-        """Insert dimensions behind the first, so that people broadcast over what follows."""
-        return value.reshape(value.shape[0], *[1] * dimensions, *value.shape[1:])
 
 
 @dataclass(frozen=True)

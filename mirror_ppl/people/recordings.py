@@ -1,14 +1,9 @@
-"""Recordings of simulated drivers, from the ground truth to the demonstrations that are fitted.
-
-As the supplement's section B builds them: ten people play 24 rounds in each setting, a reward is
-learned from all that they did, and simulated people who plan on it play the rounds that are handed
-out. ``docs/people.md`` tells the steps.
-"""
+"""Recordings of simulated people, of whatever domain."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,39 +11,36 @@ from torch import Tensor
 from mirror_ppl import __version__
 from mirror_ppl.console import Progress
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains.base import Observation, total_reward
-from mirror_ppl.domains.driving import SWITCH, Driving, DrivingState
-from mirror_ppl.people.driving import (
-    DISCOUNT,
-    HORIZON,
-    Drivers,
-    Memory,
-    PlanningDrivers,
-    TaskDrivers,
-)
-from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_reward
-from mirror_ppl.people.populations import consistencies, derived_generator, reaches
-
-PARTICIPANTS = 10
-"""How many ground-truth people the reward is learned from."""
-PARTICIPANT_ROUNDS = 24
-"""How many rounds each of them plays in each setting."""
+from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward
+from mirror_ppl.domains.driving import Driving
+from mirror_ppl.people.base import SimulatedPeople, act
+from mirror_ppl.people.populations import derived_generator
 
 
 @dataclass(frozen=True)
 class Start:
-    """How rounds begin, and the random numbers by which their drivers choose.
+    """How rounds begin, and the random numbers by which people choose.
 
     Attributes:
         state: states ``[P, B]``.
         scenario: indices into the domain's scenarios ``[P, B]``.
-        luck: uniform numbers ``[P, B, T]``; the driver switches lanes where the probability of it
-            is larger.
+        luck: uniform numbers ``[P, B, T]`` that choose actions, see `mirror_ppl.people.base.act`.
+        fate: uniform numbers ``[P, B, L]`` that decide what is chance in a person's mind.
     """
 
-    state: DrivingState
+    state: Any
     scenario: Tensor
     luck: Tensor
+    fate: Tensor | None = None
+
+    def select(self, people: slice) -> Start:
+        """The rounds of some of the people."""
+        return Start(
+            map_state(lambda part: part[people], self.state),
+            self.scenario[people],
+            self.luck[people],
+            None if self.fate is None else self.fate[people],
+        )
 
 
 @dataclass(frozen=True)
@@ -59,35 +51,27 @@ class Recording:
         observation: everything there was to observe, ``[P, B, T + 1, ...]``.
         actions: ``[P, B, T]``.
         rewards: of the task, ``[P, B, T]``.
-        probabilities: of the actions ``[P, B, T, A]``.
-        memory: what the drivers knew when they acted, ``[P, B, T, K]``.
+        probabilities: of the actions, given what people had in mind, ``[P, B, T, A]``.
+        memory: what they knew when they acted, ``[P, B, T, ...]``.
+        lengths: steps ``[P, B]`` until all was done, or all T.
     """
 
     observation: Observation
     actions: Tensor
     rewards: Tensor
     probabilities: Tensor
-    memory: Memory
-
-    @property
-    def action_entropy(self) -> Tensor:
-        """Entropy of each choice in nats, ``[P, B, T]``."""
-        return torch.special.entr(self.probabilities).sum(-1)
-
-    def decisions(self) -> Decisions:
-        """Every choice and what it was based on, people and rounds pooled."""
-        memory = self.memory
-        return Decisions(
-            lane=self.observation["ego"][:, :, :-1, 0].long().flatten(),
-            known=memory.known.flatten(0, 2),
-            position=memory.position.flatten(0, 2),
-            speed=memory.speed.flatten(0, 2),
-            action=self.actions.flatten(),
-        )
+    memory: Any
+    lengths: Tensor
 
 
 def draw_starts(
-    people: int, rounds: int, seed: int, *purpose: str, device: torch.device | str = "cpu"
+    people: int,
+    rounds: int,
+    seed: int,
+    *purpose: str,
+    device: torch.device | str = "cpu",
+    domain: Domain | None = None,
+    fates: int = 0,
 ) -> Start:
     """Draw how the rounds ``[P, B]`` begin, for each person from a generator of their own.
 
@@ -97,9 +81,11 @@ def draw_starts(
         seed: with the purpose it determines the rounds.
         purpose: what they are for; other words give other rounds.
         device: where they are drawn and live.
+        domain: the world; driving unless given.
+        fates: numbers L of a round that decide what is chance in a person's mind.
     """
-    domain = Driving()
-    scenarios, states, luck = [], [], []
+    domain = domain or Driving()
+    scenarios, states, luck, fate = [], [], [], []
     for person in range(people):
         generator = derived_generator(seed, *purpose, person, device=device)
         scenario = torch.randint(
@@ -108,29 +94,32 @@ def draw_starts(
         scenarios.append(scenario)
         states.append(domain.initial(rounds, generator, scenario))
         luck.append(torch.rand(rounds, domain.horizon, generator=generator, device=device))
-    state = DrivingState(
-        lane=torch.stack([state.lane for state in states]),
-        position=torch.stack([state.position for state in states]),
-        speed=torch.stack([state.speed for state in states]),
+        fate.append(torch.rand(rounds, fates, generator=generator, device=device))
+    return Start(
+        map_state(lambda *parts: torch.stack(parts), *states),
+        torch.stack(scenarios),
+        torch.stack(luck),
+        torch.stack(fate),
     )
-    return Start(state, torch.stack(scenarios), torch.stack(luck))
 
 
-def record(drivers: Drivers, start: Start, progress: Progress | None = None) -> Recording:
-    """Let drivers play rounds to the end; nobody tells them anything.
+def record(people: SimulatedPeople, start: Start, progress: Progress | None = None) -> Recording:
+    """Let people play rounds to the end; nobody tells them anything.
 
     Args:
-        drivers: P people.
+        people: P people.
         start: how their rounds ``[P, B]`` begin.
         progress: is told of every step.
     """
-    domain = Driving()
-    state, memory = start.state, drivers.start(start.luck.shape[1])
+    domain = people.domain
+    state, memory = start.state, people.start(start.luck.shape[1], fate=start.fate)
     observations, actions, rewards = [domain.observe(state)], [], []
     probabilities, memories = [], []
+    lengths = torch.zeros_like(start.scenario)
     for luck in start.luck.unbind(-1):
-        probability, memory = drivers.step(memory, observations[-1])
-        action = (luck < probability[..., SWITCH]).long()
+        lengths += ~domain.over(state)
+        probability, memory = people.step(memory, observations[-1])
+        action = act(probability, luck)
         following = domain.transition(state, action)
         rewards.append(total_reward(domain.rewards(state, action, following)))
         state = following
@@ -147,86 +136,47 @@ def record(drivers: Drivers, start: Start, progress: Progress | None = None) -> 
         actions=torch.stack(actions, 2),
         rewards=torch.stack(rewards, 2),
         probabilities=torch.stack(probabilities, 2),
-        memory=Memory.stack(memories, 2),
+        memory=map_state(lambda *parts: torch.stack(parts, 2), *memories),
+        lengths=lengths,
     )
 
 
-def record_participants(setting: str, seed: int) -> Recording:
-    """The ground-truth people's rounds in a setting, limited in sight by the setting alone.
-
-    Raises:
-        UnknownNameError: there is no such setting.
-    """
-    drivers = TaskDrivers(
-        reach=reaches("paper", setting, PARTICIPANTS, seed),
-        consistency=consistencies(PARTICIPANTS, seed),
-    )
-    rounds = PARTICIPANT_ROUNDS
-    return record(drivers, draw_starts(PARTICIPANTS, rounds, seed, "participants", setting))
-
-
-@lru_cache(maxsize=8)
-def learned_reward(seed: int) -> LearnedReward:
-    """The reward learned from the rounds of the ground-truth people in every setting, pooled."""
-    parts = [record_participants(setting, seed).decisions() for setting in Driving.settings]
-    names = Decisions.__dataclass_fields__
-    pooled = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    return learn_reward(Decisions(**pooled), HORIZON, DISCOUNT)
-
-
-def simulated_drivers(
-    setting: str, population: str, people: int, seed: int, device: torch.device | str = "cpu"
-) -> PlanningDrivers:
-    """The simulated people of a population, to be stepped by whoever wants to.
-
-    The same seed gives the same people, those that `simulate_driving` records.
-
-    Args:
-        setting: a setting of the driving domain.
-        population: ``paper`` or ``diverse``, see `mirror_ppl.people.populations.reaches`.
-        people: number of people P.
-        seed: determines their sight, consistency and reward.
-        device: where they live.
-
-    Raises:
-        UnknownNameError: there is no such setting or population.
-    """
-    reach = reaches(population, setting, people, seed).to(device)
-    consistency = consistencies(people, seed).to(device)
-    planning_seed = derived_generator(seed, "planning").initial_seed()
-    return PlanningDrivers(reach, consistency, learned_reward(seed), planning_seed=planning_seed)
-
-
-def simulate_driving(
+def recorded(
+    people: SimulatedPeople,
     setting: str,
     population: str,
-    people: int,
     rounds: int,
     seed: int,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> Demonstrations:
-    """Recordings of simulated drivers; see `mirror_ppl.people.simulate`."""
-    drivers = simulated_drivers(setting, population, people, seed, device)
-    start = draw_starts(people, rounds, seed, "rounds", setting, device=device)
-    recording = record(drivers, start, progress)
-    sight = zip(Driving.directions, drivers.reach.unbind(-1), strict=True)
+    """Recordings of simulated people; see `mirror_ppl.people.simulate`."""
+    domain, truth = people.domain, people.truth()
+    number = len(next(iter(truth.values())))
+    start = draw_starts(
+        number,
+        rounds,
+        seed,
+        "rounds",
+        setting,
+        device=device,
+        domain=domain,
+        fates=people.fates,
+    )
+    recording = record(people, start, progress)
+    chances = people.predictive(recording.probabilities, recording.observation, recording.actions)
     return Demonstrations(
-        domain=Driving.name,
+        domain=domain.name,
         setting=setting,
-        people=tuple(f"person-{number:02d}" for number in range(1, people + 1)),
+        people=tuple(f"person-{place:02d}" for place in range(1, number + 1)),
         ego=recording.observation["ego"],
-        observations={part.name: recording.observation[part.name] for part in Driving.modalities},
+        observations={part.name: recording.observation[part.name] for part in domain.modalities},
         actions=recording.actions,
-        round_counts=torch.full((people,), rounds),
-        lengths=torch.full((people, rounds), Driving.horizon),
+        round_counts=torch.full((number,), rounds),
+        lengths=recording.lengths,
         rewards=recording.rewards,
         scenarios=start.scenario,
-        truth={
-            **{f"sight_{direction}": reach for direction, reach in sight},
-            **{f"assumes_{name}": torch.ones(people) for name in Driving.assumptions},
-            "consistency": drivers.consistency,
-        },
-        action_entropy=recording.action_entropy,
+        truth=truth,
+        action_entropy=torch.special.entr(chances).sum(-1),
         provenance={"population": population, "seed": seed, "version": __version__},
     )

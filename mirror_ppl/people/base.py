@@ -1,0 +1,107 @@
+"""What simulated people have in common: they look, listen, remember and choose."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
+
+from torch import Tensor
+
+from mirror_ppl.domains.base import Domain, Observation, Visibility
+
+
+@dataclass(frozen=True)
+class SimulatedPeople(ABC):
+    """P people who act in a domain; step them with `step`.
+
+    Nothing is kept between calls: the memory goes in and comes out, so that one person can be led
+    through many courses of a round at once. A memory is a dataclass of tensors, all of which begin
+    with the dimensions of the rounds.
+
+    Attributes:
+        fates: how many uniform numbers decide, at the beginning of a round, what is chance in a
+            person's mind; choices of actions are not among them.
+    """
+
+    fates: ClassVar[int] = 0
+
+    @property
+    @abstractmethod
+    def domain(self) -> Domain:
+        """The world that they act in."""
+
+    @abstractmethod
+    def start(self, *batch: int, fate: Tensor | None = None) -> Any:
+        """Memory ``[P, *batch, ...]`` before a round begins.
+
+        Args:
+            batch: rounds.
+            fate: uniform numbers ``[P, *batch, fates]``; the likeliest happens unless given.
+        """
+
+    @abstractmethod
+    def sees(self, observation: Observation) -> Visibility:
+        """What each sees and hears by themselves, boolean ``[P, ..., K]`` for each modality.
+
+        Args:
+            observation: ``[P, ...]``, everything there is to observe.
+        """
+
+    @abstractmethod
+    def step(
+        self, memory: Any, observation: Observation, told: Visibility | None = None
+    ) -> tuple[Tensor, Any]:
+        """Look, listen, remember, plan.
+
+        Args:
+            memory: of the step before, ``[P, ...]``; `start` at the first step of a round.
+            observation: ``[P, ...]``, everything there is to observe.
+            told: boolean ``[P, ..., K]`` for each modality, the items communicated at this step.
+
+        Returns:
+            Probabilities of the actions ``[P, ..., A]`` and the memory at this step.
+        """
+
+    @abstractmethod
+    def truth(self) -> dict[str, Tensor]:
+        """What is true of each ``[P]``, by the names of the sites that infer it."""
+
+    def predictive(
+        self, probabilities: Tensor, observation: Observation, actions: Tensor
+    ) -> Tensor:
+        """Probabilities ``[P, B, T, A]`` of actions to somebody who knows everything but luck.
+
+        They differ from those of `step` where people have something in mind that cannot be seen.
+
+        Args:
+            probabilities: of each step, given what they had in mind, ``[P, B, T, A]``.
+            observation: what there was to observe, ``[P, B, T + 1, ...]``.
+            actions: what was done, ``[P, B, T]``.
+        """
+        del observation, actions
+        return probabilities
+
+    def select(self, index: list[int]) -> Self:
+        """Some of these people, ``[len(index)]``."""
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return type(self)(
+            **{
+                name: part[index] if isinstance(part, Tensor) else part
+                for name, part in parts.items()
+            }
+        )
+
+
+def act(probability: Tensor, luck: Tensor) -> Tensor:
+    """Actions ``[...]`` that uniform numbers ``[...]`` choose with probabilities ``[..., A]``.
+
+    Small numbers choose late actions: of two, the second where luck is less than its probability.
+    """
+    beyond = probability.flip(-1).cumsum(-1).flip(-1)[..., 1:]
+    return (luck[..., None] < beyond).sum(-1)
+
+
+def each(value: Tensor, dimensions: int) -> Tensor:
+    """Insert dimensions behind the first, so that people broadcast over what follows."""
+    return value.reshape(value.shape[0], *[1] * dimensions, *value.shape[1:])

@@ -1,0 +1,80 @@
+"""The people of the driving domain, from the ground truth to those who are handed out.
+
+As the supplement's section B builds them: ten people play 24 rounds in each setting, a reward is
+learned from all that they did, and simulated people plan on it. ``docs/people.md`` tells the steps.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+
+from mirror_ppl.domains.driving import Driving
+from mirror_ppl.people.driving import DISCOUNT, HORIZON, PlanningDrivers, TaskDrivers
+from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_reward
+from mirror_ppl.people.populations import consistencies, derived_generator, reaches
+from mirror_ppl.people.recordings import Recording, draw_starts, record
+
+PARTICIPANTS = 10
+"""How many ground-truth people the reward is learned from."""
+PARTICIPANT_ROUNDS = 24
+"""How many rounds each of them plays in each setting."""
+
+
+def decisions(recording: Recording) -> Decisions:
+    """Every choice and what it was based on, people and rounds pooled."""
+    memory = recording.memory
+    return Decisions(
+        lane=recording.observation["ego"][:, :, :-1, 0].long().flatten(),
+        known=memory.known.flatten(0, 2),
+        position=memory.position.flatten(0, 2),
+        speed=memory.speed.flatten(0, 2),
+        action=recording.actions.flatten(),
+    )
+
+
+def record_participants(setting: str, seed: int) -> Recording:
+    """The ground-truth people's rounds in a setting, limited in sight by the setting alone.
+
+    Raises:
+        UnknownNameError: there is no such setting.
+    """
+    drivers = TaskDrivers(
+        reach=reaches("paper", setting, PARTICIPANTS, seed),
+        consistency=consistencies(PARTICIPANTS, seed),
+    )
+    rounds = PARTICIPANT_ROUNDS
+    return record(drivers, draw_starts(PARTICIPANTS, rounds, seed, "participants", setting))
+
+
+@lru_cache(maxsize=8)
+def learned_reward(seed: int) -> LearnedReward:
+    """The reward learned from the rounds of the ground-truth people in every setting, pooled."""
+    parts = [decisions(record_participants(setting, seed)) for setting in Driving.settings]
+    names = Decisions.__dataclass_fields__
+    pooled = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return learn_reward(Decisions(**pooled), HORIZON, DISCOUNT)
+
+
+def simulated_drivers(
+    setting: str, population: str, people: int, seed: int, device: torch.device | str = "cpu"
+) -> PlanningDrivers:
+    """The simulated people of a population, to be stepped by whoever wants to.
+
+    The same seed gives the same people, those that `mirror_ppl.people.simulate` records.
+
+    Args:
+        setting: a setting of the driving domain.
+        population: ``paper`` or ``diverse``, see `mirror_ppl.people.populations.reaches`.
+        people: number of people P.
+        seed: determines their sight, consistency and reward.
+        device: where they live.
+
+    Raises:
+        UnknownNameError: there is no such setting or population.
+    """
+    reach = reaches(population, setting, people, seed).to(device)
+    consistency = consistencies(people, seed).to(device)
+    planning_seed = derived_generator(seed, "planning").initial_seed()
+    return PlanningDrivers(reach, consistency, learned_reward(seed), planning_seed=planning_seed)
