@@ -10,9 +10,9 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains.base import map_state, total_reward
+from mirror_ppl.domains.base import Observation, Visibility, map_state, total_reward
 from mirror_ppl.inference.experience import roll_out
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.sites import latent_values
 
 
@@ -26,6 +26,8 @@ def play_rounds(
     scenario: Tensor | None = None,
 ) -> Demonstrations:
     """Let people with given implants play rounds; every action is drawn from the program itself.
+
+    Rounds end when all is done, or after the domain's horizon.
 
     Args:
         human: the model of people.
@@ -52,14 +54,14 @@ def play_rounds(
         for m in domain.modalities
     }
     sites = dict(implants)
+    lengths = torch.zeros(people, rounds, dtype=torch.long, device=device)
+    follow = (_Stepwise if human.stepwise else _Courses)(human, told, actions)
     # What the program itself draws comes from the generator, too, whatever else is drawn from it.
     own = torch.Generator(device)
     own.set_state(generator.get_state())
     seed = int(torch.randint(2**31, (), generator=own, device=device))
     for step in range(steps):
-        # What comes later does not matter to this step: the last observation stands in for it.
-        shown = observed + observed[-1:] * (steps - 1 - step)
-        observation = {name: torch.stack([one[name] for one in shown], 2) for name in shown[0]}
+        lengths += ~domain.over(state)
         with (
             torch.random.fork_rng(devices=[]),
             poutine.trace() as trace,
@@ -70,12 +72,10 @@ def play_rounds(
             drawn = human.prior()
             with pyro.plate("round", rounds, dim=-1):
                 drawn = {**drawn, **human.attend(drawn)}
-            view = human.perceive(drawn, observation, told)
-            belief = human.believe(view, observation, actions)
-            log_probability = human.act(drawn, belief, human.self_model.action_values(belief))
+            log_probability = follow.act(drawn, observed, step)
         # What was drawn at the first step stays, of a person for all rounds.
         sites |= latent_values(trace.trace)
-        probability = log_probability[..., step, :].exp().flatten(0, 1)
+        probability = log_probability.exp().flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)
         actions[..., step] = chosen.view(people, rounds)
         state = domain.transition(state, actions[..., step])
@@ -96,5 +96,45 @@ def play_rounds(
         actions=actions,
         rewards=by_person(rewards),
         round_counts=torch.full((people,), rounds),
-        lengths=torch.full((people, rounds), steps),
+        lengths=lengths,
     )
+
+
+class _Stepwise:
+    """People of whom each step follows from the one before."""
+
+    def __init__(self, human: HumanModel, told: Visibility, actions: Tensor) -> None:
+        self.human, self.told, self.actions = human, told, actions
+        people, rounds, _ = actions.shape
+        self.knowledge = human.domain.nothing_known(people, rounds, device=actions.device)
+        like = next(human.parameters())
+        self.belief = like.new_zeros(people, rounds, human.self_model.latent)
+        self.last = torch.full_like(actions[..., 0], len(human.domain.actions))
+
+    def act(self, implants: Implants, observed: list[Observation], step: int) -> Tensor:
+        """Log-probabilities ``[P, B, A]`` of actions at a step."""
+        human, now = self.human, observed[-1]
+        told = {name: mask[..., step, :] for name, mask in self.told.items()}
+        last = self.actions[..., step - 1] if step else self.last
+        view, self.knowledge = human.look(implants, self.knowledge, now, told, step)
+        self.belief = human.advance(self.belief, human.evidence(view, now), last).mean
+        belief = self.belief[..., None, :]
+        return human.act(implants, belief, human.self_model.action_values(belief))[..., 0, :]
+
+
+class _Courses:
+    """People of whom rounds have to be gone through from the beginning at each step."""
+
+    def __init__(self, human: HumanModel, told: Visibility, actions: Tensor) -> None:
+        self.human, self.told, self.actions = human, told, actions
+
+    def act(self, implants: Implants, observed: list[Observation], step: int) -> Tensor:
+        """Log-probabilities ``[P, B, A]`` of actions at a step."""
+        human = self.human
+        # What comes later does not matter to this step: the last observation stands in for it.
+        shown = observed + observed[-1:] * (self.actions.shape[-1] - 1 - step)
+        observation = {name: torch.stack([one[name] for one in shown], 2) for name in shown[0]}
+        view = human.perceive(implants, observation, self.told)
+        belief = human.believe(view, observation, self.actions)
+        values = human.self_model.action_values(belief)
+        return human.act(implants, belief, values)[..., step, :]
