@@ -167,7 +167,7 @@ def main(options: Options) -> None:
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
     for file in folder.glob("fit.checkpoint*"):
         file.unlink()
-    _show(summary, get_domain(demonstrations.domain).modalities[0].units[0])
+    _show(summary, get_domain(demonstrations.domain).reach_unit)
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
     if has_sight(result.data):

@@ -101,7 +101,7 @@ def made_up(rng, people=PEOPLE, with_truth=True, with_test=True):
         "action": rounds,
         "observed_action": rounds,
         "ego": ["person", "round", "time", "ego_feature"],
-        "visual": ["person", "round", "time", "car", "visual_feature"],
+        "visual": ["person", "round", "time", "visual_item", "visual_feature"],
         "action_probability": ["person", "test_round", "step", "action_name"],
     }
     groups = {}

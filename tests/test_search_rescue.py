@@ -188,25 +188,25 @@ def test_smoke_leaves_the_own_portion_to_see_and_nothing_to_hear():
             assert clear["visual"].all() and clear["verbal"].all()
             # The bin of 1.5 cells sees the same.
             _, distance = WORLD.distance(observation)
-            (bin_,) = [edge for edge in WORLD.reach_bins if 1.4 < edge < 1.5]
+            (bin_,) = [edge for edge in WORLD.reach_bins if edge == 1.5]
             assert torch.equal(distance <= bin_, seen["visual"])
     with pytest.raises(UnknownNameError, match="fog"):
         WORLD.visibility("fog", observation)
 
 
-def test_bins_are_the_distances_that_tell():
-    bins = torch.tensor(WORLD.reach_bins)
-    assert (bins.diff() > 0.05).all()
+def test_radii_stand_for_all_that_see_the_same():
+    radii = WORLD.reach_bins
+    assert sorted(set(radii)) == list(radii) and 1.5 in radii
     portions = [0, 1, 2, 3, 5]
-    reached = set()
+    distances = set()
     for state in reachable(0).values():
         _, distance = WORLD.distance(WORLD.observe(state))
-        for value in distance[portions].tolist():
-            # Each distance is in the bin that begins with it.
-            place = int((bins >= value).nonzero()[0, 0])
-            assert abs(float(bins[place]) - value) < 1e-3
-            reached.add(place)
-    assert reached == set(range(len(bins)))
+        distances |= set(distance[portions].tolist())
+    # One radius from each distance that can occur to the next.
+    edges = [*sorted(distances), math.inf]
+    assert len(radii) == len(distances)
+    for least, radius, beyond in zip(edges, radii, edges[1:], strict=False):
+        assert least <= radius < beyond
 
 
 def test_pixels_show_the_house():
@@ -389,7 +389,7 @@ def test_a_person_sees_as_far_as_their_radius_and_remembers():
     observation = {name: torch.stack([one[name] for one in observed])[None] for name in observed[0]}
     steps = len(states)
     told = {m.name: torch.zeros(1, steps, len(m.items), dtype=torch.bool) for m in WORLD.modalities}
-    smoke = next(place for place, edge in enumerate(WORLD.reach_bins) if 1.4 < edge < 1.5)
+    smoke = next(place for place, edge in enumerate(WORLD.reach_bins) if edge == 1.5)
     everything = len(WORLD.reach_bins) - 1
     view = human.perceive({"sight_radius": torch.tensor([smoke, everything])}, observation, told)
     assert view.visible["visual"].shape == (2, steps, 9)

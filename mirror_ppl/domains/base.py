@@ -118,6 +118,7 @@ class Domain(Protocol):
     directions: tuple[str, ...]
     direction_groups: tuple[tuple[int, ...], ...]
     reach_bins: tuple[float, ...]
+    reach_unit: str
     partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...]
 

@@ -138,6 +138,7 @@ class Driving:
     reach_bins: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, float(ROAD_END))
     """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
     cells away and none at the next edge. The last bin is the whole road."""
+    reach_unit = "cells"
     partial_views: Mapping[str, tuple[float, ...]] = {
         "fog": (FOG_REACH, FOG_REACH, 0.0, 0.0),
         "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),

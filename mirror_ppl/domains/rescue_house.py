@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import torch
@@ -92,10 +93,23 @@ def at_entrance(place: Tensor) -> Tensor:
 
 @cache
 def reach_distances() -> tuple[float, ...]:
-    """Distances in cells of places where somebody can be to what they may want to see there."""
+    """Radii in cells, one of each set of those with which one sees the same from every place.
+
+    What matters is how far places where somebody can be are from what they may want to see there.
+    Of the radii from one such distance to the next the roundest stands for all.
+    """
     cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
     cells = cells[walkable(cells)]
     centres = portion_centres()[[*CORRIDOR_PORTIONS, *ROOM_PORTIONS]]
     squares = (cells[:, None] - centres).pow(2).sum(-1).unique()
-    # Of rounding to 32 bits no cell may be lost at the edge of a bin.
-    return tuple(float(square) ** 0.5 + 1e-4 for square in squares)
+    distances = [math.sqrt(int(square)) for square in squares]
+    return tuple(map(_roundest, distances, [*distances[1:], math.inf]))
+
+
+def _roundest(least: float, beyond: float) -> float:
+    """The least number with fewest decimals from ``least`` on and below ``beyond``."""
+    for scale in (1, 10, 100, 1000):
+        number = math.ceil(least * scale - 1e-9) / scale
+        if least <= number < beyond:
+            return number
+    return least

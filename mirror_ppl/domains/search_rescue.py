@@ -161,8 +161,8 @@ class SearchRescue:
     directions: tuple[str, ...] = ("radius",)
     direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
     reach_bins: tuple[float, ...] = reach_distances()
-    """Lower edges in cells of the bins of a radius: the distances that can occur, from any cell
-    that can be walked on to the centre of any portion whose content is not always the same."""
+    """Radii in cells, one of each set of those with which one sees the same from every place."""
+    reach_unit = "cells"
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ()
 

@@ -102,8 +102,8 @@ def to_inference_data(
             "person": list(train.people),
             "direction": list(domain.directions),
             "action_name": list(domain.actions),
-            "car": list(domain.modalities[0].items),
-            "visual_feature": list(domain.modalities[0].features),
+            **{f"{m.name}_item": list(m.items) for m in domain.modalities},
+            **{f"{m.name}_feature": list(m.features) for m in domain.modalities},
         },
         dims=_dims([*posterior, *prior, *(TRUTH + name for name in train.truth)], train.told),
         attrs={key: str(value) for key, value in attributes.items()},
@@ -115,7 +115,7 @@ def to_inference_data(
         data[name].attrs.update({key: str(value) for key, value in attributes.items()})
         for variable in data[name].data_vars:
             if str(variable).startswith(SIGHT):
-                data[name][variable].attrs["units"] = domain.modalities[0].units[0]
+                data[name][variable].attrs["units"] = domain.reach_unit
     return data
 
 
@@ -174,7 +174,7 @@ def _constants(rounds: Demonstrations) -> dict[str, Any]:
     constants: dict[str, Any] = {
         "observed_action": rounds.actions.numpy().astype("int8"),
         "ego": rounds.ego.numpy(),
-        "visual": rounds.observations["visual"].numpy(),
+        **{name: value.numpy() for name, value in rounds.observations.items()},
     }
     constants |= {f"told_{name}": mask.numpy().astype("int8") for name, mask in rounds.told.items()}
     constants |= {TRUTH + name: value.numpy() for name, value in rounds.truth.items()}
@@ -193,6 +193,7 @@ def _dims(one_a_person: Iterable[str], modalities: Iterable[str]) -> dict[str, l
     dims["observed_action"] = dims["action_entropy"] = rounds
     dims["ego"] = ["person", "round", "time", "ego_feature"]
     for modality in modalities:
-        dims[f"told_{modality}"] = [*rounds, f"{modality}_item"]
-    dims["visual"] = ["person", "round", "time", "car", "visual_feature"]
+        item = f"{modality}_item"
+        dims[f"told_{modality}"] = [*rounds, item]
+        dims[modality] = ["person", "round", "time", item, f"{modality}_feature"]
     return dims

@@ -17,9 +17,6 @@ from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import fingerprint
 
-SAME_BIN = 0.5
-"""Cells by which a reach may be off the edge of its bin."""
-
 
 @dataclass(frozen=True)
 class PosteriorFile:
@@ -65,7 +62,7 @@ class PosteriorFile:
             value = self.values[name][chosen]
             if is_reach(name, site["value"]):
                 distance = np.abs(value[..., None] - bins)
-                if not (distance.min(-1) < SAME_BIN).all():
+                if not (distance.min(-1) < np.diff(bins).min() / 2).all():
                     raise PosteriorError(f'{self.path}: "{name}" has values that are no bins')
                 value = distance.argmin(-1)
             fn = site["fn"]

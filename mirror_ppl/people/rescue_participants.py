@@ -28,7 +28,7 @@ LAPSE_MEDIAN, LAPSE_SPREAD = 0.03, 0.5
 PRIOR_COUNT = 0.5
 """How often each transition counts as seen before any was."""
 LEARNING_STEPS = 200
-RADII = (SMOKE_REACH, 2.3, 3.1, 4.2, 5.7)
+RADII = (SMOKE_REACH, 2.3, 3.2, 4.2, 5.7)
 """What radii there are in the population ``diverse``, in cells."""
 
 
