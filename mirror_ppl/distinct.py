@@ -1,4 +1,4 @@
-"""Finding equal rows, which is where shared work comes from."""
+"""Finding equal rows, which is where shared work comes from, and numbers that belong to rows."""
 
 from __future__ import annotations
 
@@ -36,3 +36,23 @@ def as_whole_numbers(values: Tensor) -> Tensor:
     # With the halves swapped: as bits, small whole numbers end in zeros, and sums of multiples of
     # a power of two would sooner be equal by chance.
     return (bits >> 16) + ((bits & 0xFFFF) << 16)
+
+
+def uniform_of(seed: int, *names: Tensor) -> Tensor:
+    """Uniform numbers ``[...]`` in 0 to 1 that are a function of whole numbers ``[...]``.
+
+    The same names have the same number, whatever else there is, and others independent ones, as far
+    as anybody can tell: Steele, Lea and Flood's mixing of bits (SplitMix64, 2014).
+    """
+    device = names[0].device
+    bits = _mixed(torch.tensor(seed, dtype=torch.long, device=device))
+    for name in names:
+        bits = _mixed(bits + name.long())
+    return ((bits >> 40) & (2**24 - 1)).to(torch.float32) / 2**24
+
+
+def _mixed(bits: Tensor) -> Tensor:
+    bits = bits - 0x61C8864680B583EB  # that is + 0x9E3779B97F4A7C15, as a signed number
+    for shift, factor in ((30, -0x40A7B892E31B1A47), (27, -0x6B2FB644ECCEEE15)):
+        bits = (bits ^ ((bits >> shift) & (2 ** (64 - shift) - 1))) * factor
+    return bits ^ ((bits >> 31) & (2**33 - 1))

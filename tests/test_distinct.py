@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mirror_ppl.distinct import distinct_rows, random_keys
+from mirror_ppl.distinct import distinct_rows, random_keys, uniform_of
 
 
 def check(rows):
@@ -71,3 +71,20 @@ def test_keys_are_the_same_each_time_and_leave_global_randomness_alone():
     assert keys.dtype == torch.long
     assert len(keys.unique()) == 100
     assert keys.min() >= 0 and keys.max() < 2**62
+
+
+def test_uniform_numbers_belong_to_their_names():
+    draws, paths = torch.arange(300)[:, None], torch.arange(400)
+    numbers = uniform_of(3, draws, paths)
+    assert numbers.shape == (300, 400)
+    assert numbers.min() >= 0 and numbers.max() < 1
+    assert torch.equal(uniform_of(3, draws[7], paths[5:9]), numbers[7, 5:9])
+    assert not torch.equal(uniform_of(4, draws, paths), numbers)
+    assert not torch.equal(uniform_of(3, paths[:300, None], draws[:, 0]), numbers[:, :300].T)
+    # Of 120,000 numbers 12,000 are in each tenth, give or take 104 (one standard error).
+    counts = torch.histc(numbers, 10, 0, 1)
+    assert (counts - 12_000).abs().max() < 5 * 104
+    # Neighbours know nothing of each other: correlations have a standard error of .003.
+    for first, second in ((numbers[1:], numbers[:-1]), (numbers[:, 1:], numbers[:, :-1])):
+        pair = torch.stack([first.flatten(), second.flatten()])
+        assert torch.corrcoef(pair)[0, 1].abs() < 0.015

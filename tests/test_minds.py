@@ -145,7 +145,8 @@ class Tracks:
             self.told[:], self.actions[:] = kinds[1], self.actions[:1].clone()
         self.path = torch.zeros(number, horizon, dtype=torch.long)
         for step in range(1, horizon):
-            self.path[:, step] = self.path[:, step - 1] * ACTIONS + self.actions[:, step - 1]
+            before, done = self.path[:, step - 1], self.actions[:, step - 1]
+            self.path[:, step] = self.futures.follow(step - 1, before, done)
 
     def looks(self, step, parent):
         if step > 0:
@@ -153,7 +154,7 @@ class Tracks:
         else:
             last = self.past.actions[-1] if self.past.time else ACTIONS
             action = torch.full_like(self.eye, int(last))
-        observation = {name: value[0] for name, value in self.futures.observations[step].items()}
+        observation = {name: value[0] for name, value in self.futures.observation(step).items()}
         return Looks(
             parent=parent,
             eye=self.eye,
@@ -183,7 +184,7 @@ class Tracks:
         return model.believe(view, observation, done)
 
     def upto(self, step):
-        return enumerate(self.futures.observations[: step + 1])
+        return enumerate(self.futures.observation(each) for each in range(step + 1))
 
 
 @pytest.fixture

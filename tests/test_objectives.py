@@ -1,5 +1,7 @@
 """What messages are worth: against a reference that goes through every course, and by hand."""
 
+from dataclasses import dataclass, replace
+
 import pytest
 import torch
 from example_person import (
@@ -29,7 +31,7 @@ from mirror_ppl.communication import (
     every_message,
 )
 from mirror_ppl.domains.base import total_reward
-from mirror_ppl.domains.driving import CARS
+from mirror_ppl.domains.driving import CARS, DrivingState
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
 
@@ -147,6 +149,13 @@ def candidates_of(past, generator, steps):
     )
 
 
+@dataclass(frozen=True)
+class Named(DrivingState):
+    """A state of the road that knows its path."""
+
+    path: torch.Tensor
+
+
 class HandSet:
     """The road as it is, with rewards set by hand: of each step ``[W, A**(h + 1)]``."""
 
@@ -154,12 +163,24 @@ class HandSet:
         self.rewards, self.draws = rewards, len(rewards[0])
 
     def futures(self, past, horizon, generator):
-        observations = SimulatorWorld(DOMAIN).futures(past, horizon, generator).observations
-        several = [
-            {name: value.expand(self.draws, *value.shape[1:]) for name, value in one.items()}
-            for one in observations
-        ]
-        return Futures(several, self.rewards)
+        now = {
+            name: value[None, None].expand(self.draws, 1, *value.shape)
+            for name, value in past.now.items()
+        }
+        path = torch.zeros(self.draws, 1, dtype=torch.long)
+        state = Named(**vars(DOMAIN.state_behind(now)), path=path)
+        return Futures(self, state, now, ACTIONS, horizon)
+
+    def observe(self, state):
+        return DOMAIN.observe(state)
+
+    def step(self, state, action, step):
+        path = state.path * ACTIONS + action
+        following = replace(DOMAIN.transition(state, action), path=path)
+        return self.rewards[step].gather(1, path), following
+
+    def value(self, state):
+        return 100.0 + state.path.float()
 
 
 @pytest.mark.parametrize(
@@ -287,6 +308,66 @@ def test_at_branch_one_each_draw_follows_a_single_course():
     followed = value(plan(None)[None]).utility[0]
     torch.testing.assert_close(followed, followed.round(), rtol=0, atol=1e-5)
     assert set(followed.round().long().tolist()) == {0, 1, 2, 3}
+
+
+def test_what_could_be_gained_beyond_the_steps_looked_at_counts_if_asked_for():
+    """Of courses that end at path 0 to 3 with 100 more than that to gain: the mean of all."""
+    rewards = [torch.zeros(1, 2), torch.zeros(1, 4)]
+    past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
+    someone = person(3, consistency=0.0)
+
+    def worth(beyond, steps_left, discount=1.0, branch=0):
+        objective = ExpectedUtility(HandSet(rewards), 2, discount, branch, beyond)
+        value = objective.at(Standing.of(someone, past), steps_left, 0)
+        return value(torch.stack([plan(None), plan(flags(verbal=["front-left"]))])).utility
+
+    cost = torch.tensor([[0.0], [0.03]])
+    for discount in (1.0, 0.9):
+        expected = discount**2 * 101.5 - cost
+        torch.testing.assert_close(worth(True, 15, discount), expected.expand(2, 3))
+    assert torch.equal(worth(False, 15), -cost.expand(2, 3))
+    # At the end of the round there is nothing beyond.
+    assert torch.equal(worth(True, 2), -cost.expand(2, 3))
+    # A single course each, kept by chance, ends at one of the four.
+    alone = worth(True, 15, branch=1)
+    torch.testing.assert_close(alone + cost, (alone + cost).round(), rtol=0, atol=1e-4)
+    assert (alone[0] != alone[0, 0]).any()
+
+
+def test_paths_are_worked_out_when_they_are_asked_for():
+    past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
+    futures = SimulatorWorld(DOMAIN).futures(past, 5, torch.Generator())
+    path, action = torch.tensor([0, 0, 0]), torch.tensor([1, 0, 1])
+    first = futures.follow(0, path, action)
+    assert first.tolist() == [1, 0, 1]
+    assert futures.names(1).tolist() == [0, 1]
+    later = futures.follow(1, first, torch.tensor([1, 1, 1]))
+    assert futures.names(2)[later].tolist() == [3, 1, 3]
+    more = futures.follow(1, torch.tensor([1, 0]), torch.tensor([0, 1]))
+    assert futures.names(2)[more].tolist() == [2, 1]
+    # Those that were there already are the same as before.
+    assert more[1] == later[1]
+    # What is seen and gained on a path is what happens if its actions are taken.
+    state = DOMAIN.state_behind(past.now)
+    for step, done in enumerate((1, 0)):
+        action = torch.tensor(done)
+        following = DOMAIN.transition(state, action)
+        here = [0, 1][step]
+        reward = total_reward(DOMAIN.rewards(state, action, following))
+        assert futures.rewards(step)[0, here, done] == reward
+        state = following
+    seen = DOMAIN.observe(state)
+    for name, value in futures.observation(2).items():
+        assert torch.equal(value[0, more[0]], seen[name])
+    torch.testing.assert_close(
+        futures.values(2)[0, more[0]], DOMAIN.reference_values(state, 1.0).amax(-1)
+    )
+
+
+def test_more_steps_than_can_be_named_are_refused():
+    past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
+    with pytest.raises(ValueError, match="of 2 actions at most 62 steps can be looked ahead"):
+        SimulatorWorld(DOMAIN).futures(past, 63, torch.Generator())
 
 
 def test_all_candidates_have_the_same_luck():

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.minds import Looks, Standing
-from mirror_ppl.communication.worlds import World, robot_belief
+from mirror_ppl.communication.worlds import Futures, World, robot_belief
+from mirror_ppl.distinct import uniform_of
 from mirror_ppl.errors import HumanModelError
 
 
@@ -67,12 +68,15 @@ class ExpectedUtility:
         horizon: steps H that are looked ahead.
         discount: per step.
         branch: probability of a course of actions below which it is kept by chance.
+        beyond: whether what could be gained at best after the last of these steps counts too,
+            where the round goes on.
     """
 
     world: World
     horizon: int = 10
     discount: float = 1.0
     branch: float = 0.1
+    beyond: bool = False
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
@@ -89,12 +93,9 @@ class ExpectedUtility:
         device = past.actions.device
         generator = torch.Generator(device).manual_seed(seed)
         futures = self.world.futures(past, horizon, generator)
-        number = len(person.human.domain.actions)
-        luck = [
-            torch.rand(person.number, number**step, generator=generator, device=device)
-            for step in range(horizon)
-        ]
-        channels = Channels(person.human.domain)
+        domain = person.human.domain
+        number, channels = len(domain.actions), Channels(domain)
+        goes_on = self.beyond and steps_left > horizon
         discounts = self.discount ** torch.arange(horizon, device=device)
 
         @torch.no_grad()
@@ -105,21 +106,26 @@ class ExpectedUtility:
             predicted = torch.zeros(count, horizon, number, device=device)
             for step in range(horizon):
                 observation = {
-                    name: part.flatten(0, 1) for name, part in futures.observations[step].items()
+                    name: part.flatten(0, 1) for name, part in futures.observation(step).items()
                 }
                 told = candidates[:, step] if step < candidates.shape[1] else None
                 chances = tree.act(observation, told, channels)
-                gained = futures.rewards[step].unflatten(1, (-1, number))[
-                    tree.draw_of_world(), tree.path
-                ]
+                gained = futures.rewards(step)[tree.draw_of_world(), tree.path]
                 utility.index_add_(
                     0,
                     tree.candidate * person.number + tree.draw,
                     discounts[step] * (chances * gained).sum(-1),
                 )
                 predicted[:, step].index_add_(0, tree.candidate, chances / person.number)
-                if step < horizon - 1:
-                    tree.branch(chances, luck[step], self.branch)
+                if step < horizon - 1 or goes_on:
+                    tree.branch(chances, futures, step, self.branch, seed)
+            if goes_on:
+                left = futures.values(horizon)[tree.draw_of_world(), tree.path]
+                utility.index_add_(
+                    0,
+                    tree.candidate * person.number + tree.draw,
+                    self.discount**horizon * tree.weight * left,
+                )
             steps = min(candidates.shape[1], horizon)
             cost = (channels.cost(candidates)[:, :steps] * discounts[:steps]).sum(1)
             return Valued(utility.view(count, person.number) - cost[:, None], predicted)
@@ -149,7 +155,6 @@ class _Tree:
         self.beliefs = standing.before
         self.belief = standing.own[person.eye[self.draw]]
         self.last = torch.full_like(self.draw, standing.last_action)
-        self.paths = 1
 
     def draw_of_world(self) -> Tensor:
         """Which draw of the world each course is in, ``[E]``."""
@@ -157,7 +162,8 @@ class _Tree:
 
     def act(self, observation, told: Tensor | None, channels: Channels) -> Tensor:
         """Look at the world and choose: weights ``[E, A]`` of each course and its next action."""
-        row = self.draw_of_world() * self.paths + self.path
+        paths = len(observation["ego"]) // self.worlds
+        row = self.draw_of_world() * paths + self.path
         eye = self.person.eye[self.draw]
         message = self.candidate if told is not None else torch.zeros_like(self.candidate)
         key = (self.belief * self.person.eye_count + eye) * (int(row.max()) + 1) + row
@@ -192,13 +198,17 @@ class _Tree:
         log_chances = self.person.act(courses[padded], values[padded])[self.draw, place]
         return self.weight[:, None] * log_chances.exp()
 
-    def branch(self, chances: Tensor, luck: Tensor, threshold: float) -> None:
+    def branch(
+        self, chances: Tensor, futures: Futures, step: int, threshold: float, seed: int
+    ) -> None:
         """Go on to the courses of one action more.
 
         Args:
             chances: their weights ``[E, A]``.
-            luck: uniform numbers ``[S, paths]``.
+            futures: what they lead to.
+            step: how many actions the courses have.
             threshold: see :class:`ExpectedUtility`.
+            seed: of what is left to chance, which is the same for all candidates.
         """
         weight = chances
         if threshold > 0:
@@ -206,17 +216,18 @@ class _Tree:
             # Systematic: the improbable siblings share one number, so that exactly as many are
             # kept as their weights ask for, give or take a fraction.
             total = torch.where(small, chances, 0.0).cumsum(-1) / threshold
-            shifted = total + luck[self.draw, self.path][:, None]
+            place = torch.full_like(self.draw, step)
+            luck = uniform_of(seed, place, self.draw, futures.names(step)[self.path])
+            shifted = total + luck[:, None]
             passed = shifted.floor()
             before = torch.cat([torch.zeros_like(passed[:, :1]), passed[:, :-1]], -1)
             weight = torch.where(small, threshold * (passed - before), chances)
         course, action = (weight > 0).nonzero(as_tuple=True)
         self.weight = weight[course, action]
-        self.path = self.path[course] * self.actions + action
+        self.path = futures.follow(step, self.path[course], action)
         self.last = action
         self.candidate, self.draw = self.candidate[course], self.draw[course]
         self.belief = self.belief[course]
-        self.paths *= self.actions
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
-"""Futures of the world under every course of actions, whoever takes them.
+"""Futures of the world under courses of actions, whoever takes them.
 
 What a person is told changes what they do and nothing else, so the world is rolled out once for
-all candidate messages: one future for each sequence of actions. A *path* is the number of such a
-sequence: path ``p`` followed by action ``a`` is path ``p * A + a``, and the empty path is 0.
+all candidate messages: one future for each sequence of actions that somebody might take. A *path*
+is such a sequence; paths are worked out when they are first asked for. The *name* of a path is a
+number: that of path ``p`` followed by action ``a`` is ``p * A + a``, and of the empty path 0.
 
 There are two worlds. `SelfModelWorld` is what the robot has learned; `SimulatorWorld` is the
 domain itself, where it is at hand. W stands for draws of the world.
@@ -10,6 +11,7 @@ domain itself, where it is at hand. W stands for draws of the world.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,22 +19,151 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains.base import Domain, Observation, total_reward
+from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
 
+NAMES = 2**62
+"""How many paths can have names."""
 
-@dataclass(frozen=True)
+
+class Roll(Protocol):
+    """How states ``[W, n]``, any dataclass of tensors, go on."""
+
+    def observe(self, state: Any) -> Observation:
+        """What there is to observe, ``[W, n, ...]``."""
+        ...
+
+    def step(self, state: Any, action: Tensor, step: int) -> tuple[Tensor, Any]:
+        """Rewards ``[W, n]`` of actions ``[W, n]`` at a step, and the states that follow."""
+        ...
+
+    def value(self, state: Any) -> Tensor:
+        """What can still be gained from there, at best, ``[W, n]``."""
+        ...
+
+
+@dataclass
+class _Paths:
+    """Paths of as many actions, in the order in which they were asked for.
+
+    Attributes:
+        state: where they lead to ``[W, n]``.
+        name: of each, ``[n]``.
+        observation: there, ``[W, n, ...]``.
+        reward: of each action from there ``[W, m A]``, of the first m of them.
+        following: the states that follow ``[W, m A]``.
+        child: the path at the next step, or -1 if it was not asked for, ``[m A]``.
+    """
+
+    state: Any
+    name: Tensor
+    observation: Observation
+    reward: Tensor | None = None
+    following: Any = None
+    child: Tensor | None = None
+
+
 class Futures:
     """What there will be to observe and to gain.
 
-    Attributes:
-        observations: at step h = 0 .. H - 1, of each path of h actions, ``[W, A**h, ...]``.
-        rewards: of the last action of each path of h + 1 actions, ``[W, A**(h + 1)]``.
+    Args:
+        roll: how states go on.
+        state: now, ``[W, 1]``.
+        now: what there is to observe now, ``[W, 1, ...]``.
+        actions: how many actions there are, A.
+        horizon: how many steps may be asked for.
+
+    Raises:
+        ValueError: there are more paths than can have names.
     """
 
-    observations: list[Observation]
-    rewards: list[Tensor]
+    def __init__(self, roll: Roll, state: Any, now: Observation, actions: int, horizon: int):
+        if actions**horizon > NAMES:
+            raise ValueError(
+                f"of {actions} actions at most {int(62 / math.log2(actions))} steps can be looked "
+                f"ahead, not {horizon}"
+            )
+        self.roll, self.actions = roll, actions
+        root = torch.zeros(1, dtype=torch.long, device=now["ego"].device)
+        self._steps = [_Paths(state, root, now)]
+
+    def observation(self, step: int) -> Observation:
+        """Of each path of so many actions, ``[W, n, ...]``."""
+        return self._steps[step].observation
+
+    def names(self, step: int) -> Tensor:
+        """Of each path of so many actions, ``[n]``."""
+        return self._steps[step].name
+
+    def rewards(self, step: int) -> Tensor:
+        """Of each action after each path of so many actions, ``[W, n, A]``."""
+        reward = self._opened(step).reward
+        assert reward is not None
+        return reward.unflatten(1, (-1, self.actions))
+
+    def values(self, step: int) -> Tensor:
+        """What can still be gained after each path of so many actions, at best, ``[W, n]``."""
+        return self.roll.value(self._steps[step].state)
+
+    def follow(self, step: int, path: Tensor, action: Tensor) -> Tensor:
+        """Which paths of one action more these are, ``[E]``; those that are new are worked out.
+
+        Args:
+            step: how many actions the paths have.
+            path: ``[E]``.
+            action: that follows each, ``[E]``.
+        """
+        here = self._opened(step)
+        assert here.child is not None
+        branch = path * self.actions + action
+        new = torch.unique(branch)
+        new = new[here.child[new] < 0]
+        if len(new):
+            state = map_state(lambda part: part[:, new], here.following)
+            name = here.name[new // self.actions] * self.actions + new % self.actions
+            found = _Paths(state, name, self.roll.observe(state))
+            known = 0
+            if step + 1 < len(self._steps):
+                there = self._steps[step + 1]
+                known = len(there.name)
+                there.state = _joined(there.state, state)
+                there.name = torch.cat([there.name, name])
+                there.observation = {
+                    key: torch.cat([value, found.observation[key]], 1)
+                    for key, value in there.observation.items()
+                }
+            else:
+                self._steps.append(found)
+            here.child[new] = known + torch.arange(len(new), device=new.device)
+        return here.child[branch]
+
+    def _opened(self, step: int) -> _Paths:
+        """The paths of so many actions, with what each action leads to."""
+        here = self._steps[step]
+        known = 0 if here.child is None else len(here.child) // self.actions
+        number = len(here.name) - known
+        if not number:
+            return here
+        path = torch.arange(known, len(here.name), device=here.name.device)
+        before = map_state(lambda part: part[:, path.repeat_interleave(self.actions)], here.state)
+        action = torch.arange(self.actions, device=path.device).repeat(number)
+        draws = here.observation["ego"].shape[0]
+        reward, following = self.roll.step(before, action.expand(draws, -1), step)
+        unknown = torch.full((number * self.actions,), -1, device=path.device)
+        if here.child is None:
+            here.reward, here.following, here.child = reward, following, unknown
+        else:
+            assert here.reward is not None
+            here.reward = torch.cat([here.reward, reward], 1)
+            here.following = _joined(here.following, following)
+            here.child = torch.cat([here.child, unknown])
+        return here
+
+
+def _joined(first: Any, second: Any) -> Any:
+    """States ``[W, n]`` and ``[W, m]`` as ``[W, n + m]``."""
+    return map_state(lambda *parts: torch.cat(parts, 1), first, second)
 
 
 class World(Protocol):
@@ -59,18 +190,22 @@ class SimulatorWorld:
 
     def futures(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> Futures:
         """See :class:`World`; the generator is not used."""
-        domain, number = self.domain, len(self.domain.actions)
         now = {name: value[None, None] for name, value in past.now.items()}
-        state = domain.state_behind(now)
-        observations, rewards = [now], []
-        for step in range(horizon):
-            parent, action = _children(number**step, number, past.actions.device)
-            before, action = _select(state, parent), action[None]
-            state = domain.transition(before, action)
-            rewards.append(total_reward(domain.rewards(before, action, state)))
-            if step < horizon - 1:
-                observations.append(domain.observe(state))
-        return Futures(observations, rewards)
+        state = self.domain.state_behind(now)
+        return Futures(self, state, now, len(self.domain.actions), horizon)
+
+    def observe(self, state: Any) -> Observation:
+        """See :class:`Roll`."""
+        return self.domain.observe(state)
+
+    def step(self, state: Any, action: Tensor, step: int) -> tuple[Tensor, Any]:
+        """See :class:`Roll`."""
+        following = self.domain.transition(state, action)
+        return total_reward(self.domain.rewards(state, action, following)), following
+
+    def value(self, state: Any) -> Tensor:
+        """The exact value of the best action, see :class:`Roll`; without discount."""
+        return self.domain.reference_values(state, 1.0).amax(-1)
 
 
 class SelfModelWorld:
@@ -93,30 +228,47 @@ class SelfModelWorld:
 
     def futures(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> Futures:
         """See :class:`World`."""
-        model, number = self.self_model, len(self.self_model.domain.actions)
-        latent = self._drawn(robot_belief(model, past), (self.draws, 1), generator)
-        observations = [
-            {
-                name: value[None, None].expand(self.draws, 1, *value.shape)
-                for name, value in past.now.items()
-            }
-        ]
-        rewards = []
-        for step in range(horizon):
-            parent, action = _children(number**step, number, past.actions.device)
-            before, action = latent[:, parent], action.expand(self.draws, -1)
-            rewards.append(model.reward(before, action).mean)
-            if step < horizon - 1:
-                latent = self._drawn(model.transition(before, action), (), generator)
-                observations.append(model.domain.nearest(model.decode(latent)))
-        return Futures(observations, rewards)
+        model = self.self_model
+        device = past.actions.device
+        shape = (self.draws, 1, model.latent)
+        belief = robot_belief(model, past)
+        noise = torch.zeros(horizon + 1, *shape, device=device, dtype=belief.mean.dtype)
+        if self.draws > 1:
+            noise.normal_(generator=generator)
+        state = _Latent((belief.mean + belief.scale * noise[0]).expand(shape))
+        now = {
+            name: value[None, None].expand(self.draws, 1, *value.shape)
+            for name, value in past.now.items()
+        }
+        roll = _LearnedRoll(model, noise[1:])
+        return Futures(roll, state, now, len(model.domain.actions), horizon)
 
-    def _drawn(self, state: Gaussian, batch: tuple[int, ...], generator: torch.Generator) -> Tensor:
-        mean = state.mean.expand(*batch, *state.mean.shape)
-        if self.draws == 1:
-            return mean
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-        return mean + state.scale * noise
+
+@dataclass(frozen=True)
+class _Latent:
+    """States ``[W, n, Z]`` of a self-model."""
+
+    z: Tensor
+
+
+@dataclass(frozen=True)
+class _LearnedRoll:
+    """How a self-model's states go on; the noise ``[H, W, 1, Z]`` is the same on all paths."""
+
+    self_model: SelfModel
+    noise: Tensor
+
+    def observe(self, state: _Latent) -> Observation:
+        model = self.self_model
+        return model.domain.nearest(model.decode(state.z))
+
+    def step(self, state: _Latent, action: Tensor, step: int) -> tuple[Tensor, _Latent]:
+        following = self.self_model.transition(state.z, action)
+        reward = self.self_model.reward(state.z, action).mean
+        return reward, _Latent(following.mean + following.scale * self.noise[step])
+
+    def value(self, state: _Latent) -> Tensor:
+        return self.self_model.action_values(state.z).amax(-1)
 
 
 def robot_belief(self_model: SelfModel, past: RoundSoFar) -> Gaussian:
@@ -131,14 +283,3 @@ def robot_belief(self_model: SelfModel, past: RoundSoFar) -> Gaussian:
     if past.time > 0:
         before = self_model.believe(evidence[:-1])[-1]
     return encoder(before, evidence[-1])
-
-
-def _children(paths: int, actions: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Parent path and last action of every path of one action more, ``[paths * A]`` each."""
-    child = torch.arange(paths * actions, device=device)
-    return child // actions, child % actions
-
-
-def _select(state: Any, paths: Tensor) -> Any:
-    """The states ``[W, len(paths)]`` of some paths."""
-    return type(state)(**{name: value[:, paths] for name, value in vars(state).items()})
