@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mirror_ppl import fit
 from mirror_ppl.communication import RoundSoFar
-from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
+from mirror_ppl.evaluation.assistance import PlannerOptions, Truth, play, speaker
 from mirror_ppl.evaluation.assistance_cells import Pairing
 from mirror_ppl.evaluation.oracle import Oracle
 from mirror_ppl.inference.experience import map_state
@@ -78,10 +78,10 @@ def lost(pairing: Pairing, number: int) -> Tensor:
     say = speaker("mirror", listener, pairing.planner, pairing.seed + number)
     flags, actions = [], None
 
-    def noted(rounds: Sequence[RoundSoFar]):
+    def noted(rounds: Sequence[RoundSoFar], truth: Truth):
         nonlocal actions
         actions = torch.stack([past.actions for past in rounds])
-        chosen, decisions = say(rounds)
+        chosen, decisions = say(rounds, truth)
         flags.append(chosen)
         return chosen, decisions
 

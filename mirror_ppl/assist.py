@@ -31,8 +31,8 @@ class Options:
 
     posterior: Path = Path("runs/demo/posterior.nc")
     """A posterior of simulated people, from python -m mirror_ppl.fit (or make demo)."""
-    domain: str = "driving"
-    """The world that the posterior has to be of: driving."""
+    domain: str | None = None
+    """The world that the posterior has to be of; that of the posterior unless given."""
     setting: str | None = None
     """The setting that the posterior has to be of; that of the posterior unless given."""
     communicator: tuple[str, ...] = ()
@@ -44,8 +44,8 @@ class Options:
     """How many of the people, from the first on; all unless given."""
     draws: int = 64
     """Posterior draws that are planned with."""
-    horizon: int = 10
-    """Steps that planners look ahead."""
+    horizon: int | None = None
+    """Steps that planners look ahead; 10 in driving and 16 in search_rescue unless given."""
     discount: float = 1.0
     """Worth of a reward one step later, from above 0 to 1."""
     sure: float = 2.0
@@ -123,14 +123,15 @@ def main(options: Options) -> None:
         raise PosteriorError(
             f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
         )
-    planner = PlannerOptions(
-        options.horizon,
-        options.discount,
-        options.branch,
-        options.patience,
-        options.sure,
-        options.kl_weight,
-        options.kl_measure,
+    planner = PlannerOptions.of(
+        posterior.attributes["domain"],
+        horizon=options.horizon,
+        discount=options.discount,
+        branch=options.branch,
+        patience=options.patience,
+        sure=options.sure,
+        kl_weight=options.kl_weight,
+        kl_measure=options.kl_measure,
     )
     pairing = Pairing(
         posterior=options.posterior,
@@ -215,12 +216,15 @@ def _people(options: Options):
     """The posterior, and what its people were simulated with."""
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.inference.posterior_file import load_posterior
-    from mirror_ppl.people import POPULATIONS
+    from mirror_ppl.people import PEOPLE
 
-    settings = get_domain(options.domain).settings
+    if options.domain is not None:
+        get_domain(options.domain)
+    posterior = load_posterior(options.posterior, options.domain)
+    domain = posterior.attributes["domain"]
+    settings = get_domain(domain).settings
     if options.setting is not None:
         require_known(options.setting, "setting", settings)
-    posterior = load_posterior(options.posterior, options.domain)
     own = posterior.attributes.get("setting", "unknown")
     if options.setting not in (None, own):
         raise PosteriorError(
@@ -248,7 +252,7 @@ def _people(options: Options):
         )
     if not str(source["seed"]).isdecimal():
         raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")
-    require_known(source["population"], "population", tuple(POPULATIONS))
+    require_known(source["population"], "population", PEOPLE[domain].populations)
     return posterior, source
 
 
@@ -256,6 +260,8 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
+
+    from mirror_ppl.domains import get_domain
 
     def table(title: str, caption: str, columns: list[str]) -> Table:
         made = Table(
@@ -272,7 +278,9 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
         return made
 
     first = next(iter(summary.values()))
+    domain = get_domain(attributes["domain"])
     notions = [name.split("_")[-1] for name in first["relevant"]]
+    about = [f"about {name.replace('_', ' ')}" for name in first["relevant"]]
     worth = table(
         f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
         "rewards a round; ±: standard error; [90% interval], paired; -: needs none and oracle",
@@ -280,9 +288,9 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
     )
     said = table(
         "What is communicated",
-        f"collisions a round; {', '.join(first['items'])}: items a step; {', '.join(notions)}: "
-        "share of items about cars on a collision course, about cars closing in; ms a decision",
-        ["collisions", *first["items"], *notions, "ms"],
+        f"{domain.mishap[1]} a round; {', '.join(first['items'])}: items a step; "
+        f"{', '.join(notions)}: share of items {', '.join(about)}; ms a decision",
+        [domain.mishap[1], *first["items"], *notions, "ms"],
     )
     for name, entry in summary.items():
         error = "" if entry["net_se"] is None else f" ±{entry['net_se']:.2f}"
@@ -296,7 +304,7 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
         )
         said.add_row(
             name,
-            f"{entry['collisions']:.2f}",
+            f"{entry['mishaps']:.2f}",
             *(f"{value:.2f}" for value in entry["items"].values()),
             *(
                 "-" if share["all"] is None else f"{100 * share['all']:.0f}%"

@@ -363,7 +363,7 @@ for name in ("none", "mirror", "all", "oracle"):
     nothing = played if nothing is None else nothing
     above = pd.Series(played.net - nothing.net)
     rows[name] = {
-        "collisions": sum(played.collisions) / len(above),
+        "collisions": sum(played.mishaps) / len(above),
         "items told": sum(map(sum, played.items.values())) / len(above),
         "cost": sum(played.cost) / len(above),
         "net": played.net.mean(),

@@ -67,7 +67,7 @@ class Scripted:
         self.script = script
         self.given = []
 
-    def __call__(self, rounds):
+    def __call__(self, rounds, truth):
         self.given.append(rounds)
         flags = torch.zeros(len(rounds), len(CHANNELS), dtype=torch.bool)
         flags[0] = CHANNELS.flags(self.script.get(rounds[0].time, {}))
@@ -90,7 +90,7 @@ def test_rewards_costs_and_collisions_are_those_of_the_scene(played):
     assert played.task == pytest.approx([-2 - 8 - 2, -1])
     assert played.cost == pytest.approx([0.01 * 4 + 0.03 * 1 + 0.03 * 4, 0])
     assert played.net == pytest.approx([-12.19, -1])
-    assert played.collisions == [1, 0]
+    assert played.mishaps == [1, 0]
     assert played.milliseconds >= 0
 
 
@@ -186,14 +186,16 @@ def test_all_play_the_same_rounds_with_the_same_luck():
     assert without_time(run("none", seed=1)) == without_time(silence)
     torch.manual_seed(1)  # nothing global matters
     flags = torch.zeros(20, len(CHANNELS), dtype=torch.bool)
-    assert without_time(play(listener(), lambda rounds: (flags, None))) == without_time(silence)
+    assert without_time(play(listener(), lambda rounds, truth: (flags, None))) == without_time(
+        silence
+    )
     never = {"visual": 0.0, "verbal": 0.0}
     assert without_time(run("random", never)) == without_time(silence)
     assert without_time(run("random", {"visual": 1.0, "verbal": 1.0})) == without_time(run("all"))
     # The cars' courses are nobody's doing, so everybody has the same chances to speak of them.
     for name in ("all", "nearest", "oracle"):
         assert run(name, rounds=5).chances == run("none", rounds=5).chances
-    other = play(listener(seed=1), lambda rounds: (flags, None))
+    other = play(listener(seed=1), lambda rounds, truth: (flags, None))
     assert without_time(other) != without_time(silence)
 
 
@@ -222,9 +224,9 @@ def test_nearest_says_each_car_once_and_only_hidden_ones():
     say = speaker("nearest", someone, PlannerOptions(), 0)
     rounds_at_last = []
 
-    def spy(rounds):
+    def spy(rounds, truth):
         rounds_at_last[:] = rounds
-        return say(rounds)
+        return say(rounds, truth)
 
     play(someone, spy)
     told = torch.stack([past.told["verbal"] for past in rounds_at_last])
@@ -294,7 +296,7 @@ def test_an_audit_of_silence_is_plain_data_too():
 
 def test_the_log_holds_audits_where_there_are_decisions(scene):
     one = decision(2)
-    log = play(scene, lambda rounds: (torch.stack([one.flags] * 2), [one] * 2), True).log
+    log = play(scene, lambda rounds, truth: (torch.stack([one.flags] * 2), [one] * 2), True).log
     assert len(log) == 6
     for entry in log:
         assert entry["message"] == {"visual": [], "verbal": ["front-left"]}

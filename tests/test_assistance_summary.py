@@ -19,7 +19,7 @@ def rounds_of(task, cost, items=0, relevant=0, milliseconds=1.0):
     return Played(
         task=task,
         cost=cost,
-        collisions=[1] + [0] * (number - 1),
+        mishaps=[1] + [0] * (number - 1),
         items={"visual": nothing, "verbal": spoken},
         relevant={"course": {"visual": nothing, "verbal": right}},
         chances={"visual": 10, "verbal": 10},
@@ -42,7 +42,7 @@ def test_means_are_those_of_rounds():
     entry = summarize_assistance(PLAYED, 5)["some"]
     assert (entry["task"], entry["cost"], entry["net"]) == (2.5, 0.25, 2.25)
     assert entry["net_by_person"] == [2.5, 2.0]
-    assert entry["collisions"] == 2 / 8
+    assert entry["mishaps"] == 2 / 8
     assert entry["items"] == {"visual": 0.0, "verbal": pytest.approx(8 / (8 * 5))}
     assert entry["relevant"] == {"course": {"all": 4 / 8, "visual": None, "verbal": 4 / 8}}
     assert entry["milliseconds"] == 3.0

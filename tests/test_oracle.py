@@ -223,7 +223,7 @@ def test_the_value_is_what_played_rounds_are_worth_on_average(generator):
         return oracle.messages(torch.stack([past.actions for past in rounds])), None
 
     # The same six rounds fifty times at once: the oracle is asked for six at a time.
-    def say_all(rounds):
+    def say_all(rounds, _):
         parts = [say(rounds[first : first + 6])[0] for first in range(0, len(rounds), 6)]
         return torch.cat(parts), None
 

@@ -421,7 +421,7 @@ def test_the_entropy_is_the_expected_surprise(fog, seed):
     recording = record(drivers, draw_starts(10, 60, seed, "a test of entropies"))
     log = recording.probabilities.clamp(min=1e-30).log()
     surprise = -log.gather(-1, recording.actions[..., None])[..., 0]
-    difference = surprise - recording.action_entropy
+    difference = surprise - torch.special.entr(recording.probabilities).sum(-1)
     spread = (log - log.flip(-1)).abs()[..., 0] * recording.probabilities.prod(-1).sqrt()
     assert abs(difference.sum()) < 4 * spread.square().sum().sqrt()
 

@@ -255,8 +255,9 @@ class Communicator:
         now = past.now
         allowed = channels.join(domain.communicable(now))
         steps_left = domain.horizon - past.time
-        if steps_left < 1 or not allowed.any():
-            return self._silence(now, allowed, steps_left < 1)
+        over = steps_left < 1 or bool(domain.over(domain.state_behind(now)))
+        if over or not allowed.any():
+            return self._silence(now, allowed, over)
         standing = Standing.of(self.person, past)
         allowed = standing.telling(allowed)
         if not allowed.any():

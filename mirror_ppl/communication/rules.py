@@ -26,23 +26,32 @@ def nearest(domain: Domain, past: RoundSoFar, setting: str) -> Tensor:
     """A sensible rule by hand, flags ``[N]``: the nearest thing that the setting hides.
 
     One thing a step, and each only once; nothing that is farther away than half the range of
-    sight. It is said where it can be said, which tells more, and else shown.
+    sight, and nothing that everybody knows. It is said where that can be done and tells more, and
+    else shown.
     """
     channels = Channels(domain)
     flags = torch.zeros(len(channels), dtype=torch.bool)
     now = past.now
     _, distance = domain.distance(now)
-    hidden = ~domain.visibility(setting, now)["visual"]
-    for mask in past.told.values():
-        hidden &= ~mask.any(0)
     allowed = domain.communicable(now)
-    may = torch.stack(list(allowed.values())).any(0)
+    known = domain.known(domain.nothing_known(device=distance.device))["visual"]
+    hidden = ~domain.visibility(setting, now)["visual"] & ~known
+    may_say = torch.zeros_like(hidden)
+    told = past.told["visual"].any(0)
+    for item, spoken in enumerate(domain.counterparts):
+        if spoken is not None:
+            may_say[item] = allowed["verbal"][spoken]
+            told[item] |= past.told["verbal"][:, spoken].any()
+    may = (allowed["visual"] | may_say) & ~told
     candidates = hidden & may & (distance <= domain.reach_bins[-1] / 2)
     if candidates.any():
         item = int(torch.where(candidates, distance, torch.inf).argmin())
-        name = "verbal" if allowed["verbal"][item] else "visual"
-        masks = channels.split(flags)
-        masks[name][item] = True  # a view into the flags
+        masks = channels.split(flags)  # views into the flags
+        spoken = domain.counterparts[item]
+        if spoken is not None and may_say[item]:
+            masks["verbal"][spoken] = True
+        else:
+            masks["visual"][item] = True
     return flags
 
 

@@ -102,6 +102,9 @@ class Domain(Protocol):
     they saw or were told in a round so far. ``over_at_horizon`` says that nothing is left to win or
     lose when a round ends; where it does not, the end is only where recording stops.
     ``partial_views`` are reaches in each direction by name, in which self-models are measured.
+    ``mishap`` is the reward term of what people should be kept from, and what several of them are
+    called. ``counterparts`` has for each visual item the verbal item that tells of the same, where
+    that tells more of it.
     """
 
     name: str
@@ -115,6 +118,8 @@ class Domain(Protocol):
     settings: tuple[str, ...]
     scenarios: tuple[str, ...]
     reward_terms: tuple[str, ...]
+    mishap: tuple[str, str]
+    counterparts: tuple[int | None, ...]
     directions: tuple[str, ...]
     direction_groups: tuple[tuple[int, ...], ...]
     reach_bins: tuple[float, ...]

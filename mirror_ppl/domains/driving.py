@@ -132,6 +132,8 @@ class Driving:
     settings: tuple[str, ...] = ("clear", "fog")
     scenarios: tuple[str, ...] = tuple(SCENARIO_SPEEDS)
     reward_terms: tuple[str, ...] = ("proximity", "collision", "off_road", "lane_change")
+    mishap: tuple[str, str] = ("collision", "collisions")
+    counterparts: tuple[int | None, ...] = (0, 1, 2, 3)
     directions: tuple[str, ...] = ("front_own", "front_other", "back_own", "back_other")
     direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
     """Directions in which most people see equally far: both lanes ahead, both behind."""

@@ -158,6 +158,8 @@ class SearchRescue:
         for room in ROOMS
     )
     reward_terms: tuple[str, ...] = ("found", "returned", "collision", "time")
+    mishap: tuple[str, str] = ("collision", "collisions")
+    counterparts: tuple[int | None, ...] = (None,) * len(PORTIONS)
     directions: tuple[str, ...] = ("radius",)
     direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
     reach_bins: tuple[float, ...] = reach_distances()

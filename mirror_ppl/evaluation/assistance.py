@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from time import perf_counter
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -26,6 +26,8 @@ from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld
 from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.oracle import Oracle
+from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
+from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.driving import Drivers
 from mirror_ppl.people.populations import derived_generator
 from mirror_ppl.people.recordings import Start
@@ -55,6 +57,7 @@ class PlannerOptions:
         branch: see :class:`ExpectedUtility`.
         patience: length of the plans that are compared, see :class:`Automatic`.
         sure: standard errors that a gain must exceed, see :class:`Communicator`.
+        beyond: see :class:`ExpectedUtility`.
         kl_weight: units of reward that mirror-kl gives for a nat.
         kl_measure: what mirror-kl measures, see :class:`Divergence`.
     """
@@ -66,6 +69,17 @@ class PlannerOptions:
     sure: float = 2.0
     kl_weight: float = 1.0
     kl_measure: str = "kl"
+    beyond: bool = False
+
+    @classmethod
+    def of(cls, domain: str, **changes: Any) -> Self:
+        """The settings for a domain, with changes; None leaves what is set for the domain."""
+        given = {name: value for name, value in changes.items() if value is not None}
+        return cls(**(BY_DOMAIN.get(domain, {}) | given))
+
+
+BY_DOMAIN: dict[str, dict[str, Any]] = {"search_rescue": {"horizon": 16, "beyond": True}}
+"""Settings of planners that differ by domain."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +89,7 @@ class Played:
     Attributes:
         task: reward of the task, ``[R]``.
         cost: of the messages, ``[R]``.
-        collisions: steps with a collision, ``[R]``.
+        mishaps: steps in which went wrong what the domain calls a mishap, ``[R]``.
         items: communicated items by modality, ``[R]`` each.
         relevant: those of them that were relevant, by notion of relevance and modality, ``[R]``.
         chances: items that could have been communicated, by modality, summed over rounds.
@@ -85,7 +99,7 @@ class Played:
 
     task: list[float]
     cost: list[float]
-    collisions: list[int]
+    mishaps: list[int]
     items: dict[str, list[int]]
     relevant: dict[str, dict[str, list[int]]]
     chances: dict[str, int]
@@ -102,7 +116,22 @@ class Played:
         return {name: sum(items) / max(self.chances[name], 1) for name, items in self.items.items()}
 
 
-Say = Callable[[Sequence[RoundSoFar]], tuple[Tensor, list[Decision] | None]]
+@dataclass(frozen=True)
+class Truth:
+    """What only an oracle knows.
+
+    Attributes:
+        step: the number of the step.
+        state: of the world, ``[1, R]``.
+        memory: of the person, of the step before, ``[1, R]``.
+    """
+
+    step: int
+    state: Any
+    memory: Any
+
+
+Say = Callable[[Sequence[RoundSoFar], Truth], tuple[Tensor, list[Decision] | None]]
 """What to say in each of R rounds: flags ``[R, N]`` and, of planners, the decisions."""
 
 
@@ -113,14 +142,14 @@ class Listener:
     Attributes:
         domain: the world.
         setting: its setting.
-        driver: the person as they are.
+        driver: the person as they are, P = 1.
         start: how the rounds ``[1, R]`` begin, and the luck by which the person chooses.
         person: what was inferred of the person, if anything; planners need it.
     """
 
     domain: Domain
     setting: str
-    driver: Drivers
+    driver: SimulatedPeople
     start: Start
     person: Person | None = None
 
@@ -146,8 +175,7 @@ def speaker(
     """
     domain = listener.domain
     if name == "oracle":
-        oracle = Oracle(listener.driver, map_state(lambda part: part[0], listener.start.state))
-        return lambda rounds: (oracle.messages(torch.stack([r.actions for r in rounds])), None)
+        return _oracle(listener)
     if name in ("none", "all", "nearest", "random"):
         generator = derived_generator(seed, "random messages")
         rule = {
@@ -156,17 +184,28 @@ def speaker(
             "nearest": lambda past: rules.nearest(domain, past, listener.setting),
             "random": lambda past: rules.at_random(domain, past, rates or {}, generator),
         }[name]
-        return lambda rounds: (torch.stack([rule(past) for past in rounds]), None)
+        return lambda rounds, _: (torch.stack([rule(past) for past in rounds]), None)
     if name not in COMMUNICATORS:
         raise UnknownNameError.of("communicator", name, COMMUNICATORS)
     assert listener.person is not None
     planner = planner_of(name, listener.person, options, seed)
 
-    def say(rounds: Sequence[RoundSoFar]) -> tuple[Tensor, list[Decision]]:
+    def say(rounds: Sequence[RoundSoFar], truth: Truth) -> tuple[Tensor, list[Decision]]:
+        del truth
         decisions = [planner.plan(past) for past in rounds]
         return torch.stack([decision.flags for decision in decisions]), decisions
 
     return say
+
+
+def _oracle(listener: Listener) -> Say:
+    """The oracle of the listener's domain."""
+    start = map_state(lambda part: part[0], listener.start.state)
+    if isinstance(listener.driver, Drivers):
+        oracle = Oracle(listener.driver, start)
+        return lambda rounds, _: (oracle.messages(torch.stack([r.actions for r in rounds])), None)
+    knows = ReachableOracle(listener.driver, start)
+    return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
 
 
 def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
@@ -177,7 +216,9 @@ def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) ->
     world = SimulatorWorld(person.human.domain)
     if name == "mirror-self-model":
         world = SelfModelWorld(person.human.self_model)
-    objective = ExpectedUtility(world, options.horizon, options.discount, options.branch)
+    objective = ExpectedUtility(
+        world, options.horizon, options.discount, options.branch, options.beyond
+    )
     return Communicator(person, objective, Automatic(options.patience), options.sure, seed)
 
 
@@ -193,10 +234,10 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
     domain, driver, start = listener.domain, listener.driver, listener.start
     channels = Channels(domain)
     number = start.luck.shape[1]
-    state, memory = start.state, driver.start(number)
+    state, memory = start.state, driver.start(number, fate=start.fate)
     rounds: list[RoundSoFar] = []
     task, cost = torch.zeros(number), torch.zeros(number)
-    collisions = torch.zeros(number, dtype=torch.long)
+    mishaps = torch.zeros(number, dtype=torch.long)
     items = {m.name: torch.zeros(number, dtype=torch.long) for m in domain.modalities}
     relevant: dict[str, dict[str, Tensor]] = {}
     chances = dict.fromkeys(items, 0)
@@ -211,20 +252,22 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
             else [RoundSoFar.begin(domain, one) for one in now]
         )
         began = perf_counter()
-        flags, decisions = say(rounds)
+        flags, decisions = say(rounds, Truth(step, state, memory))
         seconds += perf_counter() - began
+        under_way = ~domain.over(state)[0]
+        flags = flags & under_way[:, None]
         told = channels.split(flags)
         probability, memory = driver.step(memory, observation, channels.split(flags[None]))
-        action = (start.luck[0, :, step] < probability[0, :, 1]).long()
+        action = act(probability, start.luck[..., step])[0]
         following = domain.transition(state, action[None])
         terms = domain.rewards(state, action[None], following)
         task += total_reward(terms)[0]
-        collisions += (terms["collision"][0] < 0).long()
+        mishaps += (terms[domain.mishap[0]][0] < 0).long()
         cost += channels.cost(flags)
         may = domain.communicable(observation)
         for name, mask in told.items():
             items[name] += mask.sum(-1)
-            chances[name] += int(may[name].sum())
+            chances[name] += int(may[name][0, under_way].sum())
         for notion, masks in domain.relevance(observation).items():
             counts = relevant.setdefault(
                 notion, {name: torch.zeros_like(count) for name, count in items.items()}
@@ -236,12 +279,13 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
                 _entry(domain, channels, flags[r], r, step, int(action[r]), probability[0, r])
                 | ({} if decisions is None else audit(decisions[r]))
                 for r in range(number)
+                if under_way[r]
             ]
         state = following
     return Played(
         task.tolist(),
         cost.tolist(),
-        collisions.tolist(),
+        mishaps.tolist(),
         {name: count.tolist() for name, count in items.items()},
         {
             notion: {name: count.tolist() for name, count in counts.items()}

@@ -21,7 +21,6 @@ import torch
 from mirror_ppl import __version__
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.domains import Domain, get_domain
-from mirror_ppl.domains.base import map_state
 from mirror_ppl.evaluation.assistance import (
     COMMUNICATORS,
     RATES_FROM,
@@ -37,7 +36,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import Start, draw_starts, simulated_drivers
+from mirror_ppl.people import draw_starts, simulated_people
 
 
 @dataclass(frozen=True)
@@ -96,19 +95,26 @@ class Pairing:
 
     def listener(self, number: int, inferred: bool = True) -> Listener:
         """The person of that number, with their rounds, and what was inferred of them."""
-        driver = simulated_drivers(
-            self.setting, self.population, self.people, self.people_seed
+        domain = self.domain
+        driver = simulated_people(
+            domain.name, self.setting, self.population, self.people, self.people_seed
         ).select([number])
-        starts = draw_starts(self.people, self.rounds, self.seed, "assist", self.setting)
-        own = slice(number, number + 1)
-        start = Start(
-            map_state(lambda part: part[own], starts.state), starts.scenario[own], starts.luck[own]
+        starts = draw_starts(
+            self.people,
+            self.rounds,
+            self.seed,
+            "assist",
+            self.setting,
+            domain=domain,
+            fates=driver.fates,
         )
+        own = slice(number, number + 1)
+        start = starts.select(own)
         person = None
         if inferred:
             draws = self.file.draws(self.human, self.draws)
             person = Person(self.human, {site: value[:, own] for site, value in draws.items()})
-        return Listener(self.domain, self.setting, driver, start, person)
+        return Listener(domain, self.setting, driver, start, person)
 
     def play(self, number: int, name: str, rates: dict[str, float] | None) -> Played:
         """Rounds of the person of that number with one communicator."""

@@ -24,7 +24,7 @@ def summarize_assistance(
         seed: of the bootstrap.
 
     Returns:
-        By name: means a round of ``task``, ``cost``, ``net`` and ``collisions``; ``net_se``, the
+        By name: means a round of ``task``, ``cost``, ``net`` and ``mishaps``; ``net_se``, the
         standard error of ``net`` given these people (rounds are the sample); by modality ``items``
         a step; ``relevant``, the share of relevant items by notion, over all items and by modality
         (``None`` where none were communicated); ``milliseconds`` a decision; ``over_none`` and
@@ -48,7 +48,7 @@ def summarize_assistance(
             if rounds > 1
             else None,
             "net_by_person": net[name].mean(1).tolist(),
-            "collisions": _mean(parts, "collisions"),
+            "mishaps": _mean(parts, "mishaps"),
             "items": {
                 modality: float(np.mean([part.items[modality] for part in parts])) / horizon
                 for modality in parts[0].items

@@ -6,9 +6,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
 
+import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,32 @@ class SimulatedPeople(ABC):
         Returns:
             Probabilities of the actions ``[P, ..., A]`` and the memory at this step.
         """
+
+    def branches(
+        self, memory: Any, observation: Observation, told: Visibility
+    ) -> tuple[Tensor, Any, Tensor]:
+        """Everything that a step can lead to in their minds, where that is chance.
+
+        Args:
+            memory: as for `step`.
+            observation: as for `step`.
+            told: as for `step`.
+
+        Returns:
+            Chances ``[P, ..., G]`` of G minds, these ``[P, ..., G, ...]``, and probabilities of the
+            actions of each ``[P, ..., G, A]``.
+        """
+        probability, after = self.step(memory, observation, told)
+        dimensions = probability.dim() - 1
+        return (
+            torch.ones_like(probability[..., :1]),
+            map_state(lambda part: part.unsqueeze(dimensions), after),
+            probability[..., None, :],
+        )
+
+    def kept(self, memory: Any) -> Any:
+        """Of a memory what is known and wanted, without the numbers that decide what is chance."""
+        return memory
 
     @abstractmethod
     def truth(self) -> dict[str, Tensor]:

@@ -23,7 +23,7 @@ Choices that the supplement leaves open, with their reasons, are in ``docs/peopl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar
 
@@ -124,6 +124,31 @@ class Firefighters(SimulatedPeople):
         steps = self._steps(knowledge, observation)
         probability = steps.take_along_dim(goal[..., None, None], -2).squeeze(-2)
         return probability, Mind(knowledge.corridors, knowledge.rooms, goal, memory.fate)
+
+    def branches(
+        self, memory: Mind, observation: Observation, told: Visibility
+    ) -> tuple[Tensor, Mind, Tensor]:
+        """Each subgoal ``G`` = 6 that they may have next; see `SimulatedPeople.branches`."""
+        knowledge = self._learn(memory, observation, told)
+        chance = self._next(possible_subgoals(knowledge, observation))
+        chance = chance.take_along_dim(memory.goal[..., None, None], -2).squeeze(-2)
+        every = torch.arange(len(SUBGOALS), device=chance.device)
+
+        def of_each(part: Tensor, behind: int) -> Tensor:
+            part = part.unsqueeze(-1 - behind)
+            return part.expand(*chance.shape, *part.shape[chance.dim() :])
+
+        minds = Mind(
+            of_each(knowledge.corridors, 1),
+            of_each(knowledge.rooms, 1),
+            every.expand(chance.shape),
+            of_each(memory.fate, 2),
+        )
+        return chance, minds, self._steps(knowledge, observation)
+
+    def kept(self, memory: Mind) -> Mind:
+        """What they know, and their subgoal."""
+        return replace(memory, fate=memory.fate[..., :0, :0])
 
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor
