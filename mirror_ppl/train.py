@@ -16,7 +16,7 @@ exact planner; it takes about ten minutes. A guide learns from people who are dr
 model's prior; it takes about half an hour. A run that is stopped goes on when the same command is
 given again."""
 SELF_MODEL, GUIDE = "self-model", "guide"
-OF_SELF_MODEL = ("phases", "steps", "learning_rate", "device")
+OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "device")
 OF_GUIDE = ("people", "human_model", "self_model")
 
 
@@ -28,15 +28,22 @@ class Options:
     """What to train: self-model or guide."""
     out: Path | None = None
     """The weights file to write; its card can be read with `python -m mirror_ppl.train --card`.
-    Default: runs/driving_self_model.safetensors or runs/driving_guide.safetensors."""
+    Default: runs/driving_self_model.safetensors or runs/driving_guide.safetensors, by the name of
+    the domain."""
     domain: str = "driving"
-    """The world to learn. So far there is driving: two lanes, four cars that never yield."""
-    phases: int = 40
-    """Of a self-model: phases of driving and learning; 2 to try it out, 40 to be good."""
-    steps: int = 300
-    """Of a self-model: gradient steps of a phase."""
-    learning_rate: float = 1e-3
-    """Of a self-model: learning rate at the start; it falls to a hundredth."""
+    """The world to learn: driving (two lanes, four cars that never yield) or search_rescue (a
+    burning house, a victim, two corridors)."""
+    phases: int | None = None
+    """Of a self-model: phases of acting and learning; 2 to try it out. Default: what makes a good
+    one, of driving 40 and of search_rescue 200."""
+    steps: int | None = None
+    """Of a self-model: gradient steps of a phase. Default: of driving 300, of search_rescue 40."""
+    learning_rate: float | None = None
+    """Of a self-model: learning rate at the start; it falls to a hundredth. Default: of driving
+    0.001, of search_rescue 0.002."""
+    speech: str = "words"
+    """Of a self-model: what makes numbers of utterances, words or gpt2 (the supplement's; needs the
+    extra "speech" and its weights)."""
     people: int = 1000
     """Of a guide: people to learn from, simulated in the true domain."""
     human_model: str | None = None
@@ -62,12 +69,11 @@ class Options:
             if getattr(self, name) != defaults[name]:
                 raise OptionError(f"--{name.replace('_', '-')} is for --what {other}")
         for name in ("phases", "steps"):
-            if (number := getattr(self, name)) < 1:
+            if (number := getattr(self, name)) is not None and number < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")
-        if not (self.learning_rate > 0 and isfinite(self.learning_rate)):
-            raise OptionError(
-                f"--learning-rate must be a positive number, not {self.learning_rate}"
-            )
+        rate = self.learning_rate
+        if rate is not None and not (rate > 0 and isfinite(rate)):
+            raise OptionError(f"--learning-rate must be a positive number, not {rate}")
 
 
 def main(options: Options) -> None:
@@ -102,18 +108,28 @@ def main(options: Options) -> None:
 def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
     import torch
 
-    from mirror_ppl.domains import get_domain
+    from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.evaluation.self_model import self_model_quality
     from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
+    from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
 
-    settings = SelfModelOptions(
-        phases=options.phases, steps=options.steps, learning_rate=options.learning_rate
+    require_known(options.speech, "speech", tuple(EMBEDDINGS))
+    settings = SelfModelOptions.of(
+        options.domain,
+        phases=options.phases,
+        steps=options.steps,
+        learning_rate=options.learning_rate,
     )
     generator = torch.Generator(usable_device(options.device)).manual_seed(options.seed)
     with Progress("train", settings.phases) as progress:
         self_model = train_self_model(
-            get_domain(options.domain), settings, generator, progress.update, checkpoint
+            get_domain(options.domain),
+            settings,
+            generator,
+            progress.update,
+            checkpoint,
+            options.speech,
         )
     quality = self_model_quality(self_model, discount=settings.discount)
     card = _described(options, settings, quality, "measured on 4000 rounds")

@@ -26,6 +26,7 @@ from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.experience import Experience, drive, experience
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.speech import EMBEDDINGS
 from mirror_ppl.models.views import draw_views
 
 
@@ -93,11 +94,16 @@ class SelfModelOptions:
 
 BY_DOMAIN: dict[str, dict[str, Any]] = {
     "search_rescue": {
+        "phases": 200,
+        "rounds": 400,
+        "steps": 40,
+        "learning_rate": 2e-3,
         "beta": 1.0,
         "beta_decay": 0.98,
         "epsilon_decay": 0.9,
         "discount": 0.95,
-        "world_weight": 0.001,
+        "target_rate": 0.02,
+        "world_weight": 0.01,
         "length": 16,
         "stride": 2,
     },
@@ -166,6 +172,7 @@ def train_self_model(
     generator: torch.Generator,
     report: Callable[[int, str], None] = lambda done, message: None,
     checkpoint: Path | None = None,
+    speech: str = "words",
 ) -> SelfModel:
     """Train a self-model from nothing.
 
@@ -176,8 +183,10 @@ def train_self_model(
             because Pyro draws from the global one.
         report: called after each phase with the number of phases done and a message.
         checkpoint: file that is written after each phase and continued from if it exists.
+        speech: a name in `mirror_ppl.models.speech.EMBEDDINGS`.
 
     Raises:
+        AssetError: that embedding needs what is not there.
         CheckpointError: if the checkpoint belongs to another run (domain, options or seed) or
             cannot be read.
     """
@@ -185,7 +194,7 @@ def train_self_model(
     seed = int(torch.randint(2**31, (1,), generator=generator, device=device))
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        trainer = _Trainer(domain, options, generator, seed)
+        trainer = _Trainer(domain, options, generator, seed, speech)
         trainer.run(report, checkpoint)
     return trainer.self_model.eval()
 
@@ -194,7 +203,12 @@ class _Trainer:
     """State of a training run; everything that a checkpoint has to hold."""
 
     def __init__(
-        self, domain: Domain, options: SelfModelOptions, generator: torch.Generator, seed: int
+        self,
+        domain: Domain,
+        options: SelfModelOptions,
+        generator: torch.Generator,
+        seed: int,
+        speech: str = "words",
     ) -> None:
         self.domain = domain
         self.options = options
@@ -203,9 +217,11 @@ class _Trainer:
             "domain_version": domain.version,
             "options": asdict(options),
             "seed": seed,
+            "speech": speech,
         }
         self.generator = generator
-        self.self_model = SelfModel(domain).to(generator.device)
+        embedding = EMBEDDINGS[speech]
+        self.self_model = SelfModel(domain, embedding=embedding).to(generator.device)
         self.target = copy.deepcopy(self.self_model.q_network)
         self.optimizer = torch.optim.Adam(
             self.self_model.parameters(), options.learning_rate, fused=True

@@ -7,7 +7,6 @@ so play the rounds that are handed out. ``docs/people.md`` tells the steps.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -15,17 +14,30 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import require_known
+from mirror_ppl.domains.rescue_house import CORRIDORS, ROOMS
 from mirror_ppl.domains.rescue_knowledge import HouseKnowledge
 from mirror_ppl.domains.search_rescue import SMOKE_REACH, SearchRescue
 from mirror_ppl.people.populations import derived_generator
 from mirror_ppl.people.recordings import Recording, draw_starts, record
-from mirror_ppl.people.search_rescue import HOME, SUBGOALS, Firefighters, possible_subgoals
+from mirror_ppl.people.search_rescue import (
+    HOME,
+    SUBGOALS,
+    Firefighters,
+    known_victim,
+    possible_subgoals,
+    subgoal_distances,
+)
 
 PARTICIPANT_ROUNDS = 36
 """How many rounds a participant plays in each setting."""
+HABIT_SPREAD = 0.7
+"""Standard deviation over people and choices of how much somebody likes one, as a logarithm."""
+PATIENCE_MEDIAN, PATIENCE_SPREAD = 2.0, 0.3
+"""Median over people of the steps by which a way may be longer to be chosen e times more seldom,
+and standard deviation of its logarithm."""
 LAPSE_MEDIAN, LAPSE_SPREAD = 0.03, 0.5
 """Median over people of how often they step anywhere, and standard deviation of its logarithm."""
-PRIOR_COUNT = 0.5
+PRIOR_COUNT = 0.2
 """How often each transition counts as seen before any was."""
 LEARNING_STEPS = 200
 RADII = (SMOKE_REACH, 2.3, 3.2, 4.2, 5.7)
@@ -55,23 +67,41 @@ RESCUE_POPULATIONS: dict[str, Callable[[str, int, int], Tensor]] = {
 
 
 def participants(setting: str, people: int, seed: int) -> Firefighters:
-    """The ground truth: people with habits of their own, limited in sight by the setting alone."""
+    """The ground truth: people who like short ways, with habits, limited in sight by the setting.
+
+    How likely somebody goes on to a subgoal falls with the steps of the way by it, as far as they
+    know where it has to lead, and is more or less by habit.
+    """
+    steps = _steps_by_way()
     transitions, lapses = [], []
     for person in range(people):
         generator = derived_generator(seed, "habits", person)
-        # Exponential numbers, normalized, are a draw from a flat Dirichlet distribution.
-        habits = -torch.rand(len(SUBGOALS), len(SUBGOALS), generator=generator).log()
-        transitions.append(habits / habits.sum(-1, keepdim=True))
-        lapses.append(LAPSE_SPREAD * torch.randn((), generator=generator))
+        habit = HABIT_SPREAD * torch.randn(steps.shape[1:], generator=generator)
+        haste, lapse = torch.randn(2, generator=generator)
+        patience = PATIENCE_MEDIAN * (PATIENCE_SPREAD * haste).exp()
+        transitions.append((habit - steps / patience).softmax(-1))
+        lapses.append(LAPSE_MEDIAN * (LAPSE_SPREAD * lapse).exp())
     return Firefighters(
         radius=_by_setting(setting, people, seed),
         transitions=torch.stack(transitions),
-        lapse=(math.log(LAPSE_MEDIAN) + torch.stack(lapses)).exp(),
+        lapse=torch.stack(lapses),
     )
 
 
+def _steps_by_way() -> Tensor:
+    """Steps of the way to a subgoal and on from there, ``[4, 6, 6]``; as `transitions`."""
+    far = subgoal_distances().to(torch.get_default_dtype())
+    corridors, rooms = slice(0, len(CORRIDORS)), slice(len(CORRIDORS), HOME)
+    steps = far.repeat(1 + len(ROOMS), 1, 1)
+    onwards = far[corridors, rooms]
+    steps[0, HOME, corridors] += onwards.mean(-1)
+    steps[1:, HOME, corridors] += onwards.T
+    steps[:, rooms, corridors] += far[corridors, HOME]
+    return steps
+
+
 def learn_transitions(recordings: list[Recording]) -> Tensor:
-    """How each of P people goes on from a subgoal, ``[P, 6, 6]``, learned from what they did.
+    """How each of P people goes on from a subgoal, ``[P, 4, 6, 6]``, learned from what they did.
 
     A choice was made wherever the subgoal changed, among the subgoals that were possible then. The
     likelihood of such choices (Luce's, as of `Firefighters`) has its maximum, with a few made-up
@@ -81,36 +111,37 @@ def learn_transitions(recordings: list[Recording]) -> Tensor:
         recordings: of the same people, in whatever settings.
     """
     people = recordings[0].actions.shape[0]
-    number = len(SUBGOALS)
-    before, after, possible, who = [], [], [], []
+    number, kinds = len(SUBGOALS), 1 + len(ROOMS)
+    sources, chosen, possible = [], [], []
     for recording in recordings:
         mind = recording.memory
         first = torch.full_like(mind.goal[:, :, :1], HOME)
-        previous = torch.cat([first, mind.goal[:, :, :-1]], 2)
+        before = torch.cat([first, mind.goal[:, :, :-1]], 2)
         now = {name: value[:, :, :-1] for name, value in recording.observation.items()}
-        may = possible_subgoals(HouseKnowledge(mind.corridors, mind.rooms), now)
-        changed = (previous != mind.goal) & (may.sum(-1) > 1)
-        before.append(previous[changed])
-        after.append(mind.goal[changed])
+        knowledge = HouseKnowledge(mind.corridors, mind.rooms)
+        may = possible_subgoals(knowledge, now)
+        changed = (before != mind.goal) & (may.sum(-1) > 1)
+        who = changed.nonzero()[:, 0]
+        victim = known_victim(knowledge, now)[changed]
+        sources.append((who * kinds + victim) * number + before[changed])
+        chosen.append(mind.goal[changed])
         possible.append(may[changed])
-        who.append(changed.nonzero()[:, 0])
-    source = torch.cat(who) * number + torch.cat(before)
-    chosen, open_ = torch.cat(after), torch.cat(possible).double()
-    counts = torch.full((people * number, number), PRIOR_COUNT, dtype=torch.double)
-    counts.index_put_((source, chosen), torch.ones(len(chosen), dtype=torch.double), True)
+    source, choice, may = torch.cat(sources), torch.cat(chosen), torch.cat(possible).double()
+    counts = torch.full((people * kinds * number, number), PRIOR_COUNT, dtype=torch.double)
+    counts.index_put_((source, choice), torch.ones(len(choice), dtype=torch.double), True)
     worth = torch.full_like(counts, 1 / number)
     for _ in range(LEARNING_STEPS):
-        share = open_ / (worth[source] * open_).sum(-1, keepdim=True)
+        share = may / (worth[source] * may).sum(-1, keepdim=True)
         # Made-up choices were among all subgoals.
         told = torch.full_like(counts, PRIOR_COUNT * number).index_add(0, source, share)
         worth = counts / told
         worth = worth / worth.sum(-1, keepdim=True)
-    return worth.view(people, number, number).to(torch.get_default_dtype())
+    return worth.view(people, kinds, number, number).to(torch.get_default_dtype())
 
 
 @lru_cache(maxsize=8)
 def learned_transitions(people: int, seed: int) -> Tensor:
-    """How the participants go on ``[P, 6, 6]``, learned from their rounds in every setting."""
+    """How the participants go on ``[P, 4, 6, 6]``, learned from their rounds in every setting."""
     rounds, domain = PARTICIPANT_ROUNDS, SearchRescue()
     recordings = []
     for setting in domain.settings:

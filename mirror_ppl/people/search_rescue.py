@@ -2,19 +2,20 @@
 
 A firefighter goes from one subgoal to the next: a corridor, a room where the victim may be, the
 entrance. A subgoal is given up when it was reached, or when what is known of the house rules it
-out: a corridor that is blocked, a room that is empty. Then the next is chosen among those that are
-possible:
+out: a corridor that is blocked, a room that is empty. Who learns where the victim is thinks again,
+as if at the entrance. Then the next is chosen among those that are possible:
 
 ===================  ===========================================================================
 ``radius``           how far they see, in cells to the centre of a portion of the map
 ``k_t``              what they know at step t, of what they ever saw or were told
+``v_t``              the room of which they know that the victim is there, or none
 ``g_t``              their subgoal; ``G_t`` are those that are possible, given ``k_t``
-``transitions``      how they like to go on from a subgoal
+``transitions``      how they like to go on from a subgoal, by what they know of the victim
 ``lapse``            how often they step anywhere
 ===================  ===========================================================================
 
-``p(g_t | g_{t-1}, k_t) = transitions[g_{t-1}, g_t] / sum over G_t``, if ``g_{t-1}`` is not in
-``G_t``; else they stay with it.
+``p(g_t | g_{t-1}, k_t) = transitions[v_t, g_{t-1}, g_t] / sum over G_t``, if ``g_{t-1}`` is not in
+``G_t`` or ``v_t`` is news; else they stay with it.
 
 ``p(a_t | g_t, k_t) = (1 - lapse) * uniform over steps on a shortest way to g_t + lapse / 4``
 
@@ -71,8 +72,8 @@ class Firefighters(SimulatedPeople):
 
     Attributes:
         radius: how far each sees, in cells to the centre of a portion, ``[P]``.
-        transitions: how likely each goes on to a subgoal from another, ``[P, 6, 6]``; only the
-            ratios within a row count.
+        transitions: how likely each goes on to a subgoal from another, ``[P, 4, 6, 6]``, by the
+            room where they know that the victim is (0 none); only the ratios within a row count.
         lapse: probability ``[P]`` of a step in any direction.
     """
 
@@ -114,8 +115,7 @@ class Firefighters(SimulatedPeople):
     ) -> tuple[Tensor, Mind]:
         """Look, listen, choose where to go, and go; see `SimulatedPeople.step`."""
         knowledge = self._learn(memory, observation, told)
-        possible = possible_subgoals(knowledge, observation)
-        chance = self._next(possible)  # [P, ..., 6, 6]
+        chance = self._next(memory, knowledge, observation)
         here = memory.goal[..., None, None]
         row = chance.take_along_dim(here, -2).squeeze(-2)
         # The largest of logarithms with Gumbel noise is a draw with these probabilities.
@@ -130,7 +130,7 @@ class Firefighters(SimulatedPeople):
     ) -> tuple[Tensor, Mind, Tensor]:
         """Each subgoal ``G`` = 6 that they may have next; see `SimulatedPeople.branches`."""
         knowledge = self._learn(memory, observation, told)
-        chance = self._next(possible_subgoals(knowledge, observation))
+        chance = self._next(memory, knowledge, observation)
         chance = chance.take_along_dim(memory.goal[..., None, None], -2).squeeze(-2)
         every = torch.arange(len(SUBGOALS), device=chance.device)
 
@@ -163,8 +163,8 @@ class Firefighters(SimulatedPeople):
         for step, action in enumerate(actions.unbind(-1)):
             now = {name: value[:, :, step] for name, value in observation.items()}
             knowledge = self._learn(memory, now, None)
+            chance = self._next(memory, knowledge, now)
             memory = Mind(knowledge.corridors, knowledge.rooms, memory.goal, memory.fate)
-            chance = self._next(possible_subgoals(knowledge, now))
             goals = (goals[..., None, :] @ chance).squeeze(-2)
             steps = self._steps(knowledge, now)
             found.append((goals[..., None] * steps).sum(-2))
@@ -180,25 +180,32 @@ class Firefighters(SimulatedPeople):
             visible = {name: mask | told[name] for name, mask in visible.items()}
         return HouseKnowledge(memory.corridors, memory.rooms).learn(observation, visible)
 
-    def _next(self, possible: Tensor) -> Tensor:
-        """Probability ``[P, ..., 6, 6]`` of each subgoal, by the subgoal before.
-
-        Args:
-            possible: ``[P, ..., 6]``.
-        """
-        liked = each(self.transitions, possible.dim() - 2) * possible[..., None, :]
+    def _next(self, memory: Mind, knowledge: HouseKnowledge, observation: Observation) -> Tensor:
+        """Probability ``[P, ..., 6, 6]`` of each subgoal, by the subgoal before."""
+        possible = possible_subgoals(knowledge, observation)
+        victim = known_victim(knowledge, observation)
+        people = torch.arange(len(self.transitions), device=victim.device)
+        liked = self.transitions[each(people, victim.dim() - 1), victim] * possible[..., None, :]
         chosen = liked / liked.sum(-1, keepdim=True)
         stays = torch.eye(len(SUBGOALS), dtype=liked.dtype, device=liked.device)
-        return torch.where(possible[..., None], stays, chosen)
+        following = torch.where(possible[..., None], stays, chosen)
+        news = (victim > 0) & ~memory.rooms.all(-1)
+        return torch.where(news[..., None, None], chosen[..., HOME : HOME + 1, :], following)
 
     def _steps(self, knowledge: HouseKnowledge, observation: Observation) -> Tensor:
         """Probability ``[P, ..., 6, 4]`` of each action on the way to each subgoal."""
         place = observation["ego"][..., :2].long()
         barred = _barred(knowledge, observation)
         known = (barred * torch.arange(1, 3, device=barred.device)).sum(-1)
-        uniform = _ways().to(place.device)[known, place[..., 0], place[..., 1]]
+        uniform = _distances_and_ways()[1].to(place.device)[known, place[..., 0], place[..., 1]]
         lapse = each(self.lapse, uniform.dim() - 1)
         return (1 - lapse) * uniform + lapse / len(MOVES)
+
+
+def known_victim(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
+    """Where somebody on the way knows that the victim is ``[...]``: 0 nowhere, or 1 + the room."""
+    there = knowledge.rooms & (observation["verbal"][..., len(CORRIDORS) :, 0] == 1)
+    return (there * torch.arange(1, 1 + len(ROOMS), device=there.device)).sum(-1)
 
 
 def possible_subgoals(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
@@ -223,17 +230,24 @@ def _barred(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
     return knowledge.corridors & (observation["verbal"][..., : len(CORRIDORS), 0] == 1)
 
 
-@cache
-def _ways() -> Tensor:
-    """Uniform probabilities over the first steps of shortest ways, ``[3, 9, 9, 6, 4]``.
+def subgoal_distances() -> Tensor:
+    """Steps from each subgoal to each, in a house without obstacles, ``[6, 6]``."""
+    row, column = torch.tensor(list(SUBGOALS.values())).unbind(-1)
+    return _distances_and_ways()[0][0][row, column]
 
-    By the corridor that is known to be blocked (0 none), row, column, subgoal and action. Where
-    there is no way, or nowhere to go, every action is as likely.
+
+@cache
+def _distances_and_ways() -> tuple[Tensor, Tensor]:
+    """Steps to each subgoal ``[3, 9, 9, 6]``, and first steps of shortest ways.
+
+    The latter are uniform probabilities ``[3, 9, 9, 6, 4]``. By the corridor that is known to be
+    blocked (0 none), row, column, subgoal and action. Where there is no way, or nowhere to go,
+    every action is as likely.
     """
     cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
     moves = torch.tensor(list(MOVES.values()))
     goals = torch.tensor(list(SUBGOALS.values()))
-    ways = []
+    ways, distances = [], []
     for blocked in [None, *CORRIDORS.values()]:
         free = walkable(cells)
         if blocked is not None:
@@ -253,4 +267,5 @@ def _ways() -> Tensor:
         total = good.sum(-1, keepdim=True)
         uniform = torch.where(total > 0, good / total.clamp(min=1), 1 / len(moves))
         ways.append(uniform.view(SIDE, SIDE, len(goals), len(moves)))
-    return torch.stack(ways)
+        distances.append(far.view(SIDE, SIDE, len(goals)))
+    return torch.stack(distances), torch.stack(ways)
