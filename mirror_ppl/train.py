@@ -35,7 +35,7 @@ class Options:
     burning house, a victim, two corridors)."""
     phases: int | None = None
     """Of a self-model: phases of acting and learning; 2 to try it out. Default: what makes a good
-    one, of driving 40 and of search_rescue 200."""
+    one, of driving 40 and of search_rescue 400."""
     steps: int | None = None
     """Of a self-model: gradient steps of a phase. Default: of driving 300, of search_rescue 40."""
     learning_rate: float | None = None

@@ -102,6 +102,8 @@ class Domain(Protocol):
     they saw or were told in a round so far. ``over_at_horizon`` says that nothing is left to win or
     lose when a round ends; where it does not, the end is only where recording stops.
     ``partial_views`` are reaches in each direction by name, in which self-models are measured.
+    The robot practises to see only so far with weights ``reach_practice`` of the reaches (all alike
+    if empty), and to be told of an item at a step with a probability up to ``told_practice``.
     ``mishap`` is the reward term of what people should be kept from, and what several of them are
     called. ``counterparts`` has for each visual item the verbal item that tells of the same, where
     that tells more of it.
@@ -124,6 +126,8 @@ class Domain(Protocol):
     direction_groups: tuple[tuple[int, ...], ...]
     reach_bins: tuple[float, ...]
     reach_unit: str
+    reach_practice: tuple[float, ...]
+    told_practice: float
     partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...]
 

@@ -141,6 +141,8 @@ class Driving:
     """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
     cells away and none at the next edge. The last bin is the whole road."""
     reach_unit = "cells"
+    reach_practice: tuple[float, ...] = ()
+    told_practice = 0.5
     partial_views: Mapping[str, tuple[float, ...]] = {
         "fog": (FOG_REACH, FOG_REACH, 0.0, 0.0),
         "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),

@@ -165,6 +165,11 @@ class SearchRescue:
     reach_bins: tuple[float, ...] = reach_distances()
     """Radii in cells, one of each set of those with which one sees the same from every place."""
     reach_unit = "cells"
+    # What is seen a few steps ahead or only beside is what people in smoke differ in.
+    reach_practice: tuple[float, ...] = tuple(
+        4.0 if abs(radius - SMOKE_REACH) <= 1 else 1.0 for radius in reach_distances()
+    )
+    told_practice = 0.05
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ()
 

@@ -94,7 +94,7 @@ class SelfModelOptions:
 
 BY_DOMAIN: dict[str, dict[str, Any]] = {
     "search_rescue": {
-        "phases": 200,
+        "phases": 400,
         "rounds": 400,
         "steps": 40,
         "learning_rate": 2e-3,

@@ -15,6 +15,7 @@ observer would conclude; an item that is merely not visible stays unknown.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,9 +136,12 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     )
     full, dropout, sight = (kind == index for index in range(len(KINDS)))
     bins = torch.tensor(domain.reach_bins, device=device)
-    drawn = torch.randint(
-        len(bins), (batch, len(domain.directions)), generator=generator, device=device
-    )
+    shape = (batch, len(domain.directions))
+    if domain.reach_practice:
+        weights = torch.tensor(domain.reach_practice, device=device)
+        drawn = torch.multinomial(weights, math.prod(shape), True, generator=generator).view(shape)
+    else:
+        drawn = torch.randint(len(bins), shape, generator=generator, device=device)
     alike = uniform(batch) < ALIKE_PROBABILITY
     for group in domain.direction_groups:
         for direction in group[1:]:
@@ -148,7 +152,8 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
         visual = modality.name == "visual"
         rate = torch.where(dropout, uniform(batch), 1.0 if visual else 0.0)
         keep[modality.name] = torch.where(full, 1.0, rate)
-        told[modality.name] = torch.where(sight & spoken_to, 0.5 * uniform(batch), 0.0)
+        often = domain.told_practice * uniform(batch)
+        told[modality.name] = torch.where(sight & spoken_to, often, 0.0)
         noise[modality.name] = uniform(batch, steps + 1, len(modality.items), 2)
     return ViewPlan(
         reach=torch.where(sight[:, None], bins[drawn], bins[-1]),
