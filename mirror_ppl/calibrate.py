@@ -34,9 +34,10 @@ class Options:
     """What to calibrate, and where the results go."""
 
     domain: str = "driving"
-    """The world."""
-    setting: str = "fog"
-    """The setting under which rounds are recorded; what people see is up to their implants."""
+    """The world: driving or search_rescue."""
+    setting: str | None = None
+    """The setting under which rounds are recorded; what people see is up to their implants.
+    Default: the one in which people see less."""
     guide: str = "exact"
     """What to test: amortized, exact, svi or nuts."""
     guide_file: Path | None = None
@@ -94,7 +95,8 @@ def main(options: Options) -> int:
 
     if options.guide not in GUIDES:
         raise UnknownNameError.of("guide", options.guide, GUIDES)
-    require_known(options.setting, "setting", get_domain(options.domain).settings)
+    known = get_domain(options.domain).settings
+    setting = require_known(options.setting or known[-1], "setting", known)
     weights = options.self_model or shipped_weights(options.domain)
     self_model, _ = load_self_model(weights, options.domain)
     human = load_human_model(options.human_model, self_model)
@@ -104,14 +106,14 @@ def main(options: Options) -> int:
     settings = InferenceOptions(options.guide, options.draws)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     parts = folder / "parts"
-    what = [settings, options.setting, options.seed, trial]
+    what = [settings, setting, options.seed, trial]
     identity = run_identity(human, network, what)
     with Progress("calibrate", options.people) as progress:
         calibration = calibrate(
             human,
             partial(_infer, human, settings, network),
             trial,
-            options.setting,
+            setting,
             options.seed,
             lambda name, done, total, message: progress.update(done, message),
             options.jobs,

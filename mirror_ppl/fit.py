@@ -28,12 +28,13 @@ class Options:
     demos: Path | None = None
     """Recordings in the format of docs/demonstrations.md."""
     domain: str = "driving"
-    """The world of the shipped recordings: driving."""
-    setting: str = "fog"
-    """The setting of the shipped recordings: clear or fog."""
+    """The world of the shipped recordings: driving or search_rescue."""
+    setting: str | None = None
+    """The setting of the shipped recordings: of driving clear or fog, of search_rescue clear or
+    smoke. Default: the one in which people see less."""
     population: str = "paper"
     """The people of the shipped recordings: paper (sight limited by the setting alone) or diverse
-    (each their own reach ahead and behind)."""
+    (each their own sight)."""
     out: Path = Path("runs/fit")
     """Folder for the results; made if it is not there."""
     train_rounds: int | None = None
@@ -104,8 +105,8 @@ def main(options: Options) -> None:
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
-    from mirror_ppl.plots.driving import has_sight, save_sight_picture
     from mirror_ppl.plots.identifiability import plot_identifiability
+    from mirror_ppl.plots.sight import sight_picture
 
     device = usable_device(options.device)
     svi = FitOptions(steps=options.steps)
@@ -160,8 +161,9 @@ def main(options: Options) -> None:
     for name in ("summary.json", "sight.png", "open.png"):
         (folder / name).unlink(missing_ok=True)
     save_inference_data(result.data, folder / "posterior.nc")
-    if has_sight(result.data):
-        save_sight_picture(result.data, folder / "sight.png")
+    picture = sight_picture(result.data)
+    if picture is not None:
+        picture[0].save(folder / "sight.png")
     if found is not None:
         plot_identifiability(result.data).save(folder / "open.png")
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
@@ -170,8 +172,8 @@ def main(options: Options) -> None:
     _show(summary, get_domain(demonstrations.domain).reach_unit)
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
-    if has_sight(result.data):
-        print(f"{folder / 'sight.png'}: the road as each person sees it")
+    if picture is not None:
+        print(f"{folder / 'sight.png'}: {picture[1]}")
     if found is not None:
         print(f"{folder / 'open.png'}: what is open about what they see, and what would tell")
 
@@ -179,12 +181,14 @@ def main(options: Options) -> None:
 def _recordings(options: Options):
     from mirror_ppl.data import asset_path, load_demonstrations
     from mirror_ppl.domains import get_domain, require_known
+    from mirror_ppl.people import PEOPLE
 
     if options.demos is not None:
         return load_demonstrations(options.demos)
-    require_known(options.setting, "setting", get_domain(options.domain).settings)
-    require_known(options.population, "population", ("paper", "diverse"))
-    name = f"{options.domain}_{options.setting}_{options.population}.nc"
+    settings = get_domain(options.domain).settings
+    setting = require_known(options.setting or settings[-1], "setting", settings)
+    require_known(options.population, "population", PEOPLE[options.domain].populations)
+    name = f"{options.domain}_{setting}_{options.population}.nc"
     return load_demonstrations(asset_path(name))
 
 

@@ -18,11 +18,14 @@ class Options:
     out: Path
     """The netCDF file to write; one that is there is replaced, missing folders are created."""
     domain: str = "driving"
-    """The world. So far there is driving: two lanes, four cars that never yield."""
-    setting: str = "fog"
-    """Its setting: clear (the whole road in sight) or fog (2 cells ahead, nothing behind)."""
+    """The world: driving (two lanes, four cars that never yield) or search_rescue (a burning house,
+    a victim, two corridors)."""
+    setting: str | None = None
+    """Its setting: of driving clear (the whole road in sight) or fog (2 cells ahead, nothing
+    behind), of search_rescue clear (the whole house in sight) or smoke (1.5 cells around). Default:
+    the one in which people see less."""
     population: str = "paper"
-    """Who: paper (sight limited by the setting alone) or diverse (each their own reach)."""
+    """Who: paper (sight limited by the setting alone) or diverse (each their own sight)."""
     people: int = 10
     """How many people, at least 1."""
     rounds: int = 40
@@ -51,11 +54,12 @@ def main(options: Options) -> None:
     from mirror_ppl.people import simulate
 
     domain = get_domain(options.domain)
+    setting = options.setting or domain.settings[-1]
     prepare_output_folder(options.out.parent)
     with Progress("simulate", domain.horizon) as progress:
         demonstrations = simulate(
             options.domain,
-            options.setting,
+            setting,
             options.population,
             options.people,
             options.rounds,
@@ -69,7 +73,7 @@ def main(options: Options) -> None:
     assert demonstrations.rewards is not None and demonstrations.action_entropy is not None
     reward = demonstrations.rewards.nansum(-1).mean().item()
     entropy = demonstrations.action_entropy.nanmean().item()
-    print(f"{path}: {options.domain}, {options.setting}, population {options.population}")
+    print(f"{path}: {options.domain}, {setting}, population {options.population}")
     print(f"  people {options.people}, rounds of each {options.rounds}, seed {options.seed}")
     print(f"  mean reward of a round {reward:.3f}")
     print(f"  mean entropy of an action {entropy:.4f} nats")
@@ -77,7 +81,10 @@ def main(options: Options) -> None:
 
 def _command(options: Options) -> str:
     """The command that makes the same recordings again, wherever it is to write them."""
+    from mirror_ppl.domains import get_domain
+
     values = {part.name: getattr(options, part.name) for part in fields(options)}
+    values["setting"] = options.setting or get_domain(options.domain).settings[-1]
     parts = [f"--{name} {value}" for name, value in values.items() if name != "out"]
     return " ".join([PROGRAM, *parts])
 

@@ -13,7 +13,6 @@ from mirror_ppl.plots.driving import (
     has_sight,
     outline,
     plot_sight,
-    save_sight_picture,
     sight_picture,
     sight_probability,
     true_sight,
@@ -240,13 +239,13 @@ def test_any_number_of_people(rng, number):
 def test_saved_picture_is_a_png_and_leaves_nothing_behind(data, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "matplotlib.pyplot", raising=False)
     path = tmp_path / "new" / "sight.png"
-    save_sight_picture(data, path)
+    sight_picture(data).save(path)
     assert path.read_bytes().startswith(b"\x89PNG")
     assert [file.name for file in path.parent.iterdir()] == ["sight.png"]
     assert "matplotlib.pyplot" not in sys.modules
     Path(tmp_path / "file").touch()
     with pytest.raises(OutputError):
-        save_sight_picture(data, tmp_path / "file" / "sight.png")
+        sight_picture(data).save(tmp_path / "file" / "sight.png")
 
 
 def test_human_models_without_thresholds_have_no_road(data):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
 from mirror_ppl.domains.driving import ROAD_END
-from mirror_ppl.files import write_whole
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLUE, TRUE, draws, of_person, people, truth
@@ -158,16 +156,6 @@ def sight_picture(data: az.InferenceData) -> Picture:
     truth_known = any(true_sight(data, person) is not None for person in shown)
     _explain(figure, list(grid.flat), truth_known)
     return figure
-
-
-def save_sight_picture(data: az.InferenceData, path: Path) -> None:
-    """Write :func:`sight_picture` as PNG, whole or not at all.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    figure = sight_picture(data)
-    write_whole(path, lambda temporary: figure.savefig(temporary, dpi=100))
 
 
 def outline(seen: xr.DataArray) -> list[tuple[tuple[float, float], tuple[float, float]]]:

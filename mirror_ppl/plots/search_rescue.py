@@ -1,0 +1,142 @@
+"""The house as firefighters see it: samples of the posterior over sight (supplement, Fig. 12)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+
+from mirror_ppl.domains.rescue_house import PORTION, SIDE, as_image
+from mirror_ppl.domains.search_rescue import RescueState, SearchRescue
+from mirror_ppl.models.implants import SIGHT
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import BLUE, draws, of_person, people, truth
+
+if TYPE_CHECKING:
+    import arviz as az
+
+SITE = SIGHT + "radius"
+MOST_PEOPLE = 12
+"""More people than this do not fit on one picture."""
+SAMPLES = 4
+PLACE = (6, 1)
+"""Where the firefighter of the pictures stands: in the hall, before the left corridor."""
+SCENARIO = "victim top-left, right corridor blocked"
+
+
+def has_sight(data: az.InferenceData) -> bool:
+    """Whether the human model has the radius that the house is shaded by."""
+    return SITE in data["posterior"]
+
+
+def sight_probability(data: az.InferenceData, person: str) -> np.ndarray:
+    """Posterior probability that a person sees each cell of the map, ``[9, 9]``.
+
+    It is that of a firefighter who stands before the left corridor and has not looked around yet.
+
+    Args:
+        data: with the site ``sight_radius``, in cells.
+        person: id of the person.
+
+    Raises:
+        UnknownNameError: there is nobody of that id.
+    """
+    return _seen(draws(of_person(data, "posterior", person)[SITE])).mean(0)
+
+
+def sight_picture(data: az.InferenceData) -> Picture:
+    """What people see of the house, one row each: truth, probability, and posterior samples.
+
+    Black is what they do not see. Of more than 12 people the first 12 are shown.
+
+    Args:
+        data: as for :func:`sight_probability`.
+    """
+    everybody = people(data)
+    shown = everybody[:MOST_PEOPLE]
+    known = [truth(data, SITE, person) is not None for person in shown]
+    columns = (["what they see"] if any(known) else []) + ["probability"]
+    columns += [f"sample {number}" for number in range(1, SAMPLES + 1)]
+    size = (1.75 * len(columns) + 0.6, 1.8 * len(shown) + 1.5)
+    figure = Picture(figsize=size, layout="constrained")
+    grid = figure.subplots(len(shown), len(columns), squeeze=False)
+    for row, person in zip(grid, shown, strict=True):
+        panels = list(row)
+        radius = truth(data, SITE, person)
+        if any(known):
+            ax = panels.pop(0)
+            if radius is None:
+                ax.set_axis_off()
+            else:
+                _draw(ax, _seen(np.array([radius]))[0], f"{radius:g} cells")
+        _draw_probability(panels.pop(0), sight_probability(data, person))
+        drawn = draws(of_person(data, "posterior", person)[SITE])
+        chosen = np.linspace(0, len(drawn) - 1, SAMPLES).round().astype(int)
+        for ax, value in zip(panels, drawn[chosen], strict=True):
+            _draw(ax, _seen(np.array([value]))[0], f"{value:g} cells")
+        row[0].set_ylabel(person, fontsize=10)
+    for ax, title in zip(grid[0], columns, strict=True):
+        ax.set_title(title, fontsize=10, loc="left")
+    attributes = data["posterior"].attrs
+    setting = f", {attributes['setting']}" if "setting" in attributes else ""
+    some = "" if shown == everybody else f" (the first {len(shown)} of {len(everybody)} people)"
+    figure.suptitle(
+        f"What each person sees of the house{setting}{some}",
+        x=0.01,
+        ha="left",
+        fontsize=14,
+        fontweight="bold",
+    )
+    figure.supxlabel(
+        "Black: not seen. Blue: the firefighter, before the left corridor. Green: the victim.\n"
+        "Purple: the obstacle. Yellow: the entrance.",
+        x=0.01,
+        ha="left",
+        fontsize=9,
+    )
+    return figure
+
+
+def _state() -> RescueState:
+    number = SearchRescue.scenarios.index(SCENARIO)
+    state = SearchRescue().initial(1, torch.Generator(), torch.tensor([number]))
+    return RescueState(torch.tensor([PLACE]), state.found, state.home, state.blocked, state.victim)
+
+
+def _seen(radii: np.ndarray) -> np.ndarray:
+    """Which cells of the map are seen with each radius, ``[S, 9, 9]``, 0 or 1."""
+    world = SearchRescue()
+    _, distance = world.distance(world.observe(_state()))
+    portions = (distance[0].numpy() <= radii[:, None]).astype(float)
+    each = SIDE // PORTION
+    return portions.reshape(-1, each, each).repeat(PORTION, 1).repeat(PORTION, 2)
+
+
+def _map() -> np.ndarray:
+    return as_image(SearchRescue().observe(_state())["visual"])[0].numpy()
+
+
+def _draw(ax: Axes, seen: np.ndarray, label: str) -> None:
+    ax.imshow(_map() * seen[..., None])
+    _finish(ax)
+    ax.set_xlabel(label, fontsize=8)
+
+
+def _draw_probability(ax: Axes, probability: np.ndarray) -> None:
+    ax.imshow(probability, cmap="gray", vmin=0, vmax=1)
+    _finish(ax)
+    here = probability[PLACE]
+    far = probability[0, -1]
+    ax.set_xlabel(f"here {here:.2f}, far corner {far:.2f}", fontsize=8)
+
+
+def _finish(ax: Axes) -> None:
+    row, column = PLACE
+    ax.add_patch(Circle((column, row), 0.4, facecolor=BLUE, edgecolor="white", linewidth=0.8))
+    for line in range(PORTION, SIDE, PORTION):
+        ax.axhline(line - 0.5, color="#888888", linewidth=0.4)
+        ax.axvline(line - 0.5, color="#888888", linewidth=0.4)
+    ax.set(xticks=[], yticks=[])
