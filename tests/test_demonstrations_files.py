@@ -195,7 +195,10 @@ BAD_DATASETS = {
         lambda dataset: dataset.drop_attrs(),
         "attribute format is 'missing', expected 'mirror_ppl demonstrations'",
     ),
-    "unknown domain": (renamed(domain="boats"), 'unknown domain "boats"; known: driving'),
+    "unknown domain": (
+        renamed(domain="boats"),
+        'unknown domain "boats"; known: driving, search_rescue',
+    ),
     "unknown setting": (renamed(setting="rain"), 'unknown setting "rain"; known: clear, fog'),
     "no actions": (
         lambda dataset: dataset.drop_vars("action"),

@@ -18,7 +18,7 @@ from pyro.infer import TraceEnum_ELBO, config_enumerate
 from mirror_ppl import assist, console
 from mirror_ppl.__main__ import COMMANDS
 from mirror_ppl.data import load_demonstrations
-from mirror_ppl.domains.driving import Driving
+from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.fitting import fit_people
@@ -32,7 +32,7 @@ from mirror_ppl.models import HumanModel, views
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import POPULATIONS
+from mirror_ppl.people import PEOPLE
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -108,11 +108,11 @@ def test_every_command_is_real(where, line):
     module = importlib.import_module(words[2])
     assert words[2].removeprefix("mirror_ppl.") in COMMANDS
     options = vars(tyro.cli(module.Options, args=words[3:]))
-    assert options.get("domain", "driving") == "driving"
-    # Whom to assist is told by the posterior, unless it is said.
+    # Whom to assist is told by the posterior, unless it is said; so is the setting of others.
+    domain = get_domain(options.get("domain") or "driving")
+    assert options.get("setting") in (*domain.settings, None)
     unsaid = (None,) if module is assist else ()
-    assert options.get("setting", "fog") in (*Driving.settings, *unsaid)
-    assert options.get("population", "paper") in (*POPULATIONS, *unsaid)
+    assert options.get("population", "paper") in (*PEOPLE[domain.name].populations, *unsaid)
     for option in ("card", "human_model"):
         path = str(options.get(option) or "").partition(":")[0]
         assert not path or path in VARIANTS or (ROOT / path).is_file()
@@ -171,6 +171,7 @@ def test_options_and_communicators_of_assist_are_told_as_they_are():
     text, options = page("docs/communicator.md"), assist.Options()
     shown = {row[0].strip("`-"): row[1] for row in table_of(text, "Option")}
     assert shown.pop("communicator") == "all of them" and options.communicator == ()
+    assert shown.pop("horizon") == "the domain's" and options.horizon is None
     assert shown == {name: str(getattr(options, name)) for name in shown}
     first = " ".join(row[0] for row in table_of(text, "Communicator"))
     assert tuple(re.findall(r"`([\w-]+)`", first)) == COMMUNICATORS
