@@ -70,6 +70,12 @@ class Channels:
         """Flags ``[..., N]`` of masks ``[..., K]`` by modality."""
         return torch.cat([masks[modality.name] for modality in self.modalities], -1)
 
+    def marginal(self, number: int) -> Tensor:
+        """What each item ``[N]`` costs as the so-manieth of its modality in one step."""
+        count = torch.tensor([number, number - 1])
+        added = [m.cost(count)[0] - m.cost(count)[1] for m in self.modalities]
+        return torch.stack(added).repeat_interleave(torch.tensor(self.sizes))
+
     def cost(self, flags: Tensor) -> Tensor:
         """Cost ``[...]`` in units of reward of messages ``[..., N]`` (supplement, Table I)."""
         masks = self.split(flags)

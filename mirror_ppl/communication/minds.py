@@ -29,6 +29,8 @@ from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.sites import latent_sites
 
+COUNTED = 3
+"""Up to how many items of a message have to be cheaper than others that tell the same."""
 ATTENTION_VALUES = 64
 """Values that stand for all that somebody may attend to in a round, of which each draw gets one."""
 
@@ -266,7 +268,21 @@ class Standing:
         _, index = self.told(messages)
         result = torch.zeros_like(allowed)
         result[places] = (index[1:] != index[:1]).any(1)
+        result[places[self._dearer(places, index[1:])]] = False
         return result
+
+    def _dearer(self, places: Tensor, index: Tensor) -> Tensor:
+        """Items ``[n]`` that tell just what others do at less cost, even as the third of those.
+
+        Args:
+            places: of the items, ``[n]``.
+            index: beliefs after each, ``[n, U]``.
+        """
+        channels = Channels(self.person.human.domain)
+        alone, third = (channels.marginal(count).to(places.device) for count in (1, COUNTED))
+        same = (index[:, None] == index).all(-1)
+        dearer = alone[places][:, None] >= third[places] - 1e-6  # of rounding
+        return (same & dearer).any(1)
 
 
 @dataclass(frozen=True)

@@ -417,11 +417,14 @@ class SearchRescue:
         return {"goal_and_obstacle": {"visual": portions, "verbal": holds}}
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:
-        """Such as "victim in top-right", or "the middle-left of the map"."""
-        if modality == "visual":
-            return f"the {item} of the map"
-        holds = observation["verbal"][tuple(UTTERANCES).index(item), 0]
-        return UTTERANCES[item][int(holds)]
+        """Such as "victim in top-right", or "the middle-left of the map (left corridor clear)"."""
+        holds = observation["verbal"][:, 0].int().tolist()
+        said = [about[value] for about, value in zip(UTTERANCES.values(), holds, strict=True)]
+        if modality == "verbal":
+            return said[tuple(UTTERANCES).index(item)]
+        telling, number = (*CORRIDOR_PORTIONS, *ROOM_PORTIONS), PORTIONS.index(item)
+        shows = f" ({said[telling.index(number)]})" if number in telling else ""
+        return f"the {item} of the map{shows}"
 
     def deed(self, observation: Observation, item: str | None, action: int) -> str:
         """Where they would go."""

@@ -114,7 +114,7 @@ class SpeechReader(JoinedReader):
 
     def __init__(self, codes: Tensor, sizes: Sizes) -> None:
         super().__init__(codes.shape[0], codes.shape[-1], (sizes.features,), sizes.encoder)
-        self.register_buffer("codes", codes)
+        self.register_buffer("codes", codes.clone())
 
     def embed(self, symbols: Tensor) -> Tensor:
         """Of which utterance is true ``[..., K, U]``, one-hot; its code ``[..., K, C]``."""

@@ -63,11 +63,12 @@ class SelfModel(nn.Module):
     Args:
         domain: the domain that the networks are for.
         sizes: of the networks; the domain's own unless given.
-        embedding: from utterances to vectors, which an autoencoder compresses to codes.
+        embedding: from utterances to vectors, which an autoencoder compresses to codes; None if
+            the codes are to come with weights.
     """
 
     def __init__(
-        self, domain: Domain, sizes: Sizes | None = None, embedding: Embedding = hashed_words
+        self, domain: Domain, sizes: Sizes | None = None, embedding: Embedding | None = hashed_words
     ) -> None:
         super().__init__()
         self.domain = domain
@@ -75,7 +76,9 @@ class SelfModel(nn.Module):
         self.latent = latent = sizes.latent
         actions = len(domain.actions)
         codes = {
-            m.name: utterance_codes(m, sizes.code, embedding)
+            m.name: torch.zeros(len(m.items), len(m.utterances[0]), sizes.code)
+            if embedding is None
+            else utterance_codes(m, sizes.code, embedding)
             for m in domain.modalities
             if m.utterances
         }

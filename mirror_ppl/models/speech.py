@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
@@ -124,6 +125,7 @@ def compress(vectors: Tensor, code: int, seed: int = 0) -> Autoencoder:
     return network.requires_grad_(False).eval()
 
 
+@lru_cache
 def utterance_codes(
     modality: Modality, code: int, embedding: Embedding = hashed_words, seed: int = 0
 ) -> Tensor:

@@ -111,7 +111,7 @@ def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, d
             )
         sizes = Sizes(**json.loads(metadata["sizes"])) if "sizes" in metadata else None
         with torch.random.fork_rng(devices=[]):
-            self_model = SelfModel(world, sizes)
+            self_model = SelfModel(world, sizes, embedding=None)
         self_model.load_state_dict(tensors)
         card = json.loads(metadata["card"])
     except (KeyError, RuntimeError, TypeError, ValueError, MirrorError) as error:
