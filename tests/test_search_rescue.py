@@ -241,7 +241,10 @@ def test_utterances_say_what_is_so():
         assert sum(text.startswith("victim in ") for text in said) == 1
         wrong = [text for text in said if text.endswith("blocked")]
         assert wrong == ([] if blocked.startswith("no") else [blocked])
-    assert WORLD.describe(observation, "visual", "top-left") == "the top-left of the map (victim not in top-left)"
+    assert (
+        WORLD.describe(observation, "visual", "top-left")
+        == "the top-left of the map (victim not in top-left)"
+    )
     assert WORLD.deed(observation, None, LEFT) == "go left"
 
 

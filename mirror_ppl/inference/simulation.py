@@ -55,13 +55,15 @@ def play_rounds(
     }
     sites = dict(implants)
     lengths = torch.zeros(people, rounds, dtype=torch.long, device=device)
+    under_way = lengths == 0
     follow = (_Stepwise if human.stepwise else _Courses)(human, told, actions)
     # What the program itself draws comes from the generator, too, whatever else is drawn from it.
     own = torch.Generator(device)
     own.set_state(generator.get_state())
     seed = int(torch.randint(2**31, (), generator=own, device=device))
     for step in range(steps):
-        lengths += ~domain.over(state)
+        under_way &= ~domain.over(state)
+        lengths += under_way
         with (
             torch.random.fork_rng(devices=[]),
             poutine.trace() as trace,

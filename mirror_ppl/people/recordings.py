@@ -116,8 +116,10 @@ def record(people: SimulatedPeople, start: Start, progress: Progress | None = No
     observations, actions, rewards = [domain.observe(state)], [], []
     probabilities, memories = [], []
     lengths = torch.zeros_like(start.scenario)
+    under_way = lengths == 0
     for luck in start.luck.unbind(-1):
-        lengths += ~domain.over(state)
+        under_way &= ~domain.over(state)
+        lengths += under_way
         probability, memory = people.step(memory, observations[-1])
         action = act(probability, luck)
         following = domain.transition(state, action)
