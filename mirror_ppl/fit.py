@@ -28,10 +28,10 @@ class Options:
     demos: Path | None = None
     """Recordings in the format of docs/demonstrations.md."""
     domain: str = "driving"
-    """The world of the shipped recordings: driving or search_rescue."""
+    """The world of the shipped recordings: driving (none ship of search_rescue yet)."""
     setting: str | None = None
-    """The setting of the shipped recordings: of driving clear or fog, of search_rescue clear or
-    smoke. Default: the one in which people see less."""
+    """The setting of the shipped recordings: clear or fog. Default: the one in which people see
+    less, fog."""
     population: str = "paper"
     """The people of the shipped recordings: paper (sight limited by the setting alone) or diverse
     (each their own sight)."""

@@ -18,14 +18,15 @@ SCENARIO = {(v, b): 3 * b + v for v in range(3) for b in range(3)}
 
 
 def somebody(*likes, lapse=0.0):
-    """Who goes on as told in pairs of subgoals, as long as they know nothing of the victim."""
-    liked = torch.full((1, 4, 6, 6), 1e-6)
+    """Who goes on as told in pairs of subgoals, until they know where the victim is."""
+    liked = torch.full((1, 8, 6, 6), 1e-6)
     for before, after in likes:
-        liked[:, 0, before, after] = 1e6
+        liked[:, :, before, after] = 1e6
     # With the victim in their arms, and told of them: the corridor beside that room.
     for room, corridor in ((0, LEFT), (1, LEFT), (2, RIGHT)):
         liked[:, :, TOP_LEFT + room, corridor] = 1.0
-        liked[:, 1 + room, HOME, corridor] = 1.0
+        liked[:, 2**room, HOME, :TOP_LEFT] = 1e-6
+        liked[:, 2**room, HOME, corridor] = 1.0
     return Firefighters(torch.tensor([1.5]), liked, torch.tensor([lapse]))
 
 

@@ -23,7 +23,7 @@ from mirror_ppl.people.search_rescue import (
     HOME,
     SUBGOALS,
     Firefighters,
-    known_victim,
+    possible_rooms,
     possible_subgoals,
     subgoal_distances,
 )
@@ -32,13 +32,11 @@ PARTICIPANT_ROUNDS = 36
 """How many rounds a participant plays in each setting."""
 HABIT_SPREAD = 0.7
 """Standard deviation over people and choices of how much somebody likes one, as a logarithm."""
-PATIENCE_MEDIAN, PATIENCE_SPREAD = 2.0, 0.3
+PATIENCE_MEDIAN, PATIENCE_SPREAD = 1.0, 0.3
 """Median over people of the steps by which a way may be longer to be chosen e times more seldom,
 and standard deviation of its logarithm."""
 LAPSE_MEDIAN, LAPSE_SPREAD = 0.03, 0.5
 """Median over people of how often they step anywhere, and standard deviation of its logarithm."""
-PRIOR_COUNT = 0.2
-"""How often each transition counts as seen before any was."""
 LEARNING_STEPS = 200
 RADII = (SMOKE_REACH, 2.3, 3.2, 4.2, 5.7)
 """What radii there are in the population ``diverse``, in cells."""
@@ -67,52 +65,57 @@ RESCUE_POPULATIONS: dict[str, Callable[[str, int, int], Tensor]] = {
 
 
 def participants(setting: str, people: int, seed: int) -> Firefighters:
-    """The ground truth: people who like short ways, with habits, limited in sight by the setting.
-
-    How likely somebody goes on to a subgoal falls with the steps of the way by it, as far as they
-    know where it has to lead, and is more or less by habit.
-    """
-    steps = _steps_by_way()
-    transitions, lapses = [], []
+    """The ground truth: people of habits who like short ways, with sight limited by the setting."""
+    habits, patiences, lapses = [], [], []
     for person in range(people):
         generator = derived_generator(seed, "habits", person)
-        habit = HABIT_SPREAD * torch.randn(steps.shape[1:], generator=generator)
+        habits.append(HABIT_SPREAD * torch.randn(len(SUBGOALS), len(SUBGOALS), generator=generator))
         haste, lapse = torch.randn(2, generator=generator)
-        patience = PATIENCE_MEDIAN * (PATIENCE_SPREAD * haste).exp()
-        transitions.append((habit - steps / patience).softmax(-1))
+        patiences.append(PATIENCE_MEDIAN * (PATIENCE_SPREAD * haste).exp())
         lapses.append(LAPSE_MEDIAN * (LAPSE_SPREAD * lapse).exp())
     return Firefighters(
         radius=_by_setting(setting, people, seed),
-        transitions=torch.stack(transitions),
+        transitions=transitions_of(torch.stack(habits), torch.stack(patiences)),
         lapse=torch.stack(lapses),
     )
 
 
+def transitions_of(habit: Tensor, patience: Tensor) -> Tensor:
+    """How likely P people go on to a subgoal from another, ``[P, 8, 6, 6]``.
+
+    It falls with the steps of the way by it, as far as they know where it has to lead.
+
+    Args:
+        habit: how much each likes to go on so, ``[P, 6, 6]``, in nats.
+        patience: how many steps more make a way e times less likely, ``[P]``.
+    """
+    return (habit[:, None] - _steps_by_way() / patience[:, None, None, None]).softmax(-1)
+
+
+@lru_cache
 def _steps_by_way() -> Tensor:
-    """Steps of the way to a subgoal and on from there, ``[4, 6, 6]``; as `transitions`."""
+    """Steps of the way to a subgoal and on from there ``[8, 6, 6]``, by `possible_rooms`."""
     far = subgoal_distances().to(torch.get_default_dtype())
     corridors, rooms = slice(0, len(CORRIDORS)), slice(len(CORRIDORS), HOME)
-    steps = far.repeat(1 + len(ROOMS), 1, 1)
-    onwards = far[corridors, rooms]
-    steps[0, HOME, corridors] += onwards.mean(-1)
-    steps[1:, HOME, corridors] += onwards.T
+    steps = far.repeat(2 ** len(ROOMS), 1, 1)
+    for some in range(1, 2 ** len(ROOMS)):
+        may_be = [room for room in range(len(ROOMS)) if some >> room & 1]
+        steps[some, HOME, corridors] += far[corridors, rooms][:, may_be].mean(-1)
     steps[:, rooms, corridors] += far[corridors, HOME]
     return steps
 
 
 def learn_transitions(recordings: list[Recording]) -> Tensor:
-    """How each of P people goes on from a subgoal, ``[P, 4, 6, 6]``, learned from what they did.
+    """How each of P people goes on from a subgoal, ``[P, 8, 6, 6]``, learned from what they did.
 
-    A choice was made wherever the subgoal changed, among the subgoals that were possible then. The
-    likelihood of such choices (Luce's, as of `Firefighters`) has its maximum, with a few made-up
-    choices of each kind, at the end of Hunter's minorize-maximize steps (2004).
+    A choice was made wherever the subgoal changed, among the subgoals that were possible then.
+    Habits and patience are those of the largest posterior density, by Newton-like steps (L-BFGS).
 
     Args:
         recordings: of the same people, in whatever settings.
     """
-    people = recordings[0].actions.shape[0]
-    number, kinds = len(SUBGOALS), 1 + len(ROOMS)
-    sources, chosen, possible = [], [], []
+    people, number = recordings[0].actions.shape[0], len(SUBGOALS)
+    places, chosen, possible = [], [], []
     for recording in recordings:
         mind = recording.memory
         first = torch.full_like(mind.goal[:, :, :1], HOME)
@@ -122,26 +125,36 @@ def learn_transitions(recordings: list[Recording]) -> Tensor:
         may = possible_subgoals(knowledge, now)
         changed = (before != mind.goal) & (may.sum(-1) > 1)
         who = changed.nonzero()[:, 0]
-        victim = known_victim(knowledge, now)[changed]
-        sources.append((who * kinds + victim) * number + before[changed])
+        places.append(torch.stack([who, possible_rooms(knowledge, now)[changed], before[changed]]))
         chosen.append(mind.goal[changed])
         possible.append(may[changed])
-    source, choice, may = torch.cat(sources), torch.cat(chosen), torch.cat(possible).double()
-    counts = torch.full((people * kinds * number, number), PRIOR_COUNT, dtype=torch.double)
-    counts.index_put_((source, choice), torch.ones(len(choice), dtype=torch.double), True)
-    worth = torch.full_like(counts, 1 / number)
-    for _ in range(LEARNING_STEPS):
-        share = may / (worth[source] * may).sum(-1, keepdim=True)
-        # Made-up choices were among all subgoals.
-        told = torch.full_like(counts, PRIOR_COUNT * number).index_add(0, source, share)
-        worth = counts / told
-        worth = worth / worth.sum(-1, keepdim=True)
-    return worth.view(people, kinds, number, number).to(torch.get_default_dtype())
+    place, choice, may = torch.cat(places, 1), torch.cat(chosen), torch.cat(possible)
+    habit = torch.zeros(people, number, number, requires_grad=True)
+    haste = torch.zeros(people, requires_grad=True)
+    optimizer = torch.optim.LBFGS(
+        [habit, haste], max_iter=LEARNING_STEPS, line_search_fn="strong_wolfe"
+    )
+
+    def patience() -> Tensor:
+        return PATIENCE_MEDIAN * (PATIENCE_SPREAD * haste).exp()
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        liked = transitions_of(HABIT_SPREAD * habit, patience())[tuple(place)] * may
+        chance = liked.gather(-1, choice[:, None]).squeeze(-1) / liked.sum(-1)
+        value = 0.5 * (habit.pow(2).sum() + haste.pow(2).sum()) - chance.log().sum()
+        value.backward()
+        return value
+
+    with torch.enable_grad():
+        optimizer.step(loss)
+    with torch.no_grad():
+        return transitions_of(HABIT_SPREAD * habit, patience())
 
 
 @lru_cache(maxsize=8)
 def learned_transitions(people: int, seed: int) -> Tensor:
-    """How the participants go on ``[P, 4, 6, 6]``, learned from their rounds in every setting."""
+    """How the participants go on ``[P, 8, 6, 6]``, learned from their rounds in every setting."""
     rounds, domain = PARTICIPANT_ROUNDS, SearchRescue()
     recordings = []
     for setting in domain.settings:

@@ -2,20 +2,20 @@
 
 A firefighter goes from one subgoal to the next: a corridor, a room where the victim may be, the
 entrance. A subgoal is given up when it was reached, or when what is known of the house rules it
-out: a corridor that is blocked, a room that is empty. Who learns where the victim is thinks again,
-as if at the entrance. Then the next is chosen among those that are possible:
+out: a corridor that is blocked, a room that is empty. Who learns something of where the victim is
+thinks again, as if at the entrance. Then the next is chosen among those that are possible:
 
 ===================  ===========================================================================
 ``radius``           how far they see, in cells to the centre of a portion of the map
 ``k_t``              what they know at step t, of what they ever saw or were told
-``v_t``              the room of which they know that the victim is there, or none
+``v_t``              the rooms where the victim may be, for all they know
 ``g_t``              their subgoal; ``G_t`` are those that are possible, given ``k_t``
 ``transitions``      how they like to go on from a subgoal, by what they know of the victim
 ``lapse``            how often they step anywhere
 ===================  ===========================================================================
 
 ``p(g_t | g_{t-1}, k_t) = transitions[v_t, g_{t-1}, g_t] / sum over G_t``, if ``g_{t-1}`` is not in
-``G_t`` or ``v_t`` is news; else they stay with it.
+``G_t`` or ``v_t`` is news to somebody on the way to the rooms; else they stay with it.
 
 ``p(a_t | g_t, k_t) = (1 - lapse) * uniform over steps on a shortest way to g_t + lapse / 4``
 
@@ -72,8 +72,8 @@ class Firefighters(SimulatedPeople):
 
     Attributes:
         radius: how far each sees, in cells to the centre of a portion, ``[P]``.
-        transitions: how likely each goes on to a subgoal from another, ``[P, 4, 6, 6]``, by the
-            room where they know that the victim is (0 none); only the ratios within a row count.
+        transitions: how likely each goes on to a subgoal from another, ``[P, 8, 6, 6]``, by the
+            rooms where the victim may be (see `possible_rooms`); only ratios within a row count.
         lapse: probability ``[P]`` of a step in any direction.
     """
 
@@ -183,13 +183,15 @@ class Firefighters(SimulatedPeople):
     def _next(self, memory: Mind, knowledge: HouseKnowledge, observation: Observation) -> Tensor:
         """Probability ``[P, ..., 6, 6]`` of each subgoal, by the subgoal before."""
         possible = possible_subgoals(knowledge, observation)
-        victim = known_victim(knowledge, observation)
-        people = torch.arange(len(self.transitions), device=victim.device)
-        liked = self.transitions[each(people, victim.dim() - 1), victim] * possible[..., None, :]
+        rooms = possible_rooms(knowledge, observation)
+        people = torch.arange(len(self.transitions), device=rooms.device)
+        liked = self.transitions[each(people, rooms.dim() - 1), rooms] * possible[..., None, :]
         chosen = liked / liked.sum(-1, keepdim=True)
         stays = torch.eye(len(SUBGOALS), dtype=liked.dtype, device=liked.device)
         following = torch.where(possible[..., None], stays, chosen)
-        news = (victim > 0) & ~memory.rooms.all(-1)
+        before = possible_rooms(HouseKnowledge(memory.corridors, memory.rooms), observation)
+        carrying, below = observation["ego"][..., 2] == 1, observation["ego"][..., 0] > MIDDLE_ROW
+        news = (rooms != before) & below & ~carrying
         return torch.where(news[..., None, None], chosen[..., HOME : HOME + 1, :], following)
 
     def _steps(self, knowledge: HouseKnowledge, observation: Observation) -> Tensor:
@@ -202,10 +204,14 @@ class Firefighters(SimulatedPeople):
         return (1 - lapse) * uniform + lapse / len(MOVES)
 
 
-def known_victim(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
-    """Where somebody on the way knows that the victim is ``[...]``: 0 nowhere, or 1 + the room."""
-    there = knowledge.rooms & (observation["verbal"][..., len(CORRIDORS) :, 0] == 1)
-    return (there * torch.arange(1, 1 + len(ROOMS), device=there.device)).sum(-1)
+def possible_rooms(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
+    """Where the victim may be, for all they know: 1, 2 and 4 for the rooms, added up ``[...]``.
+
+    Of a victim who is carried that no longer matters.
+    """
+    holds = observation["verbal"][..., len(CORRIDORS) :, 0] == 1
+    may_be = ~knowledge.rooms | holds
+    return (may_be * 2 ** torch.arange(len(ROOMS), device=may_be.device)).sum(-1)
 
 
 def possible_subgoals(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
