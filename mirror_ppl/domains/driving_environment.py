@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from mirror_ppl.domains.driving import ROAD_END, Driving
 from mirror_ppl.domains.environment import DomainEnv
 
@@ -62,15 +64,9 @@ class DrivingEnv(DomainEnv):
         UnknownNameError: if the setting, the scenario or the render mode is not a known one.
     """
 
-    def __init__(
-        self,
-        setting: str = "clear",
-        scenario: str | None = None,
-        render_mode: str | None = None,
-    ) -> None:
-        highest = [float(ROAD_END), 1.0, 1.0]
-        limits = {"ego": ([0.0], [1.0])}
-        for modality in Driving.modalities:
-            high = highest[: len(modality.features)]
-            limits[modality.name] = ([-limit for limit in high], high)
-        super().__init__(Driving(), limits, setting, scenario, render_mode)
+    domain = Driving()
+    limits: ClassVar[dict[str, tuple[list[float], list[float]]]] = {
+        "ego": ([0.0], [1.0]),
+        "visual": ([-ROAD_END, -1.0], [ROAD_END, 1.0]),
+        "verbal": ([-ROAD_END, -1.0, -1.0], [ROAD_END, 1.0, 1.0]),
+    }

@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 from gymnasium.error import InvalidAction, ResetNeeded
 
-from mirror_ppl.domains.base import Domain, require_known, total_reward
+from mirror_ppl.domains.base import Domain, map_state, require_known, total_reward
 
 RENDER_MODES = ("rgb_array",)
 
@@ -25,10 +25,12 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
     All mechanics are the domain's: this class only draws the round, hides what the setting hides
     and counts steps. Each domain has a child of it, which says what is observed.
 
-    Args:
+    Attributes:
         domain: the world.
         limits: least and largest value of each feature by name, ``"ego"`` ``[E]`` and each modality
             ``[F]``.
+
+    Args:
         setting: one of the domain's settings; the first unless given.
         scenario: a name among its scenarios, or None for a random one in each round.
         render_mode: "rgb_array" or None.
@@ -38,16 +40,16 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 4}
+    domain: ClassVar[Domain]
+    limits: ClassVar[Mapping[str, tuple[list[float], list[float]]]]
 
     def __init__(
         self,
-        domain: Domain,
-        limits: Mapping[str, tuple[list[float], list[float]]],
         setting: str | None = None,
         scenario: str | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self.domain = domain
+        domain = self.domain
         self.setting = require_known(setting or domain.settings[0], "setting", domain.settings)
         if scenario is not None:
             require_known(scenario, "scenario", domain.scenarios)
@@ -57,7 +59,7 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         self.render_mode = render_mode
 
         self.action_space = spaces.Discrete(len(domain.actions))
-        self.observation_space = _observation_space(domain, limits)
+        self.observation_space = _observation_space(domain, self.limits)
         self._state: Any = None
         self._scenario_name = ""
         self._step = 0
@@ -74,7 +76,8 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
             index = scenarios.index(self.scenario)
         # The domain draws from torch's generators; this one hangs on Gymnasium's seed.
         generator = torch.Generator().manual_seed(int(self.np_random.integers(2**63 - 1)))
-        self._state = _only(self.domain.initial(1, generator, torch.tensor([index])))
+        batch = self.domain.initial(1, generator, torch.tensor([index]))
+        self._state = map_state(lambda part: part[0], batch)
         self._scenario_name = scenarios[index]
         self._step = 0
         return self._observation(), self._info()
@@ -154,8 +157,3 @@ def _observation_space(
         parts[modality.name] = box(modality.name, items, len(modality.features))
         parts[f"{modality.name}_mask"] = spaces.MultiBinary(items)
     return spaces.Dict(parts)
-
-
-def _only(states: Any) -> Any:
-    """The state in a batch of one."""
-    return type(states)(**{name: part[0] for name, part in vars(states).items()})

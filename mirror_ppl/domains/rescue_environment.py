@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from mirror_ppl.domains.environment import DomainEnv
 from mirror_ppl.domains.rescue_house import SIDE
 from mirror_ppl.domains.search_rescue import SearchRescue
@@ -58,16 +60,9 @@ class SearchRescueEnv(DomainEnv):
         UnknownNameError: if the setting, the scenario or the render mode is not a known one.
     """
 
-    def __init__(
-        self,
-        setting: str = "clear",
-        scenario: str | None = None,
-        render_mode: str | None = None,
-    ) -> None:
-        last = float(SIDE - 1)
-        limits = {
-            "ego": ([0.0, 0.0, 0.0], [last, last, 1.0]),
-            "visual": ([0.0], [1.0]),
-            "verbal": ([0.0], [1.0]),
-        }
-        super().__init__(SearchRescue(), limits, setting, scenario, render_mode)
+    domain = SearchRescue()
+    limits: ClassVar[dict[str, tuple[list[float], list[float]]]] = {
+        "ego": ([0.0, 0.0, 0.0], [SIDE - 1, SIDE - 1, 1.0]),
+        "visual": ([0.0], [1.0]),
+        "verbal": ([0.0], [1.0]),
+    }

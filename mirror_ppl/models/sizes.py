@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from mirror_ppl.domains.base import Domain
 
@@ -48,4 +48,4 @@ SIZES: dict[str, Sizes] = {
 
 def sizes_of(domain: Domain) -> Sizes:
     """The sizes for a domain; those of driving for one that is not known here."""
-    return replace(SIZES.get(domain.name, Sizes()))
+    return SIZES.get(domain.name, Sizes())
