@@ -1,0 +1,54 @@
+"""The house as firefighters see it."""
+
+import arviz as az
+import numpy as np
+import pytest
+import xarray as xr
+
+from mirror_ppl.plots.search_rescue import PLACE, sight_probability
+from mirror_ppl.plots.sight import sight_picture
+
+
+def made_up(radii, truth=1.5, domain="search_rescue"):
+    """A posterior of two people with these draws of their radius."""
+    draws = np.array([radii, radii[::-1]]).T[None]
+    people = {"person": ["a", "b"]}
+    posterior = xr.Dataset(
+        {"sight_radius": (("chain", "draw", "person"), draws)},
+        people,
+        {"domain": domain, "setting": "smoke"},
+    )
+    known = xr.Dataset({"truth_sight_radius": ("person", [truth, np.nan])}, people)
+    return az.InferenceData(posterior=posterior, constant_data=known)
+
+
+def test_probabilities_are_shares_of_draws_that_see_a_portion():
+    """From the hall its own portion is 1 cell away, the corridor's 2, the far corner's 7.8."""
+    seen = sight_probability(made_up([1.5, 1.5, 2.0, 10.0]), "a")
+    assert seen.shape == (9, 9)
+    assert seen[PLACE] == 1.0
+    assert seen[4, 1] == pytest.approx(0.5)
+    assert seen[0, 8] == pytest.approx(0.25)
+    assert (seen[3:6, :3] == seen[4, 1]).all()
+
+
+def test_pictures_show_truth_probability_and_samples(tmp_path):
+    made = sight_picture(made_up([1.5, 1.5, 2.0, 10.0]))
+    assert made is not None
+    figure, words = made
+    assert words == "the house as each person sees it"
+    titles = [ax.get_title(loc="left") for ax in figure.axes]
+    assert titles[:6] == ["what they see", "probability", *(f"sample {n}" for n in range(1, 5))]
+    # Of the second person the truth is not known.
+    assert [bool(ax.images) for ax in figure.axes] == [True] * 6 + [False] + [True] * 5
+    truth, near = figure.axes[0].images[0].get_array(), figure.axes[2].images[0].get_array()
+    np.testing.assert_array_equal(truth, near)
+    assert truth[7, 1].sum() > 0 and truth[4, 1].sum() == 0
+    figure.save(tmp_path / "sight.png")
+    assert (tmp_path / "sight.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_other_posteriors_have_no_such_picture():
+    other = made_up([1.5, 2.0])["posterior"].rename(sight_radius="consistency")
+    assert sight_picture(az.InferenceData(posterior=other)) is None
+    assert sight_picture(made_up([1.5, 2.0], domain="elsewhere")) is None
