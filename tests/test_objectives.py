@@ -328,10 +328,23 @@ def test_what_could_be_gained_beyond_the_steps_looked_at_counts_if_asked_for():
     assert torch.equal(worth(False, 15), -cost.expand(2, 3))
     # At the end of the round there is nothing beyond.
     assert torch.equal(worth(True, 2), -cost.expand(2, 3))
-    # A single course each, kept by chance, ends at one of the four.
+    # A single course each, kept by chance: its last step is the mean of both actions.
     alone = worth(True, 15, branch=1)
     torch.testing.assert_close(alone + cost, (alone + cost).round(), rtol=0, atol=1e-4)
-    assert (alone[0] != alone[0, 0]).any()
+    assert set(alone[0].tolist()) <= {101, 102}
+
+
+def test_what_is_kept_by_chance_is_small_however_much_is_to_gain():
+    """Four courses end at 100 to 103, each with a weight of 0 or 0.8 for its 0.25."""
+    rewards = [torch.zeros(1, 2), torch.zeros(1, 4)]
+    past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
+    objective = ExpectedUtility(HandSet(rewards), 2, branch=0.8, beyond=True)
+    standing = Standing.of(person(2000, consistency=0.0), past)
+    worth = objective.at(standing, 15, 0)(plan(None)[None]).utility[0]
+    assert abs(worth.mean() - 101.5) < 4.5 * worth.std() / len(worth) ** 0.5
+    assert worth.std() > 0
+    assert worth.min() > 99
+    assert worth.max() < 104
 
 
 def test_paths_are_worked_out_when_they_are_asked_for():

@@ -63,6 +63,10 @@ class ExpectedUtility:
     a single course of actions. In between, what is probable is exact and the improbable cheap, and
     the expectation is right at every value.
 
+    Where what could be gained after the horizon counts, it is added up as what could be gained now
+    and the advantages on the way, ``r_t + discount * V(s_{t+1}) - V(s_t)``. The sum is the same; but
+    only small numbers depend on which courses are kept by chance.
+
     Attributes:
         world: what is rolled forward.
         horizon: steps H that are looked ahead.
@@ -95,7 +99,7 @@ class ExpectedUtility:
         futures = self.world.futures(past, horizon, generator)
         domain = person.human.domain
         number, channels = len(domain.actions), Channels(domain)
-        goes_on = self.beyond and steps_left > horizon
+        ends = steps_left <= horizon
         discounts = self.discount ** torch.arange(horizon, device=device)
 
         @torch.no_grad()
@@ -103,6 +107,9 @@ class ExpectedUtility:
             tree = _Tree(standing, candidates, self.world.draws)
             count = len(candidates)
             utility = torch.zeros(count * person.number, device=device)
+            if self.beyond:
+                world = torch.arange(person.number, device=device) % self.world.draws
+                utility += futures.values(0)[world, 0].repeat(count)
             predicted = torch.zeros(count, horizon, number, device=device)
             for step in range(horizon):
                 observation = {
@@ -110,21 +117,27 @@ class ExpectedUtility:
                 }
                 told = candidates[:, step] if step < candidates.shape[1] else None
                 chances = tree.act(observation, told, channels)
-                gained = futures.rewards(step)[tree.draw_of_world(), tree.path]
+                gains = (
+                    futures.advantages(step, self.discount)
+                    if self.beyond
+                    else futures.rewards(step)
+                )
+                gained = gains[tree.draw_of_world(), tree.path]
                 utility.index_add_(
                     0,
                     tree.candidate * person.number + tree.draw,
                     discounts[step] * (chances * gained).sum(-1),
                 )
                 predicted[:, step].index_add_(0, tree.candidate, chances / person.number)
-                if step < horizon - 1 or goes_on:
+                if step < horizon - 1 or (self.beyond and ends):
                     tree.branch(chances, futures, step, self.branch, seed)
-            if goes_on:
+            if self.beyond and ends:
+                # What could be gained is lost where the round ends.
                 left = futures.values(horizon)[tree.draw_of_world(), tree.path]
                 utility.index_add_(
                     0,
                     tree.candidate * person.number + tree.draw,
-                    self.discount**horizon * tree.weight * left,
+                    -(self.discount**horizon) * tree.weight * left,
                 )
             steps = min(candidates.shape[1], horizon)
             cost = (channels.cost(candidates)[:, :steps] * discounts[:steps]).sum(1)

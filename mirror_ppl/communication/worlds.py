@@ -54,6 +54,8 @@ class _Paths:
         reward: of each action from there ``[W, m A]``, of the first m of them.
         following: the states that follow ``[W, m A]``.
         child: the path at the next step, or -1 if it was not asked for, ``[m A]``.
+        value: what can still be gained in ``state``, as far as it was asked for.
+        left: the same in ``following``.
     """
 
     state: Any
@@ -62,6 +64,8 @@ class _Paths:
     reward: Tensor | None = None
     following: Any = None
     child: Tensor | None = None
+    value: Tensor | None = None
+    left: Tensor | None = None
 
 
 class Futures:
@@ -104,7 +108,28 @@ class Futures:
 
     def values(self, step: int) -> Tensor:
         """What can still be gained after each path of so many actions, at best, ``[W, n]``."""
-        return self.roll.value(self._steps[step].state)
+        here = self._steps[step]
+        here.value = self._valued(here.value, here.state)
+        return here.value
+
+    def advantages(self, step: int, discount: float = 1.0) -> Tensor:
+        """How much better each action is than what could be gained at best, ``[W, n, A]``.
+
+        ``r(s, a) + discount * V(s') - V(s)``, which is 0 for the best action and below for others.
+        """
+        here = self._opened(step)
+        assert here.reward is not None
+        here.left = self._valued(here.left, here.following)
+        after = (here.reward + discount * here.left).unflatten(1, (-1, self.actions))
+        return after - self.values(step)[..., None]
+
+    def _valued(self, known: Tensor | None, state: Any) -> Tensor:
+        """Values of all states ``[W, n]``, of which the first are known."""
+        if known is None:
+            return self.roll.value(state)
+        first = known.shape[1]
+        new = map_state(lambda part: part[:, first:], state)
+        return torch.cat([known, self.roll.value(new)], 1)
 
     def follow(self, step: int, path: Tensor, action: Tensor) -> Tensor:
         """Which paths of one action more these are, ``[E]``; those that are new are worked out.

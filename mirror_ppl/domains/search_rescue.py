@@ -86,6 +86,8 @@ MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 SMOKE_REACH = 1.5
 """How far a firefighter sees in smoke, in cells to the centre of a portion."""
 FOUND, RETURNED, COLLISION, TIME = 1.0, 15.0, -10.0, -0.1
+BEGINNINGS = 0.25
+"""Share of the rounds that the robot learns from that begin where rounds begin."""
 
 UTTERANCES: Mapping[str, tuple[str, str]] = {
     **{
@@ -198,7 +200,10 @@ class SearchRescue:
         )
 
     def anywhere(self, batch: int, generator: torch.Generator) -> RescueState:
-        """States ``[batch]`` anywhere on the floor, with the victim in half of them."""
+        """States ``[batch]``: a quarter as rounds begin, the others anywhere on the floor.
+
+        In half of those anywhere the victim is carried.
+        """
         state = self.initial(batch, generator)
         cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
         cells = cells[walkable(cells)].to(generator.device)
@@ -208,6 +213,9 @@ class SearchRescue:
         place = torch.where(self._obstructed(state, place)[..., None], state.place, place)
         carried = torch.rand(batch, generator=generator, device=generator.device) < 0.5  # noqa: PLR2004
         found = carried | self._at_victim(state, place)
+        begins = torch.rand(batch, generator=generator, device=generator.device) < BEGINNINGS
+        place = torch.where(begins[..., None], state.place, place)
+        found = found & ~begins
         return replace(state, place=place, found=found, home=found & at_entrance(place))
 
     def transition(self, state: RescueState, action: Tensor) -> RescueState:
