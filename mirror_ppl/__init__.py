@@ -11,3 +11,4 @@ __version__ = "0.1.0"
 
 _register("mirror_ppl/Driving-v0", "mirror_ppl.domains.driving_environment:DrivingEnv")
 _register("mirror_ppl/SearchRescue-v0", "mirror_ppl.domains.rescue_environment:SearchRescueEnv")
+_register("mirror_ppl/BombDefusal-v0", "mirror_ppl.domains.bomb_environment:BombDefusalEnv")

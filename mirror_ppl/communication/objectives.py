@@ -64,8 +64,8 @@ class ExpectedUtility:
     the expectation is right at every value.
 
     Where what could be gained after the horizon counts, it is added up as what could be gained now
-    and the advantages on the way, ``r_t + discount * V(s_{t+1}) - V(s_t)``. The sum is the same; but
-    only small numbers depend on which courses are kept by chance.
+    and the advantages on the way, ``r_t + discount * V(s_{t+1}) - V(s_t)``. The sum is the same,
+    but only small numbers depend on which courses are kept by chance.
 
     Attributes:
         world: what is rolled forward.

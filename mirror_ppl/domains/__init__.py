@@ -1,10 +1,13 @@
 """Worlds as pure batched functions, and their Gymnasium faces."""
 
 from mirror_ppl.domains.base import Domain, Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.domains.search_rescue import SearchRescue
 
-DOMAINS: dict[str, Domain] = {domain.name: domain for domain in (Driving(), SearchRescue())}
+DOMAINS: dict[str, Domain] = {
+    domain.name: domain for domain in (Driving(), SearchRescue(), BombDefusal())
+}
 """Every domain by name."""
 
 

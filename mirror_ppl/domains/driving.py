@@ -143,11 +143,17 @@ class Driving:
     reach_unit = "cells"
     reach_practice: tuple[float, ...] = ()
     told_practice = 0.5
+    notice_practice = (1.0, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {
         "fog": (FOG_REACH, FOG_REACH, 0.0, 0.0),
         "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),
     }
     assumptions: tuple[str, ...] = ASSUMPTIONS
+
+    @property
+    def as_believed(self) -> Driving:
+        """The world itself: the robot was taught how it is."""
+        return self
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None

@@ -172,8 +172,14 @@ class SearchRescue:
         4.0 if abs(radius - SMOKE_REACH) <= 1 else 1.0 for radius in reach_distances()
     )
     told_practice = 0.05
+    notice_practice = (1.0, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ()
+
+    @property
+    def as_believed(self) -> SearchRescue:
+        """The world itself: the robot was taught how it is."""
+        return self
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None

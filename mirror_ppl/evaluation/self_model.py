@@ -103,14 +103,16 @@ def self_model_quality(
 
     Returns:
         By name: mean returns of the exact planner, of random actions and of the self-model in
-        ``full`` view (everything shown and told) and in ``clear`` view (everything shown, nothing
-        told), of a domain without assumptions also in its partial views; ``share_*``, how far these
+        ``full`` view (everything shown and told), where there is such a setting in ``clear`` view
+        (everything shown, nothing told), of a domain without assumptions also in its partial views;
+        where the robot was taught wrong, in ``full`` view as it really is (``return_as_it_is``) and
+        of the planner there (``return_exact_as_it_is``); ``share_*``, how far these
         are on the way from random to exact; and for several views ``agreement_*``, the share of
         decisions that agree with the exact planner of that view, and ``clear_agreement_*``, of
         those in which more than ``CLEAR_DECISION`` is at stake. Decisions are compared along
         rounds with one random action in five.
     """
-    domain = self_model.domain
+    domain = self_model.domain.as_believed
     device = next(self_model.parameters()).device
     generator = torch.Generator(device).manual_seed(seed)
     start = domain.initial(rounds, generator)
@@ -121,10 +123,9 @@ def self_model_quality(
     best = float(returns(domain, start, planner_actions(domain, start, steps, 1.0)).mean())
     worst = float(returns(domain, start, anything).mean())
     report = {"return_exact": best, "return_random": worst}
-    views = {
-        "full": fixed_views(domain, rounds, generator, speech=True),
-        "clear": fixed_views(domain, rounds, generator),
-    }
+    views = {"full": fixed_views(domain, rounds, generator, speech=True)}
+    if "clear" in domain.settings:
+        views["clear"] = fixed_views(domain, rounds, generator)
     for name, reach in domain.partial_views.items():
         views[name] = fixed_views(domain, rounds, generator, reach)
     for name, plan in views.items():
@@ -133,6 +134,11 @@ def self_model_quality(
             reached = float(returns(domain, start, own).mean())
             report[f"return_{name}"] = reached
             report[f"share_{name}"] = (reached - worst) / (best - worst)
+            if name == "full" and domain is not self_model.domain:
+                real = self_model.domain
+                report["return_as_it_is"] = float(returns(real, start, own).mean())
+                planned = planner_actions(real, start, steps, 1.0)
+                report["return_exact_as_it_is"] = float(returns(real, start, planned).mean())
         if name not in ("full", "clear") and not domain.assumptions:
             continue
         actions = drive(self_model, start, plan, steps, generator, epsilon=0.2)

@@ -107,6 +107,19 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "length": 16,
         "stride": 2,
     },
+    "bomb_defusal": {
+        "phases": 200,
+        "rounds": 400,
+        "steps": 40,
+        "learning_rate": 2e-3,
+        "beta": 1.0,
+        "beta_decay": 0.98,
+        "epsilon_decay": 0.9,
+        "discount": 0.95,
+        "target_rate": 0.02,
+        "world_weight": 0.01,
+        "length": 12,
+    },
 }
 """Settings that differ by domain; beta and epsilon are the supplement's."""
 

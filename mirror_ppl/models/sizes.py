@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mirror_ppl.domains.base import Domain
 
@@ -42,8 +42,11 @@ class Sizes:
 SIZES: dict[str, Sizes] = {
     "driving": Sizes(),
     "search_rescue": Sizes(encoder=128, decoder=64, q_network=200),
+    "bomb_defusal": Sizes(encoder=128, decoder=64, q_network=200, image=64, stride=2),
 }
-"""The supplement's sizes by domain."""
+"""The supplement's sizes by domain; of bomb defusal a smaller Q-network, see ``PAPER``."""
+PAPER: dict[str, Sizes] = SIZES | {"bomb_defusal": replace(SIZES["bomb_defusal"], q_network=2048)}
+"""The supplement's sizes by domain, whatever they cost."""
 
 
 def sizes_of(domain: Domain) -> Sizes:

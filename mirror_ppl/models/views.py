@@ -5,7 +5,8 @@ what they make of it. So each training round is seen in a way of its own, of thr
 
 - *full*: everything, in both modalities;
 - *dropout*: each item with a probability drawn for the round, in each modality;
-- *sight*: cars up to a reach drawn for each direction, and now and then something is told.
+- *sight*: items up to a reach drawn for each direction, in worlds where that takes time noticed at
+  each step with a probability drawn for the round; and now and then something is told.
 
 An observer with a sight view remembers: what follows from what they have seen and been told counts
 as visible. And they may take things for granted, such as that a car never seen is not there. For
@@ -146,11 +147,15 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     for group in domain.direction_groups:
         for direction in group[1:]:
             drawn[:, direction] = torch.where(alike, drawn[:, group[0]], drawn[:, direction])
+    least, most = domain.notice_practice
     keep, told, noise = {}, {}, {}
     spoken_to = uniform(batch) < TOLD_PROBABILITY
     for modality in domain.modalities:
         visual = modality.name == "visual"
-        rate = torch.where(dropout, uniform(batch), 1.0 if visual else 0.0)
+        seen = 1.0 if visual else 0.0
+        if visual and least < most:
+            seen = torch.where(sight, least + (most - least) * uniform(batch), 1.0)
+        rate = torch.where(dropout, uniform(batch), seen)
         keep[modality.name] = torch.where(full, 1.0, rate)
         often = domain.told_practice * uniform(batch)
         told[modality.name] = torch.where(sight & spoken_to, often, 0.0)

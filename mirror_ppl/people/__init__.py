@@ -17,6 +17,8 @@ from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import require_known
 from mirror_ppl.people.base import SimulatedPeople, act
+from mirror_ppl.people.bomb_defusal import Defusers
+from mirror_ppl.people.bomb_participants import DEFUSER_POPULATIONS, simulated_defusers
 from mirror_ppl.people.driving import Drivers, Memory, PlanningDrivers, TaskDrivers, remember
 from mirror_ppl.people.driving_participants import learned_reward, simulated_drivers
 from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_reward, log_policy
@@ -42,6 +44,7 @@ class DomainPeople:
 PEOPLE: dict[str, DomainPeople] = {
     "driving": DomainPeople(tuple(POPULATIONS), simulated_drivers),
     "search_rescue": DomainPeople(tuple(RESCUE_POPULATIONS), simulated_firefighters),
+    "bomb_defusal": DomainPeople(DEFUSER_POPULATIONS, simulated_defusers),
 }
 """The people of each domain, by its name."""
 
@@ -96,7 +99,8 @@ def simulate(
         each of the domain's directions (how far the person sees, in the domain's unit of distance;
         the last of ``reach_bins`` is everything), ``assumes_...`` for each of the domain's
         assumptions (1: made), and of driving ``consistency`` (1 / units of reward), of search and
-        rescue ``lapse`` (probability of a step in any direction).
+        rescue ``lapse`` (probability of a step in any direction); of bomb defusal
+        ``notices_...`` for each terminal (probability of finding it at a step).
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
@@ -115,6 +119,7 @@ __all__ = [
     "POPULATIONS",
     "CrossEntropyOptions",
     "Decisions",
+    "Defusers",
     "DomainPeople",
     "Drivers",
     "Firefighters",
@@ -133,6 +138,7 @@ __all__ = [
     "record",
     "remember",
     "simulate",
+    "simulated_defusers",
     "simulated_drivers",
     "simulated_firefighters",
     "simulated_people",

@@ -1,0 +1,415 @@
+"""Bomb defusal: three stages, and rules that the robot has wrong (supplement, sections A and E).
+
+Description
+    A bomb is defused in three stages; at each a button has to be pressed. Which of four it is
+    depends on the type of the bomb, A or B, and on the symbol that one of six terminals shows::
+
+        type    cross    plus    frame    bars     and as the robot was taught it
+        A       red      green   yellow   blue     frame blue, bars yellow
+        B       yellow   blue    green    red      cross green, frame yellow
+
+    That terminal is lit; the others show symbols too, which do not count. Every stage has new ones.
+
+    Rules of the robot and of the world are two instances of the same domain, see
+    `BombDefusal.as_believed`.
+
+Actions
+    0 wait, 1 red, 2 green, 3 blue, 4 yellow. A press leads to the next stage, right or wrong.
+
+Observations
+    ========  ============  =======  ===============================================================
+    ego       stage         count    which stage it is, 0 to 2; 3 when all is done; always known
+    ego       since         steps    since when; always known
+    visual    75 numbers    0 to 1   pixels of each terminal: row, column, red-green-blue
+    verbal    kind          0 or 1   the type of the bomb, what the utterance says: 1 if it is B
+    ========  ============  =======  ===============================================================
+
+    In the setting ``labelled`` the type is written on the bomb; in ``unlabelled`` nobody sees it.
+    All terminals are in view in both: that people do not find the right one at once is a matter of
+    people, not of the setting.
+
+Rewards, of the action and the state that it leads to
+    =====  ===  =====================================
+    right  +5   for the right button
+    wrong  -5   for another
+    time   -1   for each step until the third press
+    =====  ===  =====================================
+
+Start and end
+    A round begins at the first stage, and is over after the third press or 60 steps.
+
+Version history
+    1: first version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.bomb_knowledge import BombKnowledge
+from mirror_ppl.domains.bomb_panel import (
+    BUTTONS,
+    KINDS,
+    OLD_RULES,
+    PICTURE,
+    RULES,
+    STAGES,
+    SYMBOLS,
+    TERMINALS,
+    Rules,
+    panel,
+    read_panel,
+    right_button,
+)
+
+RIGHT, WRONG, TIME = 5.0, -5.0, -1.0
+WAIT = 0
+LIVE_NOWHERE = -1
+PIXELS = PICTURE[0] * PICTURE[1] * PICTURE[2]
+
+
+@dataclass(frozen=True)
+class BombState:
+    """State of a batch of rounds.
+
+    Attributes:
+        stage: ``[...]``, 0 to 2; 3 when all is done.
+        since: steps since the stage began ``[...]``, as far as a round goes.
+        kind: type of the bomb ``[...]``, 0 for A and 1 for B.
+        live: which terminal counts at each stage ``[..., 3]``.
+        symbols: what the terminals of each stage show ``[..., 3, 6]``, indices into ``SYMBOLS``.
+    """
+
+    stage: Tensor
+    since: Tensor
+    kind: Tensor
+    live: Tensor
+    symbols: Tensor
+
+
+class BombDefusal:
+    """The domain of bomb defusal; see the module's description.
+
+    Args:
+        rules: which button is right.
+    """
+
+    name = "bomb_defusal"
+    version = "1"
+    modalities: tuple[Modality, ...] = (
+        Modality(
+            "visual",
+            tuple(f"terminal {number}" for number in range(1, TERMINALS + 1)),
+            tuple(
+                f"pixel {row} {column} {colour}"
+                for row in range(PICTURE[0])
+                for column in range(PICTURE[1])
+                for colour in ("red", "green", "blue")
+            ),
+            ("intensity",) * PIXELS,
+            (1.0,) * PIXELS,
+            0.3,
+            image=PICTURE,
+        ),
+        Modality(
+            "verbal",
+            ("type",),
+            ("kind",),
+            ("truth",),
+            (1.0,),
+            0.5,
+            utterances=(tuple(f"{kind} bomb" for kind in KINDS),),
+        ),
+    )
+    ego_features: tuple[str, ...] = ("stage", "since")
+    symbol_sizes: Mapping[str, int] = {"ego": STAGES + 1, "visual": PIXELS, "verbal": len(KINDS)}
+    actions: tuple[str, ...] = ("wait", *BUTTONS)
+    horizon = 60
+    over_at_horizon = False
+    settings: tuple[str, ...] = ("labelled", "unlabelled")
+    scenarios: tuple[str, ...] = tuple(f"{kind} bomb" for kind in KINDS)
+    reward_terms: tuple[str, ...] = ("right", "wrong", "time")
+    mishap: tuple[str, str] = ("wrong", "wrong buttons")
+    counterparts: tuple[int | None, ...] = (None,) * TERMINALS
+    directions: tuple[str, ...] = ("panel",)
+    direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
+    reach_bins: tuple[float, ...] = (0.0,)
+    """Everybody reaches every terminal: they are all in front of them."""
+    reach_unit = "steps"
+    reach_practice: tuple[float, ...] = ()
+    told_practice = 0.5
+    # The robot takes people to be about as quick as they would have to be for waiting to pay.
+    notice_practice = (0.25, 1.0)
+    partial_views: Mapping[str, tuple[float, ...]] = {}
+    assumptions: tuple[str, ...] = ()
+
+    def __init__(self, rules: Rules = RULES) -> None:
+        self.rules = rules
+
+    @property
+    def as_believed(self) -> BombDefusal:
+        """The world as the robot was taught it: with the old rules."""
+        return BombDefusal(OLD_RULES)
+
+    def initial(
+        self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
+    ) -> BombState:
+        """States ``[batch]`` at the first stage.
+
+        Args:
+            batch: number of rounds.
+            generator: source of randomness; its device is where the states live.
+            scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
+        """
+        device = generator.device
+
+        def drawn(most: int, *shape: int) -> Tensor:
+            return torch.randint(most, (batch, *shape), generator=generator, device=device)
+
+        if scenario is None:
+            scenario = drawn(len(self.scenarios))
+        nothing = torch.zeros(batch, dtype=torch.long, device=device)
+        return BombState(
+            stage=nothing,
+            since=nothing,
+            kind=scenario,
+            live=drawn(TERMINALS, STAGES),
+            symbols=drawn(len(SYMBOLS), STAGES, TERMINALS),
+        )
+
+    def anywhere(self, batch: int, generator: torch.Generator) -> BombState:
+        """States ``[batch]`` at the beginning of any stage."""
+        state = self.initial(batch, generator)
+        stage = torch.randint(STAGES, (batch,), generator=generator, device=generator.device)
+        return replace(state, stage=stage)
+
+    def transition(self, state: BombState, action: Tensor) -> BombState:
+        """State at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
+        presses = (action != WAIT) & ~self.over(state)
+        waits = (action == WAIT) & ~self.over(state)
+        return replace(
+            state,
+            stage=state.stage + presses.long(),
+            since=torch.where(presses, 0, state.since + waits.long()).clamp(max=self.horizon),
+        )
+
+    def rewards(self, state: BombState, action: Tensor, following: BombState) -> dict[str, Tensor]:
+        """Reward terms ``[...]`` by name, in units of reward."""
+        del following
+        _, symbol = self._shown(state)
+        presses = (action != WAIT) & ~self.over(state)
+        right = action - 1 == right_button(self.rules, state.kind, symbol)
+        dtype = torch.get_default_dtype()
+        return {
+            "right": RIGHT * (presses & right).to(dtype),
+            "wrong": WRONG * (presses & ~right).to(dtype),
+            "time": TIME * (~self.over(state)).to(dtype),
+        }
+
+    def _panel(self, state: BombState) -> tuple[Tensor, Tensor]:
+        """The terminal that counts ``[...]``, and symbols ``[..., 6]``, at the present stage."""
+        stage = state.stage.clamp(max=STAGES - 1)
+        live = state.live.take_along_dim(stage[..., None], -1).squeeze(-1)
+        symbols = state.symbols.take_along_dim(stage[..., None, None], -2).squeeze(-2)
+        return live, symbols
+
+    def _shown(self, state: BombState) -> tuple[Tensor, Tensor]:
+        """The terminal that counts ``[...]``, and its symbol."""
+        live, symbols = self._panel(state)
+        return live, symbols.take_along_dim(live[..., None], -1).squeeze(-1)
+
+    def over(self, state: BombState) -> Tensor:
+        """Where the third button was pressed ``[...]``."""
+        return state.stage >= STAGES
+
+    def observe(self, state: BombState) -> Observation:
+        """Everything there is to observe: ego ``[..., 2]``, visual ``[..., 6, 75]`` and so on.
+
+        When all is done no terminal is lit.
+        """
+        dtype = torch.get_default_dtype()
+        live, symbols = self._panel(state)
+        live = torch.where(self.over(state), LIVE_NOWHERE, live)
+        return {
+            "ego": torch.stack([state.stage, state.since], -1).to(dtype),
+            "visual": panel(live, symbols).to(dtype),
+            "verbal": state.kind[..., None, None].to(dtype),
+        }
+
+    def visibility(self, setting: str, observation: Observation) -> Visibility:
+        """What the setting lets an unaided person see.
+
+        Raises:
+            UnknownNameError: if the setting is neither ``labelled`` nor ``unlabelled``.
+        """
+        require_known(setting, "setting", self.settings)
+        everything = self.communicable(observation)
+        if setting == "labelled":
+            return everything
+        return {**everything, "verbal": torch.zeros_like(everything["verbal"])}
+
+    def communicable(self, observation: Observation) -> Visibility:
+        """Every terminal can be shown, and of the type can be spoken."""
+        return {
+            name: torch.ones_like(observation[name][..., 0], dtype=torch.bool)
+            for name in ("visual", "verbal")
+        }
+
+    def faults(self, observation: Observation) -> dict[str, Tensor]:
+        """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
+        stage, since = observation["ego"].unbind(-1)
+        kind = observation["verbal"][..., 0, 0]
+        possible = (stage == stage.round()) & (stage >= 0) & (stage <= STAGES)
+        live, symbols = read_panel(observation["visual"])
+        live = torch.where(stage >= STAGES, LIVE_NOWHERE, live)
+        unlike = (observation["visual"] - panel(live, symbols)).abs().amax((-1, -2))
+        return {
+            "stage has to be 0, 1, 2 or 3": ~possible,
+            "since has to be a whole number, 0 or more": (since != since.round()) | (since < 0),
+            "kind has to be 0 or 1": (kind != 0) & (kind != 1),
+            "one terminal has to be lit until all is done, and each to show a symbol": (
+                unlike > 1e-3  # noqa: PLR2004 - of rounding
+            ),
+        }
+
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> BombKnowledge:
+        """Knowledge ``[*batch]`` before anything was observed."""
+        return BombKnowledge.nothing(*batch, device=device)
+
+    def learn(
+        self,
+        knowledge: BombKnowledge,
+        observation: Observation,
+        visible: Visibility,
+        sees: Callable[[Observation], Visibility],
+    ) -> BombKnowledge:
+        """The type stays known, and what terminals show until the next stage."""
+        del sees
+        return knowledge.learn(observation, visible)
+
+    def known(self, knowledge: BombKnowledge) -> Visibility:
+        """Terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
+        return knowledge.items()
+
+    def assume(
+        self, knowledge: BombKnowledge, observation: Observation
+    ) -> tuple[dict[str, Visibility], Observation]:
+        """Nothing is taken for granted."""
+        del knowledge
+        return {}, observation
+
+    def supposed(
+        self, state: BombState, knowledge: BombKnowledge, assumes: Mapping[str, Tensor]
+    ) -> BombState:
+        """The state as it is: nothing is taken for granted."""
+        del knowledge, assumes
+        return state
+
+    def symbols(self, observation: Observation) -> dict[str, Tensor]:
+        """Observations in the form in which networks read them.
+
+        Returns:
+            ego ``[..., 4]``, one-hot stage; visual ``[..., 6, 75]``, raw pixels; verbal
+            ``[..., 1, 2]``, one-hot which of the two utterances is true.
+        """
+        ego = one_hot(observation["ego"][..., 0].long(), STAGES + 1).to(observation["ego"])
+        said = one_hot(observation["verbal"][..., 0].long(), len(KINDS)).to(observation["ego"])
+        return {"ego": ego, "visual": observation["visual"], "verbal": said}
+
+    def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
+        """There is one direction, and all terminals are at hand: zeros ``[..., 6]``."""
+        distance = torch.zeros_like(observation["visual"][..., 0])
+        return distance.long(), distance
+
+    def state_behind(self, observation: Observation) -> BombState:
+        """The state ``[...]`` that gives this observation of everything.
+
+        Of other stages nothing can be observed: their terminals are taken to be like those now.
+        """
+        stage, since = observation["ego"].round().long().unbind(-1)
+        live, symbols = read_panel(observation["visual"])
+        return BombState(
+            stage=stage,
+            since=since,
+            kind=observation["verbal"][..., 0, 0].round().long(),
+            live=live[..., None].expand(*live.shape, STAGES),
+            symbols=symbols[..., None, :].expand(*live.shape, STAGES, TERMINALS),
+        )
+
+    def nearest(self, observation: Observation) -> Observation:
+        """The observation that can be and is nearest to decoded values."""
+        stage, since = observation["ego"].round().unbind(-1)
+        live, symbols = read_panel(observation["visual"])
+        stage = stage.clamp(0, STAGES)
+        live = torch.where(stage >= STAGES, LIVE_NOWHERE, live)
+        return {
+            "ego": torch.stack([stage, since.clamp(min=0)], -1),
+            "visual": panel(live, symbols).to(observation["visual"]),
+            "verbal": observation["verbal"].round().clamp(0, 1),
+        }
+
+    def relevance(self, observation: Observation) -> dict[str, Visibility]:
+        """The terminal that counts, and the type (supplement, section F)."""
+        live, _ = read_panel(observation["visual"])
+        lit = torch.arange(TERMINALS, device=live.device) == live[..., None]
+        under_way = observation["ego"][..., :1] < STAGES
+        return {
+            "terminal_and_type": {
+                "visual": lit & under_way,
+                "verbal": under_way.expand(observation["verbal"].shape[:-1]),
+            }
+        }
+
+    def describe(self, observation: Observation, modality: str, item: str) -> str:
+        """Such as "Type A bomb", or "terminal 2 (lit, cross)"."""
+        if modality == "verbal":
+            return f"{KINDS[int(observation['verbal'][0, 0])]} bomb"
+        live, symbols = read_panel(observation["visual"])
+        number = self.modalities[0].items.index(item)
+        shows = tuple(SYMBOLS)[int(symbols[number])]
+        return f"{item} ({'lit, ' if number == int(live) else ''}{shows})"
+
+    def deed(self, observation: Observation, item: str | None, action: int) -> str:
+        """What they would do."""
+        del observation, item
+        return "wait" if action == WAIT else f"press {self.actions[action]}"
+
+    def reference_values(self, state: BombState, discount: float) -> Tensor:
+        """Exact action values ``[..., 5]`` with everything known, for as long as it takes."""
+        _, symbol = self._shown(state)
+        right = right_button(self.rules, state.kind, symbol)
+        presses = torch.arange(len(BUTTONS), device=right.device) == right[..., None]
+        left = torch.arange(STAGES + 1, device=right.device).flip(0)
+        weights = discount ** torch.arange(STAGES, device=right.device)
+        best = torch.cat([weights.new_zeros(1), weights.cumsum(0)])[left] * (RIGHT + TIME)
+        now, following = best[state.stage], best[(state.stage + 1).clamp(max=STAGES)]
+        values = torch.where(presses, RIGHT, WRONG) + (discount * following + TIME)[..., None]
+        values = torch.cat([(TIME + discount * now)[..., None], values], -1)
+        return torch.where(self.over(state)[..., None], 0.0, values)
+
+    def render(self, state: BombState) -> np.ndarray:
+        """Picture ``uint8 [height, width, 3]`` of one state: the terminals, the type, the stage."""
+        cell, gap = 6, 6
+        side = PICTURE[0] * cell
+        columns = TERMINALS // 2
+        height, width = 3 * gap + 2 * side + 12, (columns + 1) * gap + columns * side
+        picture = np.full((height, width, 3), 90, dtype=np.uint8)
+        pixels = self.observe(state)["visual"].unflatten(-1, PICTURE).numpy()
+        for number, terminal in enumerate((255 * pixels).round().astype(np.uint8)):
+            row, column = divmod(number, columns)
+            top, left = gap + row * (side + gap), gap + column * (side + gap)
+            grown = terminal.repeat(cell, 0).repeat(cell, 1)
+            picture[top : top + side, left : left + side] = grown
+        done = int(state.stage)
+        for stage in range(STAGES):
+            left = gap + stage * 14
+            picture[-12:-4, left : left + 10] = (60, 160, 60) if stage < done else (40, 40, 40)
+        picture[-12:-4, -gap - 20 : -gap] = ((220, 120, 40), (60, 120, 220))[int(state.kind)]
+        return picture

@@ -1,0 +1,51 @@
+"""What somebody has learned of a bomb.
+
+The type of the bomb stays, and so does what is known of it. Every stage has terminals of its own:
+what was seen of them is known until the next stage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.domains.bomb_panel import TERMINALS
+
+
+@dataclass(frozen=True)
+class BombKnowledge:
+    """At one step.
+
+    Attributes:
+        stage: of that step ``[...]``.
+        terminals: whether it is known what each shows ``[..., 6]``.
+        kind: whether the type of the bomb is known ``[...]``.
+    """
+
+    stage: Tensor
+    terminals: Tensor
+    kind: Tensor
+
+    @classmethod
+    def nothing(cls, *batch: int, device: torch.device | None = None) -> BombKnowledge:
+        """Before anything was observed."""
+        return cls(
+            torch.zeros(batch, dtype=torch.long, device=device),
+            torch.zeros(*batch, TERMINALS, dtype=torch.bool, device=device),
+            torch.zeros(batch, dtype=torch.bool, device=device),
+        )
+
+    def learn(self, observation: Observation, visible: Visibility) -> BombKnowledge:
+        """Knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
+        stage = observation["ego"][..., 0].round().long()
+        same = (stage == self.stage)[..., None]
+        kind = self.kind | visible["verbal"][..., 0]
+        terminals = (self.terminals & same) | visible["visual"]
+        return BombKnowledge(stage.expand(kind.shape), terminals, kind)
+
+    def items(self) -> Visibility:
+        """Terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
+        return {"visual": self.terminals, "verbal": self.kind[..., None]}

@@ -1,0 +1,211 @@
+"""People who defuse bombs: what they have in mind, and when they press (supplement, section B).
+
+Who does not know the type of the bomb guesses, once a round. At every stage somebody looks for the
+terminal that counts and finds it at each step with a probability of their own; who has found it, or
+was shown it, presses the button that is right for the type they believe in, and until then waits:
+
+====================  ==========================================================================
+``notices``           probability of finding each terminal at a step
+``k_t``               the type that they believe in: what they know, else their guess
+``f_t``               whether they have found the terminal that counts
+====================  ==========================================================================
+
+``p(f_t | not f_{t-1}) = notices[terminal]``, and ``a_t`` is the right button for ``k_t`` if
+``f_t``, else to wait. Penalties teach nothing about the type: who guessed wrong stays wrong.
+
+Choices that the supplement leaves open, with their reasons, are in ``docs/people.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
+from mirror_ppl.domains.bomb_panel import KINDS, STAGES, read_panel, right_button
+from mirror_ppl.people.base import SimulatedPeople, each
+
+UNDECIDED = -1
+"""The guess of somebody who has not guessed yet."""
+
+
+@dataclass(frozen=True)
+class Mind:
+    """What somebody knows and has found.
+
+    Attributes:
+        informed: whether they know the type ``[...]``.
+        guess: what they take it for if they do not, ``[...]``.
+        found: whether they have found the terminal that counts ``[...]``, at ``stage`` ``[...]``.
+        step: number of the next step ``[...]``.
+        fate: uniform numbers ``[..., 1 + T]``: of the guess, and of finding it at each step.
+    """
+
+    informed: Tensor
+    guess: Tensor
+    found: Tensor
+    stage: Tensor
+    step: Tensor
+    fate: Tensor
+
+
+@dataclass(frozen=True)
+class Defusers(SimulatedPeople):
+    """P people who defuse bombs.
+
+    Attributes:
+        notices: probability of finding each terminal at a step ``[P, 6]``.
+        reads: whether each can read the type on the bomb ``[P]``.
+    """
+
+    notices: Tensor
+    reads: Tensor
+
+    fates: ClassVar[int] = 1 + BombDefusal.horizon
+
+    @property
+    def domain(self) -> BombDefusal:
+        """Bomb defusal, by the rules that are so."""
+        return BombDefusal()
+
+    def truth(self) -> dict[str, Tensor]:
+        """How probably they find each terminal at a step."""
+        items = self.domain.modalities[0].items
+        return {f"notices_{item}": self.notices[:, place] for place, item in enumerate(items)}
+
+    def start(self, *batch: int, fate: Tensor | None = None) -> Mind:
+        """Minds ``[P, *batch]`` before a round; see `SimulatedPeople.start`."""
+        shape, device = (len(self.notices), *batch), self.notices.device
+        if fate is None:
+            fate = torch.full((*shape, self.fates), 0.5, device=device)
+        never = torch.zeros(shape, dtype=torch.bool, device=device)
+        nothing = torch.zeros(shape, dtype=torch.long, device=device)
+        return Mind(never, nothing + UNDECIDED, never, nothing, nothing, fate)
+
+    def sees(self, observation: Observation) -> Visibility:
+        """What they see at once: no terminal, and the type if they can read it."""
+        nothing = torch.zeros_like(observation["visual"][..., 0], dtype=torch.bool)
+        verbal = observation["verbal"][..., 0]
+        reads = each(self.reads, verbal.dim() - 1)
+        return {"visual": nothing, "verbal": reads.expand(verbal.shape)}
+
+    def step(
+        self, memory: Mind, observation: Observation, told: Visibility | None = None
+    ) -> tuple[Tensor, Mind]:
+        """Look, listen, and press; see `SimulatedPeople.step`."""
+        decided, chance = self._look(memory, observation, told)
+        luck = memory.fate.take_along_dim(1 + memory.step[..., None], -1).squeeze(-1)
+        first = (memory.fate[..., 0] * len(KINDS)).long()
+        mind = replace(
+            decided,
+            guess=torch.where(decided.guess == UNDECIDED, first, decided.guess),
+            found=decided.found | (luck < chance),
+        )
+        return self._acts(mind, observation), mind
+
+    def branches(
+        self, memory: Mind, observation: Observation, told: Visibility
+    ) -> tuple[Tensor, Mind, Tensor]:
+        """Found or not with either guess, ``G`` = 4; see `SimulatedPeople.branches`."""
+        decided, chance = self._look(memory, observation, told)
+        found = torch.stack([1 - chance, chance], -1)
+        found = torch.where(decided.found[..., None], found.new_tensor([0.0, 1.0]), found)
+        kinds = len(KINDS)
+        guess = one_hot(decided.guess.clamp(min=0), kinds).to(found.dtype)
+        guess = torch.where((decided.guess == UNDECIDED)[..., None], 1 / kinds, guess)
+        chances = (found[..., None] * guess[..., None, :]).flatten(-2)
+        which = torch.arange(2 * kinds, device=chances.device).expand(chances.shape)
+
+        def of_each(part: Tensor, behind: int = 0) -> Tensor:
+            part = part.unsqueeze(-1 - behind)
+            return part.expand(*chances.shape, *part.shape[chances.dim() :])
+
+        minds = Mind(
+            of_each(decided.informed),
+            which % kinds,
+            which >= kinds,
+            of_each(decided.stage),
+            of_each(decided.step),
+            of_each(decided.fate, 1),
+        )
+        seen = {
+            name: value.unsqueeze(decided.guess.dim()).expand(
+                *chances.shape, *value.shape[decided.guess.dim() :]
+            )
+            for name, value in observation.items()
+        }
+        return chances, minds, self._acts(minds, seen)
+
+    def kept(self, memory: Mind) -> Mind:
+        """What they know, guess and have found."""
+        return replace(memory, step=torch.zeros_like(memory.step), fate=memory.fate[..., :0])
+
+    def predictive(
+        self, probabilities: Tensor, observation: Observation, actions: Tensor
+    ) -> Tensor:
+        """Of actions ``[P, B, T, A]``, given what was done before but not what they had in mind.
+
+        Who has not pressed yet has not found it yet; what was pressed tells what they believe in.
+        """
+        now = {name: value[:, :, :-1] for name, value in observation.items()}
+        chance, symbol = self._counts(now)
+        true = now["verbal"][..., 0, 0].long()
+        kinds = torch.arange(len(KINDS), device=true.device)
+        buttons = right_button(
+            self.domain.rules, kinds.expand(*symbol.shape, -1), symbol[..., None]
+        )
+        informed = self.sees(now)["verbal"][..., 0, None]
+        believed = torch.where(informed, (true[..., None] == kinds).to(chance.dtype), 0.5)
+        pressed = actions[..., None] == 1 + buttons
+        told = torch.where((actions == WAIT)[..., None], 1.0, pressed.to(chance.dtype))
+        # Of the steps before.
+        so_far = torch.cat([torch.ones_like(told[:, :, :1]), told[:, :, :-1]], 2).cumprod(2)
+        believed = believed * so_far
+        believed = believed / believed.sum(-1, keepdim=True).clamp(min=1e-12)
+        press = one_hot(1 + buttons, len(self.domain.actions)).to(chance.dtype)
+        press = (believed[..., None] * press).sum(-2)
+        wait = one_hot(torch.zeros_like(symbol), len(self.domain.actions)).to(chance.dtype)
+        found = chance[..., None] * press + (1 - chance)[..., None] * wait
+        over = now["ego"][..., 0] >= STAGES
+        return torch.where(over[..., None], wait, found)
+
+    def _counts(self, observation: Observation) -> tuple[Tensor, Tensor]:
+        """How probably the terminal that counts is found now ``[P, ...]``, and its symbol."""
+        live, symbols = read_panel(observation["visual"])
+        symbol = symbols.take_along_dim(live[..., None], -1).squeeze(-1)
+        own = each(self.notices, live.dim() - 1)
+        return own.expand(*live.shape, -1).take_along_dim(live[..., None], -1).squeeze(-1), symbol
+
+    def _look(
+        self, memory: Mind, observation: Observation, told: Visibility | None
+    ) -> tuple[Mind, Tensor]:
+        """Minds before chance decides, and how probably the terminal is found now."""
+        chance, _ = self._counts(observation)
+        stage = observation["ego"][..., 0].long()
+        found = memory.found & (stage == memory.stage)
+        heard = self.sees(observation)["verbal"][..., 0]
+        if told is not None:
+            live, _ = read_panel(observation["visual"])
+            found = found | told["visual"].take_along_dim(live[..., None], -1).squeeze(-1)
+            heard = heard | told["verbal"][..., 0]
+        return replace(
+            memory,
+            informed=memory.informed | heard,
+            found=found,
+            stage=stage.expand(found.shape),
+            step=(memory.step + 1).clamp(max=self.domain.horizon - 1),
+        ), chance
+
+    def _acts(self, mind: Mind, observation: Observation) -> Tensor:
+        """Probabilities of actions ``[P, ..., A]``: all but one are 0."""
+        _, symbol = self._counts(observation)
+        kind = torch.where(mind.informed, observation["verbal"][..., 0, 0].long(), mind.guess)
+        button = right_button(self.domain.rules, kind, symbol)
+        presses = mind.found & (observation["ego"][..., 0] < STAGES)
+        action = torch.where(presses, 1 + button, WAIT)
+        return one_hot(action, len(self.domain.actions)).to(self.notices.dtype)
