@@ -16,7 +16,7 @@ exact planner; it takes about ten minutes. A guide learns from people who are dr
 model's prior; it takes about half an hour. A run that is stopped goes on when the same command is
 given again."""
 SELF_MODEL, GUIDE = "self-model", "guide"
-OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "device")
+OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "sizes", "device")
 OF_GUIDE = ("people", "human_model", "self_model")
 
 
@@ -31,19 +31,22 @@ class Options:
     Default: runs/driving_self_model.safetensors or runs/driving_guide.safetensors, by the name of
     the domain."""
     domain: str = "driving"
-    """The world to learn: driving (two lanes, four cars that never yield) or search_rescue (a
-    burning house, a victim, two corridors)."""
+    """The world to learn: driving (two lanes, four cars that never yield), search_rescue (a
+    burning house, a victim, two corridors) or bomb_defusal (three stages, six terminals)."""
     phases: int | None = None
     """Of a self-model: phases of acting and learning; 2 to try it out. Default: what makes a good
-    one, of driving 40 and of search_rescue 400."""
+    one, of driving 40, of search_rescue 400 and of bomb_defusal 200."""
     steps: int | None = None
-    """Of a self-model: gradient steps of a phase. Default: of driving 300, of search_rescue 40."""
+    """Of a self-model: gradient steps of a phase. Default: of driving 300, of the others 40."""
     learning_rate: float | None = None
     """Of a self-model: learning rate at the start; it falls to a hundredth. Default: of driving
-    0.001, of search_rescue 0.002."""
+    0.001, of the others 0.002."""
     speech: str = "words"
     """Of a self-model: what makes numbers of utterances, words or gpt2 (the supplement's; needs the
     extra "speech" and its weights)."""
+    sizes: str = "shipped"
+    """Of a self-model: sizes of the networks, shipped or paper (the supplement's, which differ in
+    bomb_defusal: a Q-network of 3 x 2048)."""
     people: int = 1000
     """Of a guide: people to learn from, simulated in the true domain."""
     human_model: str | None = None
@@ -111,10 +114,14 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.evaluation.self_model import self_model_quality
     from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
+    from mirror_ppl.models.sizes import PAPER, SIZES
     from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
 
     require_known(options.speech, "speech", tuple(EMBEDDINGS))
+    sizes = {"shipped": SIZES, "paper": PAPER}[
+        require_known(options.sizes, "sizes", ("shipped", "paper"))
+    ][options.domain]
     settings = SelfModelOptions.of(
         options.domain,
         phases=options.phases,
@@ -124,13 +131,16 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
     generator = torch.Generator(usable_device(options.device)).manual_seed(options.seed)
     with Progress("train", settings.phases) as progress:
         self_model = train_self_model(
-            get_domain(options.domain),
+            get_domain(options.domain).as_believed,
             settings,
             generator,
             progress.update,
             checkpoint,
             options.speech,
+            sizes,
         )
+    # It was taught the world as it is believed to be, and lives in the world as it is.
+    self_model.domain = get_domain(options.domain)
     quality = self_model_quality(self_model, discount=settings.discount)
     card = _described(options, settings, quality, "measured on 4000 rounds")
     save_self_model(self_model, out, card)

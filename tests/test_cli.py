@@ -276,7 +276,10 @@ class Dreamer(HumanModel):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("--domain", "flying"), 'unknown domain "flying"; known: bomb_defusal, driving, search_rescue'),
+        (
+            ("--domain", "flying"),
+            'unknown domain "flying"; known: bomb_defusal, driving, search_rescue',
+        ),
         (("--setting", "rain"), 'unknown setting "rain"; known: clear, fog'),
         (("--population", "dense"), 'unknown population "dense"; known: diverse, paper'),
         (("--device", "abacus"), 'unknown device "abacus"; known: cpu'),

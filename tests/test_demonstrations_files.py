@@ -197,7 +197,7 @@ BAD_DATASETS = {
     ),
     "unknown domain": (
         renamed(domain="boats"),
-        'unknown domain "boats"; known: driving, search_rescue',
+        'unknown domain "boats"; known: bomb_defusal, driving, search_rescue',
     ),
     "unknown setting": (renamed(setting="rain"), 'unknown setting "rain"; known: clear, fog'),
     "no actions": (

@@ -42,6 +42,8 @@ class Experience:
         rounds: what happened.
         outcomes: of every action.
         over: whether nothing could be won or lost any more, at these steps ``[B, T']``.
+        informed: whether the observer knows everything there ``[B, T']``.
+        exact: values of every action for somebody who does, if asked for, ``[B, T', A]``.
         first: first step at which they were worked out.
         stride: how far these steps are apart.
     """
@@ -49,6 +51,8 @@ class Experience:
     rounds: Rounds
     outcomes: tuple[Outcomes, ...]
     over: Tensor
+    informed: Tensor
+    exact: Tensor | None = None
     first: int = 0
     stride: int = 1
 
@@ -73,6 +77,7 @@ def experience(
     plan: ViewPlan,
     first: int = 0,
     stride: int = 1,
+    discount: float | None = None,
 ) -> Experience:
     """What an observer with a view gets from rounds.
 
@@ -86,6 +91,7 @@ def experience(
         plan: views of B rounds.
         first: first step at which the outcomes of every action are worked out.
         stride: how far these steps are apart.
+        discount: of exact values; without it there are none.
     """
     states = roll_out(domain, start, actions)
     visible, knowledge = follow(domain, plan, domain.observe(states))
@@ -111,10 +117,12 @@ def experience(
 
     observation = domain.observe(believed)
     taken = plan.taken(domain, knowledge, observation)
+    visible = {name: mask | taken[name] for name, mask in visible.items()}
+    everything = torch.stack([mask.all(-1) for mask in visible.values()]).all(0)
     return Experience(
         rounds=Rounds(
             observation=observation,
-            visible={name: mask | taken[name] for name, mask in visible.items()},
+            visible=visible,
             actions=actions,
             rewards=total_reward(
                 domain.rewards(current, actions, domain.transition(current, actions))
@@ -125,6 +133,8 @@ def experience(
             for index in range(len(domain.actions))
         ),
         over=domain.over(some),
+        exact=None if discount is None else domain.reference_values(some, discount),
+        informed=everything[:, steps],
         first=first,
         stride=stride,
     )

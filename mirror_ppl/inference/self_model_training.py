@@ -7,7 +7,8 @@ draws rounds from all experience so far, sees each through a view of its own, an
     - ELBO / (B (T + 1)) * world_weight  +  mean squared Bellman error of both actions.
 
 The Bellman error uses the outcomes of *every* action: the robot's simulator is at hand, so no
-action's value has to wait until somebody takes it.
+action's value has to wait until somebody takes it. Where the robot knows everything, it can also
+learn from the exact planner, which is its expert, instead of from what it expects itself.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.experience import Experience, drive, experience
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
 from mirror_ppl.models.views import draw_views
 
@@ -52,6 +54,8 @@ class SelfModelOptions:
         world_weight: weight of the negative ELBO per observation.
         length: steps of a round that is learned from; as many as a round has, if 0.
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
+        exact: whether somebody who knows everything learns the exact planner's values, and not
+            what a step leads to.
     """
 
     phases: int = 40
@@ -69,6 +73,7 @@ class SelfModelOptions:
     world_weight: float = 0.01
     length: int = 0
     stride: int = 1
+    exact: bool = False
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
@@ -106,6 +111,7 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "world_weight": 0.01,
         "length": 16,
         "stride": 2,
+        "exact": True,
     },
     "bomb_defusal": {
         "phases": 200,
@@ -119,6 +125,8 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "target_rate": 0.02,
         "world_weight": 0.01,
         "length": 12,
+        "stride": 2,
+        "exact": True,
     },
 }
 """Settings that differ by domain; beta and epsilon are the supplement's."""
@@ -171,7 +179,10 @@ def self_model_loss(
             if self_model.domain.over_at_horizon and steps == self_model.domain.horizon:
                 over = over | (torch.arange(steps, device=over.device) == steps - 1)[lived.steps]
             goals.append(outcome.reward + options.discount * value.masked_fill(over, 0.0))
-    error = self_model.action_values(belief) - torch.stack(goals, -1)
+    goal = torch.stack(goals, -1)
+    if lived.exact is not None:
+        goal = torch.where(lived.informed[..., None], lived.exact, goal)
+    error = self_model.action_values(belief) - goal
     # When all is done it does not matter what one does.
     bellman = error[~lived.over].pow(2).mean()
     return Loss(
@@ -186,6 +197,7 @@ def train_self_model(
     report: Callable[[int, str], None] = lambda done, message: None,
     checkpoint: Path | None = None,
     speech: str = "words",
+    sizes: Sizes | None = None,
 ) -> SelfModel:
     """Train a self-model from nothing.
 
@@ -197,6 +209,7 @@ def train_self_model(
         report: called after each phase with the number of phases done and a message.
         checkpoint: file that is written after each phase and continued from if it exists.
         speech: a name in `mirror_ppl.models.speech.EMBEDDINGS`.
+        sizes: of the networks; the domain's own unless given.
 
     Raises:
         AssetError: that embedding needs what is not there.
@@ -207,7 +220,7 @@ def train_self_model(
     seed = int(torch.randint(2**31, (1,), generator=generator, device=device))
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        trainer = _Trainer(domain, options, generator, seed, speech)
+        trainer = _Trainer(domain, options, generator, seed, speech, sizes or sizes_of(domain))
         trainer.run(report, checkpoint)
     return trainer.self_model.eval()
 
@@ -221,7 +234,8 @@ class _Trainer:
         options: SelfModelOptions,
         generator: torch.Generator,
         seed: int,
-        speech: str = "words",
+        speech: str,
+        sizes: Sizes,
     ) -> None:
         self.domain = domain
         self.options = options
@@ -231,10 +245,11 @@ class _Trainer:
             "options": asdict(options),
             "seed": seed,
             "speech": speech,
+            "sizes": asdict(sizes),
         }
         self.generator = generator
         embedding = EMBEDDINGS[speech]
-        self.self_model = SelfModel(domain, embedding=embedding).to(generator.device)
+        self.self_model = SelfModel(domain, sizes, embedding).to(generator.device)
         self.target = copy.deepcopy(self.self_model.q_network)
         self.optimizer = torch.optim.Adam(
             self.self_model.parameters(), options.learning_rate, fused=True
@@ -333,7 +348,13 @@ class _Trainer:
             plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
             start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
             lived = experience(
-                self.domain, start, actions[chosen], plan, self._first(), options.stride
+                self.domain,
+                start,
+                actions[chosen],
+                plan,
+                self._first(),
+                options.stride,
+                options.discount if options.exact else None,
             )
             loss = self_model_loss(
                 self.self_model, self.target, lived, options, on_means=step % 2 == 1
