@@ -144,9 +144,10 @@ class BombDefusal:
     """Everybody reaches every terminal: they are all in front of them."""
     reach_unit = "steps"
     reach_practice: tuple[float, ...] = ()
-    told_practice = 0.5
-    # The robot takes people to be about as quick as they would have to be for waiting to pay.
-    notice_practice = (0.25, 1.0)
+    told_practice = 0.1
+    # People search for long and go on searching, as if they were about to find it.
+    notice_practice = (0.02, 1.0)
+    notice_hope = 0.5
     partial_views: Mapping[str, tuple[float, ...]] = {}
     assumptions: tuple[str, ...] = ()
 
@@ -255,6 +256,12 @@ class BombDefusal:
             return everything
         return {**everything, "verbal": torch.zeros_like(everything["verbal"])}
 
+    def sought(self, observation: Observation) -> Tensor:
+        """The terminal that is lit ``[..., 6]``, if one is."""
+        live, _ = read_panel(observation["visual"])
+        lit = torch.arange(TERMINALS, device=live.device) == live[..., None]
+        return lit & (observation["ego"][..., :1] < STAGES)
+
     def communicable(self, observation: Observation) -> Visibility:
         """Every terminal can be shown, and of the type can be spoken."""
         return {
@@ -357,12 +364,10 @@ class BombDefusal:
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
         """The terminal that counts, and the type (supplement, section F)."""
-        live, _ = read_panel(observation["visual"])
-        lit = torch.arange(TERMINALS, device=live.device) == live[..., None]
         under_way = observation["ego"][..., :1] < STAGES
         return {
             "terminal_and_type": {
-                "visual": lit & under_way,
+                "visual": self.sought(observation),
                 "verbal": under_way.expand(observation["verbal"].shape[:-1]),
             }
         }

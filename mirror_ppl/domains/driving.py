@@ -144,6 +144,7 @@ class Driving:
     reach_practice: tuple[float, ...] = ()
     told_practice = 0.5
     notice_practice = (1.0, 1.0)
+    notice_hope = 1.0
     partial_views: Mapping[str, tuple[float, ...]] = {
         "fog": (FOG_REACH, FOG_REACH, 0.0, 0.0),
         "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),
@@ -235,6 +236,10 @@ class Driving:
         else:
             seen = (ahead >= 0) & (ahead <= FOG_REACH)
         return {"visual": seen, "verbal": torch.zeros_like(seen)}
+
+    def sought(self, observation: Observation) -> Tensor:
+        """Everything."""
+        return torch.ones_like(observation["visual"][..., 0], dtype=torch.bool)
 
     def communicable(self, observation: Observation) -> Visibility:
         """Only cars in front on the visible road may be shown; any car on it may be spoken of."""

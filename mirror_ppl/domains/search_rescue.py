@@ -173,6 +173,7 @@ class SearchRescue:
     )
     told_practice = 0.05
     notice_practice = (1.0, 1.0)
+    notice_hope = 1.0
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ()
 
@@ -284,6 +285,10 @@ class SearchRescue:
         if setting == "clear":
             return {"visual": torch.ones_like(distance, dtype=torch.bool), "verbal": everything}
         return {"visual": distance <= SMOKE_REACH, "verbal": ~everything}
+
+    def sought(self, observation: Observation) -> Tensor:
+        """Everything."""
+        return torch.ones_like(observation["visual"][..., 0], dtype=torch.bool)
 
     def communicable(self, observation: Observation) -> Visibility:
         """Every portion can be shown, and of every corridor and room can be spoken."""

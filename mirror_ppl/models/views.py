@@ -5,8 +5,9 @@ what they make of it. So each training round is seen in a way of its own, of thr
 
 - *full*: everything, in both modalities;
 - *dropout*: each item with a probability drawn for the round, in each modality;
-- *sight*: items up to a reach drawn for each direction, in worlds where that takes time noticed at
-  each step with a probability drawn for the round; and now and then something is told.
+- *sight*: items up to a reach drawn for each direction; in worlds where one has to search, what one
+  looks for, noticed at each step with a probability drawn for the round. Now and then something is
+  told.
 
 An observer with a sight view remembers: what follows from what they have seen and been told counts
 as visible. And they may take things for granted, such as that a car never seen is not there. For
@@ -17,7 +18,7 @@ observer would conclude; an item that is merely not visible stays unknown.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -30,6 +31,8 @@ KIND_PROBABILITIES = (0.1, 0.1, 0.8)
 ASSUMPTION_PROBABILITY = 0.7
 """Share of sight views in which each assumption is made."""
 TOLD_PROBABILITY = 0.4
+HEARD_PROBABILITY = 0.5
+"""Share of sight views, in worlds where one has to search, in which utterances need not be told."""
 ALIKE_PROBABILITY = 0.5
 """Share of sight views with the same reach in all directions of a group: most people's eyes."""
 
@@ -42,6 +45,7 @@ class ViewPlan:
         reach: sight threshold for each direction ``[B, D]``, in the domain's unit of distance.
         keep: for each modality, the probability ``[B]`` that an item within reach is visible.
         told: for each modality, the probability ``[B]`` that a communicable item is told.
+        searches: ``[B]``, whether only what one looks for is seen unaided.
         remembers: ``[B]``, whether what follows from earlier observations counts as visible.
         assumes: for each of the domain's assumptions, whether it is made, ``[B]``.
         noise: for each modality, uniform numbers ``[B, T + 1, K, 2]`` that decide keep and told.
@@ -50,6 +54,7 @@ class ViewPlan:
     reach: Tensor
     keep: Visibility
     told: Visibility
+    searches: Tensor
     remembers: Tensor
     assumes: dict[str, Tensor]
     noise: dict[str, Tensor]
@@ -65,12 +70,19 @@ class ViewPlan:
             for name, value in observation.items()
             if name != "ego"
         }
-        seen["visual"] = distance <= self.reach[batch, direction]
+        sought = domain.sought(observation) | ~self.searches[:, None, None]
+        seen["visual"] = sought & (distance <= self.reach[batch, direction])
         steps = slice(first, first + stride * distance.shape[1], stride)
         return {
             name: near & (self.noise[name][:, steps, :, 0] < self.keep[name][:, None, None])
             for name, near in seen.items()
         }
+
+    def hoping(self, domain: Domain) -> ViewPlan:
+        """The view of what comes next: who searches hopes to find what they look for soon."""
+        keep = self.keep["visual"]
+        hoped = torch.where(self.searches, keep.clamp(min=domain.notice_hope), keep)
+        return replace(self, keep={**self.keep, "visual": hoped})
 
     def visibility(
         self, domain: Domain, observation: Observation, first: int = 0, stride: int = 1
@@ -153,8 +165,10 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     for modality in domain.modalities:
         visual = modality.name == "visual"
         seen = 1.0 if visual else 0.0
-        if visual and least < most:
-            seen = torch.where(sight, least + (most - least) * uniform(batch), 1.0)
+        if least < most:
+            drawn_rate = least * (most / least) ** uniform(batch)
+            heard = (uniform(batch) < HEARD_PROBABILITY).to(drawn_rate)
+            seen = torch.where(sight, drawn_rate if visual else heard, seen)
         rate = torch.where(dropout, uniform(batch), seen)
         keep[modality.name] = torch.where(full, 1.0, rate)
         often = domain.told_practice * uniform(batch)
@@ -164,6 +178,7 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
         reach=torch.where(sight[:, None], bins[drawn], bins[-1]),
         keep=keep,
         told=told,
+        searches=sight & (least < most),
         remembers=sight,
         assumes={
             name: sight & (uniform(batch) < ASSUMPTION_PROBABILITY) for name in domain.assumptions
