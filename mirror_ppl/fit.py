@@ -17,8 +17,8 @@ FEW = 20
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
-InferenceData), summary.json, sight.png and open.png. A fit that is stopped goes on from its
-checkpoint when the same command is given again."""
+InferenceData), summary.json, pictures of what they see, and open.png. A fit that is stopped goes on
+from its checkpoint when the same command is given again."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def main(options: Options) -> None:
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.identifiability import plot_identifiability
-    from mirror_ppl.plots.sight import sight_picture
+    from mirror_ppl.plots.sight import FILES, sight_pictures
 
     device = usable_device(options.device)
     svi = FitOptions(steps=options.steps)
@@ -158,12 +158,12 @@ def main(options: Options) -> None:
     summary = result.summary | {"seconds": round(monotonic() - began, 1)}
     text = json.dumps(summary, indent=1) + "\n"
     # Without it, results of a run that was killed here cannot be taken for those of an older one.
-    for name in ("summary.json", "sight.png", "open.png"):
+    for name in ("summary.json", "open.png", *FILES):
         (folder / name).unlink(missing_ok=True)
     save_inference_data(result.data, folder / "posterior.nc")
-    picture = sight_picture(result.data)
-    if picture is not None:
-        picture[0].save(folder / "sight.png")
+    pictures = sight_pictures(result.data)
+    for name, (picture, _) in pictures.items():
+        picture.save(folder / name)
     if found is not None:
         plot_identifiability(result.data).save(folder / "open.png")
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
@@ -172,8 +172,8 @@ def main(options: Options) -> None:
     _show(summary, get_domain(demonstrations.domain).reach_unit)
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
-    if picture is not None:
-        print(f"{folder / 'sight.png'}: {picture[1]}")
+    for name, (_, shows) in pictures.items():
+        print(f"{folder / name}: {shows}")
     if found is not None:
         print(f"{folder / 'open.png'}: what is open about what they see, and what would tell")
 

@@ -32,7 +32,7 @@ from mirror_ppl.inference.fitting import split_rounds
 from mirror_ppl.inference.summary import summarize
 from mirror_ppl.models.weights import load_self_model
 
-RESULTS = {"open.png", "posterior.nc", "sight.png", "summary.json"}
+RESULTS = {"open.png", "posterior.nc", "samples.png", "sight.png", "summary.json"}
 
 
 def content(folder):

@@ -13,12 +13,14 @@ from mirror_ppl.plots.driving import (
     has_sight,
     outline,
     plot_sight,
+    seen_of_draws,
     sight_picture,
     sight_probability,
     true_sight,
 )
 from mirror_ppl.plots.implants import kernel_density, plot_implants, scalar_implants
 from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.road_samples import samples_picture
 from mirror_ppl.plots.rounds import (
     calibration,
     lane_changes,
@@ -201,6 +203,22 @@ def test_picture_has_the_road_of_each_person(data):
         assert (image.origin, image.get_extent()) == ("lower", [-12.5, 12.5, 0, 2])
         assert image.cmap(1.0)[:3] > image.cmap(0.0)[:3]
     assert "driving in fog" in figure.get_suptitle()
+    draw(figure)
+
+
+def test_samples_are_drawn_beside_what_is_really_seen(data):
+    """Black are the cells that are not seen: of 50 all but those, in each panel."""
+    figure = samples_picture(data)
+    titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
+    assert titles == ["what they see", *(f"sample {number}" for number in range(1, 5))]
+    black = [
+        sum(patch.get_facecolor()[:3] == (0, 0, 0) for patch in ax.patches) for ax in figure.axes
+    ]
+    own = [int(50 - one.sum()) for one in seen_of_draws(data, "anna").values]
+    # Of the four draws in order; ben sees everything, and of him the truth is not known.
+    assert black == [int(50 - true_sight(data, "anna").sum()), *own] + [0] * 5
+    assert len(set(own)) > 1
+    assert not figure.axes[5].axison
     draw(figure)
 
 

@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from mirror_ppl.plots.search_rescue import PLACE, sight_probability
-from mirror_ppl.plots.sight import sight_picture
+from mirror_ppl.plots.sight import sight_pictures
 
 
 def made_up(radii, truth=1.5, domain="search_rescue"):
@@ -33,9 +33,9 @@ def test_probabilities_are_shares_of_draws_that_see_a_portion():
 
 
 def test_pictures_show_truth_probability_and_samples(tmp_path):
-    made = sight_picture(made_up([1.5, 1.5, 2.0, 10.0]))
-    assert made is not None
-    figure, words = made
+    made = sight_pictures(made_up([1.5, 1.5, 2.0, 10.0]))
+    assert set(made) == {"sight.png"}
+    figure, words = made["sight.png"]
     assert words == "the house as each person sees it"
     titles = [ax.get_title(loc="left") for ax in figure.axes]
     assert titles[:6] == ["what they see", "probability", *(f"sample {n}" for n in range(1, 5))]
@@ -50,5 +50,5 @@ def test_pictures_show_truth_probability_and_samples(tmp_path):
 
 def test_other_posteriors_have_no_such_picture():
     other = made_up([1.5, 2.0])["posterior"].rename(sight_radius="consistency")
-    assert sight_picture(az.InferenceData(posterior=other)) is None
-    assert sight_picture(made_up([1.5, 2.0], domain="elsewhere")) is None
+    assert sight_pictures(az.InferenceData(posterior=other)) == {}
+    assert sight_pictures(made_up([1.5, 2.0], domain="elsewhere")) == {}

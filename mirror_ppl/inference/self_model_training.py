@@ -183,8 +183,9 @@ def self_model_loss(
     if lived.exact is not None:
         goal = torch.where(lived.informed[..., None], lived.exact, goal)
     error = self_model.action_values(belief) - goal
-    # When all is done it does not matter what one does.
-    bellman = error[~lived.over].pow(2).mean()
+    # When all is done, which may be so in every round, it does not matter what one does.
+    under_way = error[~lived.over]
+    bellman = under_way.pow(2).sum() / max(under_way.numel(), 1)
     return Loss(
         options.world_weight * negative_elbo + bellman, negative_elbo.detach(), bellman.detach()
     )

@@ -57,6 +57,23 @@ def sight_probability(data: az.InferenceData, person: str) -> xr.DataArray:
         UnknownNameError: there is nobody of that id.
         KeyError: the human model has other implants; see :func:`has_sight`.
     """
+    probability = seen_of_draws(data, person).mean("sample")
+    return probability.rename("sight_probability")
+
+
+def seen_of_draws(data: az.InferenceData, person: str) -> xr.DataArray:
+    """Where a person sees a car in each posterior draw, 0 or 1.
+
+    Args:
+        data: as for :func:`sight_probability`.
+        person: id of the person.
+
+    Returns:
+        ``[S, 2, 25]``: dimensions ``sample``, ``lane`` and ``distance``.
+
+    Raises:
+        UnknownNameError: there is nobody of that id.
+    """
     posterior = of_person(data, "posterior", person)
     return _seen({site: draws(posterior[site]) for site in _sites()})
 
@@ -72,7 +89,7 @@ def true_sight(data: az.InferenceData, person: str) -> xr.DataArray | None:
     """
     reach = {site: truth(data, site, person) for site in _sites()}
     known = {site: np.array([value]) for site, value in reach.items() if value is not None}
-    return _seen(known) if len(known) == len(reach) else None
+    return _seen(known)[0] if len(known) == len(reach) else None
 
 
 def plot_sight(data: az.InferenceData, person: str, ax: Axes | None = None) -> Axes:
@@ -222,16 +239,15 @@ def _sites() -> tuple[str, ...]:
 
 
 def _seen(reach: Mapping[str, np.ndarray]) -> xr.DataArray:
-    """Share of the reaches ``[S]`` at which a car is seen, ``[2, 25]``."""
+    """Where a car is seen at each of the reaches ``[S]``, ``[S, 2, 25]``."""
     rows = []
     for lane in LANES:
         ahead, behind = (reach[f"{SIGHT}{side}_{lane}"][:, None] for side in ("front", "back"))
-        rows.append((np.abs(DISTANCES) <= np.where(DISTANCES >= 0, ahead, behind)).mean(0))
+        rows.append(np.abs(DISTANCES) <= np.where(DISTANCES >= 0, ahead, behind))
     return xr.DataArray(
-        np.stack(rows),
-        dims=("lane", "distance"),
+        np.stack(rows, 1).astype(float),
+        dims=("sample", "lane", "distance"),
         coords={"lane": list(LANES), "distance": ("distance", DISTANCES, {"units": "cells"})},
-        name="sight_probability",
     )
 
 

@@ -1,32 +1,62 @@
-"""The picture of what people see, in whatever domain has one."""
+"""The pictures of what people see, in whatever domain has some."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mirror_ppl.plots import driving, search_rescue
+from mirror_ppl.plots import driving, road_samples, search_rescue
 from mirror_ppl.plots.picture import Picture
 
 if TYPE_CHECKING:
     import arviz as az
 
-PICTURES: dict[
-    str, tuple[Callable[[az.InferenceData], bool], Callable[[az.InferenceData], Picture], str]
-] = {
-    "driving": (driving.has_sight, driving.sight_picture, "the road as each person sees it"),
-    "search_rescue": (
-        search_rescue.has_sight,
-        search_rescue.sight_picture,
-        "the house as each person sees it",
-    ),
+
+@dataclass(frozen=True)
+class SightPicture:
+    """A picture of what people see.
+
+    Attributes:
+        possible: whether a posterior can be drawn so.
+        draw: draws it.
+        shows: what is to be seen, in words.
+    """
+
+    possible: Callable[[az.InferenceData], bool]
+    draw: Callable[[az.InferenceData], Picture]
+    shows: str
+
+
+PICTURES: dict[str, dict[str, SightPicture]] = {
+    "driving": {
+        "sight.png": SightPicture(
+            driving.has_sight, driving.sight_picture, "the road as each person sees it"
+        ),
+        "samples.png": SightPicture(
+            road_samples.has_sight,
+            road_samples.samples_picture,
+            "the same in samples, beside what they really see",
+        ),
+    },
+    "search_rescue": {
+        "sight.png": SightPicture(
+            search_rescue.has_sight,
+            search_rescue.sight_picture,
+            "the house as each person sees it",
+        ),
+    },
 }
-"""By domain: whether a posterior can be drawn, what draws it, and what is to be seen there."""
+"""By domain and file name."""
+FILES = tuple(sorted({name for own in PICTURES.values() for name in own}))
+"""All names that there are."""
 
 
-def sight_picture(data: az.InferenceData) -> tuple[Picture, str] | None:
-    """What each person sees, and that in words; ``None`` if there is no picture of such sight."""
-    known = PICTURES.get(str(data["posterior"].attrs.get("domain", "")))
-    if known is None or not known[0](data):
-        return None
-    return known[1](data), known[2]
+def sight_pictures(data: az.InferenceData) -> dict[str, tuple[Picture, str]]:
+    """What each person sees, and that in words, by file name; nothing of sight of other kinds."""
+    known = PICTURES.get(str(data["posterior"].attrs.get("domain", "")), {})
+    return {
+        name: (picture.draw(data), picture.shows)
+        for name, picture in known.items()
+        if picture.possible(data)
+    }

@@ -1,0 +1,106 @@
+"""The road in samples of the posterior, beside what is really seen (supplement, Fig. 11).
+
+Where `mirror_ppl.plots.driving` draws how probably a car is seen, this draws who might sit there:
+each sample is one way for the person to see.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
+
+from mirror_ppl.domains.driving import ROAD_END
+from mirror_ppl.plots.driving import (
+    HEADLIGHT,
+    draw_car,
+    has_sight,
+    seen_of_draws,
+    true_sight,
+)
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import people
+
+if TYPE_CHECKING:
+    import arviz as az
+
+__all__ = ["has_sight", "samples_picture"]
+
+SAMPLES = 4
+MOST_PEOPLE = 12
+"""More people than this do not fit on one picture."""
+CARS = ((2, 1), (6, 0), (-3, 1), (-5, 0))
+"""Cells ahead and lane of four cars that stand for any."""
+RED, DARK = "#c0392b", "#000000"
+
+
+def samples_picture(data: az.InferenceData) -> Picture:
+    """What people see of a road with four cars, one row each: truth, and posterior samples.
+
+    Black is what they do not see. Of more than 12 people the first 12 are shown.
+
+    Args:
+        data: with the four sites of sight, see :func:`has_sight`.
+    """
+    everybody = people(data)
+    shown = everybody[:MOST_PEOPLE]
+    real = {person: true_sight(data, person) for person in shown}
+    known = any(seen is not None for seen in real.values())
+    columns = ["what they see"] if known else []
+    columns += [f"sample {number}" for number in range(1, SAMPLES + 1)]
+    size = (3.3 * len(columns) + 0.8, 0.62 * len(shown) + 1.3)
+    figure = Picture(figsize=size, layout="constrained")
+    grid = figure.subplots(len(shown), len(columns), squeeze=False)
+    for row, person in zip(grid, shown, strict=True):
+        panels = list(row)
+        if known:
+            ax = panels.pop(0)
+            seen = real[person]
+            if seen is None:
+                ax.set_axis_off()
+            else:
+                _draw(ax, seen)
+        drawn = seen_of_draws(data, person)
+        chosen = np.linspace(0, drawn.sizes["sample"] - 1, SAMPLES).round().astype(int)
+        for ax, number in zip(panels, chosen, strict=True):
+            _draw(ax, drawn[number])
+        row[0].set_ylabel(person, fontsize=9, rotation=0, ha="right", va="center")
+    for ax, title in zip(grid[0], columns, strict=True):
+        ax.set_title(title, fontsize=10, loc="left")
+    attributes = data["posterior"].attrs
+    setting = f", {attributes['setting']}" if "setting" in attributes else ""
+    some = "" if shown == everybody else f" (the first {len(shown)} of {len(everybody)} people)"
+    figure.suptitle(
+        f"What each person may see of the road{setting}{some}",
+        x=0.01,
+        ha="left",
+        fontsize=14,
+        fontweight="bold",
+    )
+    figure.supxlabel(
+        "Black: not seen. Blue: the person, who drives to the right. Red: other cars.",
+        x=0.01,
+        ha="left",
+        fontsize=9,
+    )
+    return figure
+
+
+def _draw(ax: Axes, seen: xr.DataArray) -> None:
+    """A road with four cars, black where ``seen`` ``[2, 25]`` is 0."""
+    end = ROAD_END + 0.5
+    ax.add_patch(Rectangle((-end, 0), 2 * end, 2, fc=HEADLIGHT, ec="none"))
+    for distance, lane in CARS:
+        draw_car(ax, distance, lane + 0.5, RED)
+    draw_car(ax)
+    for (lane, cell), sees in np.ndenumerate(seen.values):
+        if not sees:
+            here = (cell - end, float(lane))
+            ax.add_patch(Rectangle(here, 1, 1, fc=DARK, ec=DARK, lw=0.4, zorder=8))
+    ax.set(xlim=(-end, end), ylim=(0, 2), xticks=[], yticks=[])
+    ax.set_aspect(1.4)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
