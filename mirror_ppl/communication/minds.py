@@ -24,7 +24,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility, map_state
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.models.attention import AttentionValues, Proposal
+from mirror_ppl.models.attention import Proposal
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.sites import latent_sites
@@ -90,13 +90,18 @@ class Person:
         """
         if not self.human.attends:
             return self
-        values = self._attention
+        so_far = {name: value[: past.time] for name, value in past.observation.items()}
+        facts = {name: fact.view(1, 1) for name, fact in self.human.facts(past.observation).items()}
+        values = self._attention.values(
+            None, 0, facts, self.human.explanations(so_far, past.actions)
+        )
         log_chances = self._log_chances(values.values, past)
         with self._conditioned():
             log_chances = log_chances + self.human.log_attention(
                 self.implants,
                 {name: value[None, None] for name, value in values.values.items()},
                 values.log_weights[None, None],
+                facts,
             ).view(-1, len(values))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(past.time)
@@ -108,9 +113,9 @@ class Person:
         return person
 
     @cached_property
-    def _attention(self) -> AttentionValues:
-        """Values of attention that stand for all that this person may attend to."""
-        return Proposal(self.human, self.draws, self.draws, ATTENTION_VALUES).values(None, 0)
+    def _attention(self) -> Proposal:
+        """Proposes values of attention that stand for all that this person may attend to."""
+        return Proposal(self.human, self.draws, self.draws, ATTENTION_VALUES)
 
     def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
         """Log-probability ``[S, G]`` of what was done so far under values of attention ``[G]``."""

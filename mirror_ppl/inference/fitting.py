@@ -136,6 +136,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     """
     train, test = split_rounds(demonstrations, train_rounds)
     people = train.num_people
+    human.learn_world(train)
     run = None
     if checkpoint is not None:
         run = (

@@ -200,8 +200,14 @@ class Sightings:
         attended, number, seed = None, len(alive), 0
         if self._proposal is not None:
             recorded = {**observation, "actions": actions}
+            so_far = {name: value[0, real] for name, value in observation.items()}
             seed = _number_of({name: value[:, real] for name, value in recorded.items()})
-            attended = self._proposal.values(self._weights(), seed)
+            attended = self._proposal.values(
+                self._weights(),
+                seed,
+                {name: fact.view(1, 1) for name, fact in self.human.facts(so_far).items()},
+                self.human.explanations(so_far, actions[0, real]),
+            )
             each = len(attended)
             candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
             candidates |= {name: value.repeat(number) for name, value in attended.values.items()}
@@ -284,6 +290,10 @@ class Sightings:
             log_kept=_stacked([one.log_kept for one in attended], torch.inf),
             sights=torch.cat([pad(part, [0, most - part.shape[1]]) for part in sights])[None],
             rounds=torch.cat(rounds).to(self.alive.device)[None],
+            facts={
+                name: torch.cat([one.facts[name] for one in attended], 1)
+                for name in attended[0].facts
+            },
         )
 
     def _weights(self) -> Tensor:
@@ -350,7 +360,9 @@ class Sightings:
         values = {name: value[None, None] for name, value in attended.values.items()}
         with self._deciding(self.draw_ways()):
             implants = self.human.prior()
-            chances = self.human.log_attention(implants, values, attended.log_weights[None, None])
+            chances = self.human.log_attention(
+                implants, values, attended.log_weights[None, None], attended.facts
+            )
         return likelihoods + chances[:, 0]
 
     def draw_ways(self) -> dict[str, Tensor]:

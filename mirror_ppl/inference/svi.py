@@ -351,7 +351,9 @@ def _attentive(
     found = each.expand(table.people, *each.shape[-2:])[person[..., None, None], moments]
     done = table.recorded[:, :, None, :, None].expand(*moments.shape, 1)
     along = found.gather(-1, done).squeeze(-1).cumsum(-1)
-    weights = human.log_attention(implants, attention.values, attention.log_weights)
+    weights = human.log_attention(
+        implants, attention.values, attention.log_weights, attention.facts
+    )
     # What was done before a step tells what they attend to at it.
     before = torch.nn.functional.pad(along[..., :-1], [1, 0])
     before = torch.log_softmax(before + attention.shares(weights)[..., None], 2)

@@ -158,6 +158,10 @@ def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> View
             log_weights=padded([one.log_weights for one in own], -torch.inf),
             kept=padded([one.kept for one in own]),
             log_kept=padded([one.log_kept for one in own], torch.inf),
+            facts={
+                name: torch.stack([_pad(one.facts[name][0], rounds) for one in own])
+                for name in own[0].facts
+            },
             **_padded_sights(views),
         )
     return ViewTable(

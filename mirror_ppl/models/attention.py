@@ -19,7 +19,7 @@ probabilities with which a value was kept on the way.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pyro
@@ -47,12 +47,14 @@ class AttentionValues:
         log_weights: ``-log pi``, ``[G]``.
         kept: which of them are looked at ``[G']``.
         log_kept: log-probability with which each of these was kept ``[G']``.
+        facts: of the round, see `HumanModel.facts`.
     """
 
     values: dict[str, Tensor]
     log_weights: Tensor
     kept: Tensor
     log_kept: Tensor
+    facts: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.log_weights)
@@ -84,7 +86,10 @@ def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[s
 
 
 def site_probabilities(
-    human: HumanModel, ways: Mapping[str, Tensor], weights: Tensor | None = None
+    human: HumanModel,
+    ways: Mapping[str, Tensor],
+    weights: Tensor | None = None,
+    facts: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:
     """How probable each value of each site of attention is, ``[n]``.
 
@@ -92,6 +97,7 @@ def site_probabilities(
         human: the model of people.
         ways: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
         weights: of each of them ``[W]``; alike unless given.
+        facts: of the round, see `HumanModel.facts`.
     """
     number = len(next(iter(ways.values())))
     with (
@@ -102,7 +108,7 @@ def site_probabilities(
         pyro.plate("person", 1, dim=-2),
     ):
         torch.manual_seed(0)
-        nodes = attention_nodes(human, human.prior())
+        nodes = attention_nodes(human, {**human.prior(), **(facts or {})})
     found = {}
     for name, node in nodes.items():
         support = node["fn"].enumerate_support(expand=False)
@@ -195,27 +201,53 @@ class Proposal:
         self.supports = attention_sites(human)
         self.number = number
         self.anybody = dict(anybody)
-        self._prior = site_probabilities(human, anybody)
-        self._likely = None if likely is None else site_probabilities(human, likely)
+        self._found: dict[tuple, dict[str, Tensor]] = {}
+        self.likely = likely
 
-    def values(self, weights: Tensor | None, seed: int) -> AttentionValues:
+    def values(
+        self,
+        weights: Tensor | None,
+        seed: int,
+        facts: Mapping[str, Tensor] | None = None,
+        explanations: Mapping[str, Tensor] | None = None,
+    ) -> AttentionValues:
         """Values for a round.
 
         Args:
             weights: of the draws from the prior, as the rounds so far have it, ``[W]``; looked at
                 unless it is known what the person may be like.
             seed: of the draws.
+            facts: of the round, see `HumanModel.facts`.
+            explanations: of what was done, see `HumanModel.explanations`.
         """
-        likely = self._likely
-        if likely is None:
-            likely = self._prior
-            if weights is not None:
-                likely = site_probabilities(self.human, self.anybody, weights)
-        chances = {
-            name: (1 - ANY_WAY - ANY_VALUE) * own
-            + ANY_WAY * self._prior[name]
-            + ANY_VALUE / len(own)
-            for name, own in likely.items()
-        }
+        facts = dict(facts or {})
+        prior = self._of_anybody(facts)
+        likely = prior
+        if self.likely is not None:
+            likely = self._of_this_person(facts)
+        elif weights is not None:
+            likely = site_probabilities(self.human, self.anybody, weights, facts)
+        chances = {}
+        for name, own in likely.items():
+            own = (1 - ANY_WAY) * own + ANY_WAY * prior[name]
+            if explanations and name in explanations:
+                own = torch.softmax(own.log() + explanations[name].to(own), 0)
+            chances[name] = (1 - ANY_VALUE) * own + ANY_VALUE / len(own)
         generator = torch.Generator(next(iter(chances.values())).device).manual_seed(seed)
-        return choose_values(self.supports, chances, self.number, generator)
+        chosen = choose_values(self.supports, chances, self.number, generator)
+        return replace(chosen, facts=facts)
+
+    def _of_anybody(self, facts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return self._known("anybody", self.anybody, facts)
+
+    def _of_this_person(self, facts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return self._known("likely", self.likely or {}, facts)
+
+    def _known(
+        self, whom: str, draws: Mapping[str, Tensor], facts: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Probabilities of values; the same for the same facts."""
+        key = (whom, *((name, *value.flatten().tolist()) for name, value in facts.items()))
+        if key not in self._found:
+            self._found[key] = site_probabilities(self.human, draws, None, facts)
+        return self._found[key]

@@ -33,6 +33,7 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
+from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.distinct import as_whole_numbers, random_keys
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
@@ -163,10 +164,45 @@ class HumanModel(nn.Module):
         :meth:`prior`; nothing differs unless this is overridden.
 
         Args:
-            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
+            implants: as :meth:`prior` returned them, ``[..., P, 1]``, with what :meth:`facts` said
+                of the rounds, ``[..., P, B]``, where they are known.
         """
         del implants
         return {}
+
+    def facts(self, observation: Observation) -> dict[str, Tensor]:
+        """What of a round decides, besides themselves, what somebody attends to, ``[...]``.
+
+        :meth:`attend` reads it by these names, which are no sites. Nothing does unless this is
+        overridden.
+
+        Args:
+            observation: everything there was to observe, ``[..., T, K, F]``, as far as the round
+                went.
+        """
+        del observation
+        return {}
+
+    def explanations(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
+        """How well values of attention explain what was done, as logarithms ``[n]`` by site.
+
+        Attention is proposed by that; whatever it says, what is inferred is right in the limit.
+        Nothing is known unless this is overridden.
+
+        Args:
+            observation: of one round, ``[t, K, F]``.
+            actions: what was done so far, ``[t]``.
+        """
+        del observation, actions
+        return {}
+
+    def learn_world(self, demonstrations: Demonstrations) -> None:
+        """Learn from what was recorded what is true of the world, and not of one person.
+
+        Called with the rounds that are learned from, before anybody's implants are inferred. There
+        is nothing to learn unless this is overridden.
+        """
+        del demonstrations
 
     @cached_property
     def attends(self) -> bool:
@@ -182,7 +218,11 @@ class HumanModel(nn.Module):
             return bool(self.attend(self.prior()))
 
     def log_attention(
-        self, implants: Implants, values: Mapping[str, Tensor], log_weights: Tensor
+        self,
+        implants: Implants,
+        values: Mapping[str, Tensor],
+        log_weights: Tensor,
+        facts: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """``log p(m_b | psi_p)`` of G values that stand for all in a round, ``[..., P, B, G]``.
 
@@ -192,6 +232,7 @@ class HumanModel(nn.Module):
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
             values: of the sites of :meth:`attend`, ``[P, B, G]``.
             log_weights: for how many each of them stands, ``[P, B, G]``.
+            facts: of the rounds ``[P, B]``, see :meth:`facts`.
         """
         # Far to the left of whatever dimensions draws and enumeration take.
         given = {
@@ -205,7 +246,7 @@ class HumanModel(nn.Module):
             poutine.condition(data=given),
             pyro.plate("round", rounds, dim=-1),
         ):
-            self.attend(implants)
+            self.attend({**implants, **(facts or {})})
         nodes = [trace.trace.nodes[name] for name in given]
         total = sum(node["fn"].log_prob(node["value"]) for node in nodes)
         total = torch.as_tensor(total).movedim(0, -1)
@@ -348,7 +389,9 @@ class HumanModel(nn.Module):
         attention = table.attention
         if attention is None:
             return table.log_likelihoods(log_probabilities)
-        weights = self.log_attention(implants, attention.values, attention.log_weights)
+        weights = self.log_attention(
+            implants, attention.values, attention.log_weights, attention.facts
+        )
         return table.log_likelihoods(log_probabilities, weights)
 
     def model(self, table: ViewTable, world: Rounds | None = None) -> None:

@@ -60,11 +60,16 @@ def noticed_sites(domain: Domain) -> tuple[str, ...]:
     return tuple(NOTICED + item for item in _visual_items(domain))
 
 
-def notice_implants(domain: Domain, like: Tensor) -> dict[str, Tensor]:
-    """Sample how probably somebody notices each item at a step: ``notices_<item>``, uniform."""
-    one = like.new_ones(())
+def notice_implants(
+    domain: Domain, like: Tensor, success: float = 1.0, failure: float = 1.0
+) -> dict[str, Tensor]:
+    """Sample how probably somebody notices each item at a step: ``notices_<item>``.
+
+    The prior is a Beta density, uniform unless its parameters are given.
+    """
+    first, second = like.new_tensor(success), like.new_tensor(failure)
     return {
-        site: pyro.sample(site, dist.Beta(one, one))
+        site: pyro.sample(site, dist.Beta(first, second))
         for site in (NOTICES + item for item in _visual_items(domain))
     }
 

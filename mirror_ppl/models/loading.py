@@ -15,9 +15,15 @@ from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.variants import VARIANTS
+
+MIRROR = "mirror"
+"""The package's own model; which it is depends on the domain."""
+OWN: Mapping[str, type[HumanModel]] = {"bomb_defusal": Searcher}
+"""The package's own model of domains that need another than `HumanModel`."""
 
 
 def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
@@ -31,8 +37,8 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
     Raises:
         HumanModelError: the file or class is missing, does not import, or is not a human model.
     """
-    if specification is None:
-        return HumanModel(self_model)
+    if specification in (None, MIRROR):
+        return OWN.get(self_model.domain.name, HumanModel)(self_model)
     if specification in VARIANTS:
         return VARIANTS[specification](self_model)
     path_text, colon, name = specification.rpartition(":")

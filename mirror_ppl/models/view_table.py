@@ -8,7 +8,7 @@ view of a round and kept; the program then looks up the view that its implants l
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -70,6 +70,7 @@ class Attention:
         sights: the view of each sight under each value kept, ``[P, U, G']``, an index into the V
             views.
         rounds: the round that each sight is of, ``[P, U]``.
+        facts: of the rounds ``[P, B]``, see `HumanModel.facts`.
     """
 
     values: Mapping[str, Tensor]
@@ -78,6 +79,7 @@ class Attention:
     log_kept: Tensor
     sights: Tensor
     rounds: Tensor
+    facts: Mapping[str, Tensor] = field(default_factory=dict)
 
     def marginal(self, likelihoods: Tensor, log_weights: Tensor) -> Tensor:
         """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.

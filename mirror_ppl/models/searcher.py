@@ -1,0 +1,235 @@
+"""People who search, and who know rules that the robot does not: the model of bomb defusal.
+
+Implements the implants of the supplement's section C for bomb defusal::
+
+    notices_k  ~ Beta(1, 9)                    probability of noticing terminal k at a step
+    reads      ~ Bernoulli                     whether they can read the type of the bomb
+    rule_j     ~ Categorical(permutations)     policy: which button they press for that of the robot
+    guess_b    ~ Bernoulli                     in each round: the type they take it for
+    found_b,s  ~ Geometric(notices_k)          in each round and stage s, k what one looks for in it
+    n_t        = what one looks for, from found_b,s on; the type, if they can read it
+
+and ``a_t`` is chosen by the robot's action values at ``zH_t`` as everywhere, with buttons exchanged
+by the rule of the type that ``zH_t`` is of. By the same rules the robot's own reward model is
+wrong. What was recorded of rewards tells which hold (:meth:`Searcher.learn_world`), so they are an
+implant of the reward, too::
+
+    r_t ~ Normal(r(s_t, rule^-1(a_t)), 1)    r the reward as the robot was taught it
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import permutations
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains.base import Observation, Visibility, total_reward
+from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.human import HumanModel, Implants, View
+from mirror_ppl.models.self_model import SelfModel
+
+READS, RULE, GUESS, FOUND, SOUGHT = "reads_type", "rule_", "guess", "found_", "sought_"
+"""Names of sites, and of the fact what is looked for at a stage."""
+SEARCHING = (1.0, 9.0)
+"""Of the prior of how probably a terminal is noticed at a step: a Beta density of mean 0.1."""
+SAME = 0.5
+"""Prior probability that the robot's rules for a type hold."""
+REWARD_SCALE = 1.0
+"""Standard deviation of recorded rewards, in units of reward."""
+
+
+class Searcher(HumanModel):
+    """Finds what counts sooner or later, guesses what nobody says, and knows the rules.
+
+    Args:
+        self_model: the robot's networks, of bomb defusal.
+
+    Attributes:
+        rule_logits: of each permutation of buttons, by type, ``[2, 24]``; the prior until
+            :meth:`learn_world` was called.
+    """
+
+    stepwise = True
+    rule_logits: Tensor
+    exchanges: Tensor
+
+    def __init__(self, self_model: SelfModel) -> None:
+        super().__init__(self_model)
+        buttons = len(self.domain.actions) - 1
+        orders = torch.tensor(list(permutations(range(buttons))))  # the first changes nothing
+        # [24, 4, 4]: row a has a 1 at the button that the robot would press where they press a.
+        self.register_buffer(
+            "exchanges", torch.nn.functional.one_hot(orders).transpose(1, 2).float()
+        )
+        number = len(orders)
+        prior = torch.full((len(self.kinds), number), (1 - SAME) / (number - 1))
+        prior[:, 0] = SAME
+        self.register_buffer("rule_logits", prior.log())
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Types of bombs, as sites name them."""
+        (utterances,) = next(m.utterances for m in self.domain.modalities if m.utterances)
+        return tuple(text.lower().removesuffix(" bomb").replace(" ", "_") for text in utterances)
+
+    @property
+    def stages(self) -> int:
+        """Number of stages of a round."""
+        return self.domain.symbol_sizes["ego"] - 1
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample how quick they are, whether they read the type, their rules and choices."""
+        domain, like = self.domain, next(self.self_model.parameters())
+        half = like.new_full((2,), 0.5)
+        return (
+            implant_priors.notice_implants(domain, like, *SEARCHING)
+            | {READS: pyro.sample(READS, dist.Categorical(half))}
+            | {
+                RULE + kind: pyro.sample(RULE + kind, dist.Categorical(logits=logits))
+                for kind, logits in zip(self.kinds, self.rule_logits, strict=True)
+            }
+            | implant_priors.policy_implants(domain, self.self_model.latent, like)
+        )
+
+    def attend(self, implants: Implants) -> dict[str, Tensor]:
+        """Sample the guess, and when they find what they look for at each stage."""
+        one = next(iter(implants.values()))
+        items = next(m.items for m in self.domain.modalities if m.name == "visual")
+        each = [implants[implant_priors.NOTICES + item] for item in items]
+        notices = torch.stack(torch.broadcast_tensors(*each), -1)
+        sites = {GUESS: pyro.sample(GUESS, dist.Categorical(notices.new_full((2,), 0.5)))}
+        for stage in range(self.stages):
+            sought = implants.get(f"{SOUGHT}{stage}", one.new_zeros(1, 1, dtype=torch.long))
+            shape = torch.broadcast_shapes(notices.shape[:-1], sought.shape)
+            own = notices.expand(*shape, -1).gather(-1, sought.expand(shape)[..., None])
+            name = f"{FOUND}{stage}"
+            found = implant_priors.first_success(own.squeeze(-1), self.domain.horizon)
+            sites[name] = pyro.sample(name, found)
+        return sites
+
+    def facts(self, observation: Observation) -> dict[str, Tensor]:
+        """What was looked for at each stage; at those not reached, what was looked for last."""
+        stage = observation["ego"][..., 0].long()
+        sought = self.domain.sought(observation).long().argmax(-1)
+        last, found = None, {}
+        for number in range(self.stages):
+            here = stage == number
+            place = here.long().argmax(-1, keepdim=True)
+            own = sought.gather(-1, place).squeeze(-1)
+            last = own if last is None else torch.where(here.any(-1), own, last)
+            found[f"{SOUGHT}{number}"] = last
+        return found
+
+    def explanations(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
+        """What was pressed for was found just before; what was waited for was not."""
+        steps = torch.arange(self.domain.horizon + 1, device=actions.device)
+        stage, since = (part[: len(actions)] for part in observation["ego"].long().unbind(-1))
+        found = {}
+        for number in range(self.stages):
+            here = stage == number
+            if not here.any():
+                continue
+            waited = since[here].max()
+            pressed = bool((here & (actions != 0)).any())
+            before = (waited - steps).clamp(min=0).float()
+            # Each step earlier is a wait that needs explaining, up to a few nats.
+            log = -(2.0 * before).clamp(max=8.0)
+            if pressed:
+                log = torch.where(steps > waited, -4.0, log)
+            found[f"{FOUND}{number}"] = log
+        return found
+
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
+        """What one looks for, once it was found, and the type of those who read it."""
+        del step
+        stage, since = observation["ego"].long().unbind(-1)
+        times = [implants[f"{FOUND}{number}"] for number in range(self.stages)]
+        times = torch.stack(torch.broadcast_tensors(*times), -1)
+        shape = torch.broadcast_shapes(times.shape[:-1], stage.shape)
+        place = stage.clamp(max=self.stages - 1).expand(shape)[..., None]
+        found = times.expand(*shape, -1).gather(-1, place).squeeze(-1) <= since
+        verbal = observation["verbal"][..., 0]
+        reads = (implants[READS] == 1)[..., None]
+        return {
+            "visual": self.domain.sought(observation) & found[..., None],
+            "verbal": reads.expand(torch.broadcast_shapes(reads.shape, verbal.shape)),
+        }
+
+    def look(self, implants, knowledge, observation, told, step):
+        """As everywhere; and who does not know the type takes it for what they guess."""
+        view, knowledge = super().look(implants, knowledge, observation, told, step)
+        guess = implants[GUESS].to(observation["verbal"])[..., None, None]
+        known = view.visible["verbal"]
+        shape = torch.broadcast_shapes(known.shape, guess.shape[:-1])
+        imagined = {**observation, "verbal": guess.expand(*shape, 1)}
+        taken = {
+            "visual": torch.zeros_like(view.visible["visual"]),
+            "verbal": ~known.expand(shape),
+        }
+        return View(view.visible, taken, imagined), knowledge
+
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """Choose as the robot would, with buttons exchanged by the rules they know."""
+        presses = values[..., 1:]
+        second = self.believed_kind(belief)[..., None]  # [..., T, 1]
+        own = [self._exchanged(presses, implants[RULE + kind][..., None]) for kind in self.kinds]
+        exchanged = (1 - second) * own[0] + second * own[1]
+        wait = values[..., :1].expand(*exchanged.shape[:-1], 1)
+        return super().act(implants, belief, torch.cat([wait, exchanged], -1))
+
+    def believed_kind(self, belief: Tensor) -> Tensor:
+        """How probably the bomb is of the second type to somebody with a belief ``[..., Z]``."""
+        return self.self_model.decoders["verbal"](belief).mean[..., 0, 0].clamp(0, 1)
+
+    def _exchanged(self, presses: Tensor, rule: Tensor) -> Tensor:
+        """Values ``[..., P, V, T, 4]`` of buttons under a rule ``[..., P, 1, 1]``."""
+        exchange = self.exchanges[rule.long()]  # [..., P, 1, 1, 4, 4]
+        return (exchange @ presses[..., None]).squeeze(-1)
+
+    @torch.no_grad()
+    def learn_world(self, demonstrations: Demonstrations) -> None:
+        """Learn which rules hold from recorded rewards: the posterior becomes the prior.
+
+        What is right in the world is so for everybody, so all rounds of all people tell. The
+        posterior is exact: every rule is tried. The robot sees everything, and its rewards are
+        those of its simulator.
+
+        Args:
+            demonstrations: rounds with rewards; without any nothing is learned.
+        """
+        if demonstrations.rewards is None:
+            return
+        observation = demonstrations.observation()
+        steps = demonstrations.shape[2]
+        pressed = demonstrations.mask & (demonstrations.actions > 0)
+        seen = {name: value[:, :, :steps][pressed] for name, value in observation.items()}
+        button, reward = demonstrations.actions[pressed] - 1, demonstrations.rewards[pressed]
+        kind = seen["verbal"][..., 0, 0].long()
+        world = self.domain.as_believed
+        state = world.state_behind(seen)
+        scores = []
+        for robot in range(self.exchanges.shape[-1]):  # the button that the robot would press
+            action = torch.full_like(button, 1 + robot)
+            expected = total_reward(world.rewards(state, action, world.transition(state, action)))
+            scores.append(dist.Normal(expected, REWARD_SCALE).log_prob(reward))
+        scores = torch.stack(scores, -1)  # [n, 4]
+        for number in range(len(self.kinds)):
+            some = kind == number
+            under = self.exchanges[:, button[some]]  # [24, n, 4]
+            self.rule_logits[number] += (under * scores[some]).sum((1, 2))
+        self.rule_logits -= self.rule_logits.logsumexp(-1, keepdim=True)
+
+
+def rules_of(human: Searcher, draws: Mapping[str, Tensor]) -> tuple[tuple[int, ...], ...]:
+    """The likeliest right button by type and by the button that the robot was taught, of draws."""
+    found = []
+    for kind in human.kinds:
+        likeliest = int(draws[RULE + kind].flatten().long().mode().values)
+        exchange = human.exchanges[likeliest]
+        found.append(tuple(exchange.argmax(0).tolist()))
+    return tuple(found)
