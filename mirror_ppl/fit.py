@@ -28,10 +28,11 @@ class Options:
     demos: Path | None = None
     """Recordings in the format of docs/demonstrations.md."""
     domain: str = "driving"
-    """The world of the shipped recordings: driving (none ship of search_rescue yet)."""
+    """The world of the shipped recordings: driving or search_rescue (none ship of bomb_defusal
+    yet)."""
     setting: str | None = None
-    """The setting of the shipped recordings: clear or fog. Default: the one in which people see
-    less, fog."""
+    """The setting of the shipped recordings: clear or fog in driving, clear or smoke in
+    search_rescue. Default: the one in which people see less."""
     population: str = "paper"
     """The people of the shipped recordings: paper (sight limited by the setting alone) or diverse
     (each their own sight)."""

@@ -20,9 +20,9 @@ class BombKnowledge:
     """At one step.
 
     Attributes:
-        stage: of that step ``[...]``.
+        stage: of that step ``[..., 1]``.
         terminals: whether it is known what each shows ``[..., 6]``.
-        kind: whether the type of the bomb is known ``[...]``.
+        kind: whether the type of the bomb is known ``[..., 1]``.
     """
 
     stage: Tensor
@@ -33,19 +33,18 @@ class BombKnowledge:
     def nothing(cls, *batch: int, device: torch.device | None = None) -> BombKnowledge:
         """Before anything was observed."""
         return cls(
-            torch.zeros(batch, dtype=torch.long, device=device),
+            torch.zeros(*batch, 1, dtype=torch.long, device=device),
             torch.zeros(*batch, TERMINALS, dtype=torch.bool, device=device),
-            torch.zeros(batch, dtype=torch.bool, device=device),
+            torch.zeros(*batch, 1, dtype=torch.bool, device=device),
         )
 
     def learn(self, observation: Observation, visible: Visibility) -> BombKnowledge:
         """Knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
-        stage = observation["ego"][..., 0].round().long()
-        same = (stage == self.stage)[..., None]
-        kind = self.kind | visible["verbal"][..., 0]
-        terminals = (self.terminals & same) | visible["visual"]
+        stage = observation["ego"][..., :1].round().long()
+        kind = self.kind | visible["verbal"]
+        terminals = (self.terminals & (stage == self.stage)) | visible["visual"]
         return BombKnowledge(stage.expand(kind.shape), terminals, kind)
 
     def items(self) -> Visibility:
         """Terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
-        return {"visual": self.terminals, "verbal": self.kind[..., None]}
+        return {"visual": self.terminals, "verbal": self.kind}

@@ -78,7 +78,10 @@ class PlannerOptions:
         return cls(**(BY_DOMAIN.get(domain, {}) | given))
 
 
-BY_DOMAIN: dict[str, dict[str, Any]] = {"search_rescue": {"horizon": 16, "beyond": True}}
+BY_DOMAIN: dict[str, dict[str, Any]] = {
+    "search_rescue": {"horizon": 16, "beyond": True, "branch": 0.4},
+    "bomb_defusal": {"horizon": 12, "beyond": True, "branch": 0.4},
+}
 """Settings of planners that differ by domain."""
 
 
@@ -213,7 +216,7 @@ def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) ->
     if name == "mirror-kl":
         objective = Divergence(options.kl_weight, options.kl_measure)
         return Communicator(person, objective, Automatic(1), options.sure, seed)
-    world = SimulatorWorld(person.human.domain)
+    world = SimulatorWorld(person.human.known_world(person.draws))
     if name == "mirror-self-model":
         world = SelfModelWorld(person.human.self_model)
     objective = ExpectedUtility(

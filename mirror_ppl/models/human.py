@@ -204,6 +204,15 @@ class HumanModel(nn.Module):
         """
         del demonstrations
 
+    def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
+        """The world as the robot knows it after what it learned, in which it plans.
+
+        Args:
+            draws: of one person's implants ``[S, 1, 1, ...]``; implants of the reward change it.
+        """
+        del draws
+        return self.domain
+
     @cached_property
     def attends(self) -> bool:
         """Whether something differs from round to round."""

@@ -28,7 +28,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains.base import Observation, Visibility, total_reward
+from mirror_ppl.domains.base import Domain, Observation, Visibility, total_reward
+from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants, View
 from mirror_ppl.models.self_model import SelfModel
@@ -224,12 +225,13 @@ class Searcher(HumanModel):
             self.rule_logits[number] += (under * scores[some]).sum((1, 2))
         self.rule_logits -= self.rule_logits.logsumexp(-1, keepdim=True)
 
-
-def rules_of(human: Searcher, draws: Mapping[str, Tensor]) -> tuple[tuple[int, ...], ...]:
-    """The likeliest right button by type and by the button that the robot was taught, of draws."""
-    found = []
-    for kind in human.kinds:
-        likeliest = int(draws[RULE + kind].flatten().long().mode().values)
-        exchange = human.exchanges[likeliest]
-        found.append(tuple(exchange.argmax(0).tolist()))
-    return tuple(found)
+    def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
+        """The bomb by the rules that are likeliest to hold."""
+        taught = self.domain.as_believed
+        assert isinstance(taught, BombDefusal)
+        rules = []
+        for kind, row in zip(self.kinds, taught.rules, strict=True):
+            likeliest = int(draws[RULE + kind].flatten().long().mode().values)
+            pressed = self.exchanges[likeliest].argmax(0)  # by the button that the robot would
+            rules.append(tuple(int(pressed[button]) for button in row))
+        return BombDefusal(tuple(rules))
