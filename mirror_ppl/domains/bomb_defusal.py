@@ -146,7 +146,7 @@ class BombDefusal:
     reach_practice: tuple[float, ...] = ()
     told_practice = 0.1
     # People search for long and go on searching, as if they were about to find it.
-    notice_practice = (0.02, 1.0)
+    notice_practice = (0.05, 1.0)
     notice_hope = 0.5
     partial_views: Mapping[str, tuple[float, ...]] = {}
     assumptions: tuple[str, ...] = ()

@@ -124,8 +124,8 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "discount": 0.95,
         "target_rate": 0.02,
         "world_weight": 0.01,
-        "length": 32,
-        "stride": 4,
+        "length": 16,
+        "stride": 2,
         "exact": True,
     },
 }

@@ -28,6 +28,8 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility
 
 KINDS = ("full", "dropout", "sight")
 KIND_PROBABILITIES = (0.1, 0.1, 0.8)
+SEARCHING_KINDS = (0.3, 0.1, 0.6)
+"""The same in worlds where one has to search, in which sight views tell little for long."""
 ASSUMPTION_PROBABILITY = 0.7
 """Share of sight views in which each assumption is made."""
 TOLD_PROBABILITY = 0.4
@@ -144,9 +146,9 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, device=device)
 
-    kind = torch.multinomial(
-        torch.tensor(KIND_PROBABILITIES, device=device), batch, True, generator=generator
-    )
+    least, most = domain.notice_practice
+    kinds = SEARCHING_KINDS if least < most else KIND_PROBABILITIES
+    kind = torch.multinomial(torch.tensor(kinds, device=device), batch, True, generator=generator)
     full, dropout, sight = (kind == index for index in range(len(KINDS)))
     bins = torch.tensor(domain.reach_bins, device=device)
     shape = (batch, len(domain.directions))
@@ -159,7 +161,6 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     for group in domain.direction_groups:
         for direction in group[1:]:
             drawn[:, direction] = torch.where(alike, drawn[:, group[0]], drawn[:, direction])
-    least, most = domain.notice_practice
     keep, told, noise = {}, {}, {}
     spoken_to = uniform(batch) < TOLD_PROBABILITY
     for modality in domain.modalities:

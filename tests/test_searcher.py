@@ -1,0 +1,281 @@
+"""Searchers: when they find what counts, what they take a bomb for, and the rules they know."""
+
+from dataclasses import replace
+from itertools import permutations
+
+import pyro
+import pytest
+import torch
+from pyro import poutine
+
+from mirror_ppl.communication import Person, RoundSoFar
+from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.bomb_defusal import BombDefusal
+from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
+from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.attention import Proposal, site_probabilities
+from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.searcher import Searcher
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.people import simulate
+
+WORLD = BombDefusal()
+WAIT = 0
+ORDERS = list(permutations(range(4)))
+
+
+@pytest.fixture(scope="module")
+def searcher():
+    torch.manual_seed(0)
+    return Searcher(SelfModel(WORLD))
+
+
+def course(actions, seed=0, rounds=1):
+    """Observations ``[rounds, T + 1, ...]`` of rounds in which this is done, and the states."""
+    state = WORLD.initial(rounds, torch.Generator().manual_seed(seed))
+    states = [state]
+    for action in actions:
+        states.append(WORLD.transition(states[-1], torch.full((rounds,), action)))
+    observed = [WORLD.observe(state) for state in states]
+    return {name: torch.stack([o[name] for o in observed], 1) for name in observed[0]}, states
+
+
+def implants(searcher, seed=0, **values):
+    """Sites of one person with given values."""
+    given = {name: torch.tensor([[value]]) for name, value in values.items()}
+    with (
+        torch.random.fork_rng(),
+        poutine.condition(data=given),
+        pyro.plate("person", 1, dim=-2),
+    ):
+        torch.manual_seed(seed)
+        return searcher.prior()
+
+
+def test_it_is_the_package_s_own_model_of_bomb_defusal(searcher):
+    assert type(load_human_model(None, searcher.self_model)) is Searcher
+    assert type(load_human_model("mirror", searcher.self_model)) is Searcher
+    assert type(load_human_model(None, SelfModel(get_domain("driving")))) is HumanModel
+    check_contract(searcher)
+    assert searcher.stepwise and searcher.attends
+
+
+def test_what_is_looked_for_is_known_of_the_stages_that_were_reached(searcher):
+    observation, states = course([WAIT, 1, 2, WAIT], rounds=5)
+    facts = searcher.facts(observation)
+    for stage in range(3):
+        assert torch.equal(facts[f"sought_{stage}"], states[0].live[:, stage])
+    # Of later stages it is taken to be as at the last one.
+    early = {name: value[:, :3] for name, value in observation.items()}
+    facts = searcher.facts(early)
+    assert torch.equal(facts["sought_1"], states[0].live[:, 1])
+    assert torch.equal(facts["sought_2"], states[0].live[:, 1])
+
+
+def test_finding_is_geometric_with_the_probability_of_what_is_looked_for(searcher):
+    """By the facts of the round: 0.1 of terminal 1, 0.5 of terminal 2."""
+    some = implants(searcher, **{"notices_terminal 1": 0.1, "notices_terminal 2": 0.5})
+    ways = {name: value[None] for name, value in some.items()}
+    facts = {f"sought_{stage}": torch.tensor([[stage % 2]]) for stage in range(3)}
+    found = site_probabilities(searcher, ways, facts=facts)
+    for stage, p in enumerate((0.1, 0.5, 0.1)):
+        expected = p * (1 - p) ** torch.arange(60.0)
+        torch.testing.assert_close(found[f"found_{stage}"][:60], expected, rtol=1e-4, atol=1e-7)
+    assert found["guess"].tolist() == [0.5, 0.5]
+
+
+def test_what_counts_is_seen_once_found_and_at_no_other_stage(searcher):
+    observation, states = course([WAIT, WAIT, 1, WAIT, WAIT])
+    sites = {f"found_{stage}": torch.tensor([[when]]) for stage, when in enumerate((2, 1, 60))}
+    for reads in (0, 1):
+        seen = []
+        for step in range(6):
+            now = {name: value[:, step] for name, value in observation.items()}
+            own = {name: value[0] for name, value in sites.items()}
+            own["reads_type"] = torch.tensor([reads])
+            visible = searcher.sees(own, now, step)
+            assert visible["verbal"].tolist() == [[bool(reads)]]
+            shown = visible["visual"][0].nonzero().flatten().tolist()
+            live = int(states[step].live[0, min(int(states[step].stage[0]), 2)])
+            assert shown in ([], [live])
+            seen.append(bool(shown))
+        # Three steps at the first stage, three at the second.
+        assert seen == [False, False, True, False, True, True]
+
+
+def test_an_unknown_type_is_taken_for_what_is_guessed(searcher):
+    observation, _ = course([WAIT, WAIT])
+    now = {name: value[:, 0] for name, value in observation.items()}
+    nothing = {"visual": torch.zeros(1, 6, dtype=torch.bool), "verbal": torch.zeros(1, 1).bool()}
+    own = {f"found_{stage}": torch.tensor([60]) for stage in range(3)}
+    for guess in (0, 1):
+        own |= {"guess": torch.tensor([guess]), "reads_type": torch.tensor([0])}
+        knowledge = WORLD.nothing_known(1)
+        view, knowledge = searcher.look(own, knowledge, now, nothing, 0)
+        assert view.taken["verbal"].all() and not view.visible["verbal"].any()
+        assert view.imagined["verbal"].flatten().tolist() == [guess]
+        assert not view.taken["visual"].any()
+        # It is believed as if it were told.
+        told = {**nothing, "verbal": torch.ones(1, 1, dtype=torch.bool)}
+        if guess == int(observation["verbal"][0, 0, 0, 0]):
+            heard, _ = searcher.look(own, WORLD.nothing_known(1), now, told, 0)
+            torch.testing.assert_close(searcher.evidence(heard, now), searcher.evidence(view, now))
+        heard, _ = searcher.look(own, knowledge, now, told, 1)
+        assert heard.visible["verbal"].all() and not heard.taken["verbal"].any()
+
+
+def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(searcher, monkeypatch):
+    """Where the robot would press b, they press ORDERS[rule][b]: values go with the buttons."""
+    values = torch.tensor([0.5, 1.0, 2.0, 3.0, 4.0]).expand(1, 1, 1, 5)
+    belief = torch.zeros(1, 1, 1, 48)
+    for kind, rule in ((0, 1), (1, 9)):
+        monkeypatch.setattr(
+            searcher, "believed_kind", lambda belief, kind=kind: torch.full((1, 1, 1), float(kind))
+        )
+        some = implants(searcher, lapse=1e-9, consistency=1.0) | {
+            "residual_in": torch.zeros(1, 1, 49, 8),
+            "residual_out": torch.zeros(1, 1, 9, 5),
+            "rule_type_a": torch.tensor([[1]]),
+            "rule_type_b": torch.tensor([[9]]),
+        }
+        found = searcher.act(some, belief, values).flatten()
+        expected = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0])
+        for robot in range(4):
+            expected[1 + ORDERS[rule][robot]] = 1.0 + robot
+        torch.testing.assert_close(found, expected.log_softmax(0), rtol=0, atol=1e-4)
+
+
+def test_rules_are_learned_from_rewards_and_planned_with():
+    """Of forty rounds or so there is one set of rules that explains all rewards."""
+    torch.manual_seed(0)
+    human = Searcher(SelfModel(WORLD))
+    torch.testing.assert_close(human.rule_logits.exp().sum(-1), torch.ones(2))
+    assert human.rule_logits.exp()[:, 0].tolist() == pytest.approx([0.5, 0.5])
+    recorded = simulate("bomb_defusal", "labelled", people=3, rounds=20, seed=1)
+    human.learn_world(recorded)
+    learned = [ORDERS[int(logits.argmax())] for logits in human.rule_logits]
+    assert human.rule_logits.exp().amax(-1).min() > 0.99
+    for kind in range(2):
+        for symbol in range(4):
+            assert learned[kind][OLD_RULES[kind][symbol]] == RULES[kind][symbol]
+    some = implants(human)
+    assert human.known_world({name: value[None] for name, value in some.items()}).rules == RULES
+    # Without rewards there is nothing to learn.
+    again = Searcher(human.self_model)
+    again.learn_world(replace(recorded, rewards=None))
+    assert again.rule_logits.exp()[:, 0].tolist() == pytest.approx([0.5, 0.5])
+
+
+def test_what_was_done_tells_when_it_was_found(searcher):
+    observation, _ = course([WAIT] * 4 + [2] + [WAIT] * 3)
+    own = {name: value[0] for name, value in observation.items()}
+    actions = torch.tensor([WAIT] * 4 + [2] + [WAIT] * 3)
+    found = searcher.explanations(own, actions)
+    # Pressed at the fifth step: found just then, rather than before or after.
+    assert int(found["found_0"].argmax()) == 4
+    assert set(found) == {"found_0", "found_1"}
+    later = found["found_1"]
+    assert later[3:].tolist() == [0.0] * 58 and (later[:2] < 0).all()
+    proposal = Proposal(searcher, *(2 * [{n: v[None] for n, v in implants(searcher).items()}]), 64)
+    facts = {name: fact.view(1, 1) for name, fact in searcher.facts(observation).items()}
+    chosen = proposal.values(None, 0, facts, found)
+    weights = torch.bincount(chosen.values["found_0"], minlength=61)
+    assert int(weights.argmax()) == 4
+    assert chosen.facts.keys() == facts.keys()
+
+
+def test_who_is_in_a_round_has_not_found_what_they_wait_for(searcher):
+    """A consistent person who waited four steps: most draws have not found it yet."""
+    some = implants(searcher, **{"notices_terminal 1": 0.2}, consistency=20.0, lapse=0.01)
+    draws = {name: value.expand(40, *value.shape).clone() for name, value in some.items()}
+    observation, _ = course([WAIT] * 4)
+    rounds = RoundSoFar.begin(WORLD, {name: value[0, 0] for name, value in observation.items()})
+    quiet = {"visual": torch.zeros(6, dtype=torch.bool), "verbal": torch.zeros(1).bool()}
+    for step in range(1, 5):
+        now = {name: value[0, step] for name, value in observation.items()}
+        rounds = rounds.then(quiet, WAIT, now)
+    person = Person(searcher, draws).in_round(rounds)
+    found = person.eyes["found_0"][person.eye]
+    assert len(found) == 40 and found.unique().numel() > 1
+
+
+def test_a_person_s_probabilities_come_out_of_their_rounds():
+    """With a self-model that presses when it knows and waits until then, by hand."""
+    torch.manual_seed(0)
+    human = Searcher(Knowing(WORLD))
+    recorded = simulate("bomb_defusal", "labelled", people=1, rounds=12, seed=0)
+    human.learn_world(recorded)
+    sightings = Sightings(human, Screening())
+    for one_round in rounds_of(recorded, 0):
+        sightings.add(*one_round)
+    found = sample_exactly(human, sightings.table(), ImportanceOptions(proposals=256))
+    draws = found.sample(200, sightings.grid)
+    mean = torch.stack([draws[f"notices_terminal {k}"].mean() for k in range(1, 7)]).mean()
+    # About 30 finds, and a prior worth one: a standard error of a fifth.
+    truth = recorded.truth["notices_terminal 1"][0]
+    assert abs((mean / truth).log()) < 4.5 / 30**0.5
+    assert draws["reads_type"].float().mean() > 0.99
+
+
+class Knowing(SelfModel):
+    """A self-model that believes what there is to see, and values it by the old rules."""
+
+    class Reader(torch.nn.Module):
+        """Beliefs are values: those of a press are known of a lit terminal of a known type."""
+
+        def __init__(self, action):
+            super().__init__()
+            self.action = action
+
+        def embed(self, symbols):
+            """Values of a bomb of either type ``[..., 1, 10]``, for every terminal."""
+            ego = torch.nn.functional.pad(symbols["ego"].argmax(-1, keepdim=True).float(), [0, 1])
+            values = []
+            for kind in (0.0, 1.0):
+                seen = {"ego": ego, "visual": symbols["visual"]}
+                seen["verbal"] = torch.full((*ego.shape[:-1], 1, 1), kind)
+                state = WORLD.state_behind(seen)
+                values.append(WORLD.as_believed.reference_values(state, 0.9))
+            lit = WORLD.sought({"ego": ego, **symbols})
+            return {"ego": torch.cat(values, -1), "visual": lit, "verbal": symbols["verbal"]}
+
+        def combine(self, embedded, visible, imagined=None, taken=None):
+            kind = embedded["verbal"][..., 0, 1:]
+            known = visible["verbal"].float()
+            if imagined is not None:
+                guess = imagined["verbal"][..., 0, 1:]
+                kind, known = torch.where(visible["verbal"], kind, guess), torch.ones_like(known)
+            first, second = embedded["ego"].split(5, -1)
+            values = (1 - kind) * first + kind * second
+            found = (visible["visual"] & embedded["visual"]).any(-1, keepdim=True) & (known > 0)
+            wait = torch.tensor([0.0, -5.0, -5.0, -5.0, -5.0])
+            values = torch.where(found, values, wait)
+            kind = kind.expand(*values.shape[:-1], 1)
+            return torch.nn.functional.pad(torch.cat([values, kind], -1), [0, 128 - 6])
+
+        def previous_actions(self, actions):
+            return torch.zeros(*actions.shape[:-1], actions.shape[-1] + 1, 128)
+
+        def forward(self, previous, evidence):
+            mean = evidence[..., :48]
+            return type("Belief", (), {"mean": mean, "scale": torch.ones_like(mean)})
+
+    def __init__(self, domain):
+        super().__init__(domain)
+        with torch.no_grad():
+            self.encoder.action.weight.zero_()
+        self.encoder = self.Reader(self.encoder.action)
+        self.decoders["verbal"] = Kind()
+
+    def action_values(self, belief):
+        return belief[..., :5]
+
+
+class Kind(torch.nn.Module):
+    """Reads the type off a belief of `Knowing`."""
+
+    def forward(self, belief):
+        return type("Decoded", (), {"mean": belief[..., 5, None, None]})
