@@ -43,6 +43,21 @@ def test_terminals_are_noticed_at_the_rates_that_are_practised(generator):
         assert not plan.keep["verbal"][plan.remembers].any()
 
 
+def test_in_easy_phases_nothing_is_overlooked_for_long(generator):
+    plan = draw_views(WORLD, 4000, 6, generator, easy=True)
+    sight = plan.remembers
+    assert not plan.searches.any()
+    assert ((plan.keep["visual"][sight] >= 0.25) & (plan.keep["visual"][sight] <= 1)).all()
+    assert 0.4 < float(plan.told["visual"].max()) <= 0.5
+    # Where nobody has to search it is the same as ever.
+    plans = [
+        draw_views(get_domain("driving"), 9, 3, torch.Generator().manual_seed(0), easy=easy)
+        for easy in (False, True)
+    ]
+    assert torch.equal(plans[0].noise["visual"], plans[1].noise["visual"])
+    assert torch.equal(plans[0].keep["visual"], plans[1].keep["visual"])
+
+
 def test_who_searches_sees_only_what_counts_and_hopes_to_see_it_soon(generator):
     state = WORLD.initial(4000, generator)
     observation = {name: value[:, None] for name, value in WORLD.observe(state).items()}

@@ -54,6 +54,7 @@ class SelfModelOptions:
         world_weight: weight of the negative ELBO per observation.
         length: steps of a round that is learned from; as many as a round has, if 0.
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
+        easy: phases at the beginning in which nobody has to search for long.
         exact: whether somebody who knows everything learns the exact planner's values, and not
             what a step leads to.
     """
@@ -74,6 +75,7 @@ class SelfModelOptions:
     length: int = 0
     stride: int = 1
     exact: bool = False
+    easy: int = 0
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
@@ -127,6 +129,7 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "length": 16,
         "stride": 2,
         "exact": True,
+        "easy": 80,
     },
 }
 """Settings that differ by domain; beta and epsilon are the supplement's."""
@@ -318,7 +321,7 @@ class _Trainer:
         options, domain = self.options, self.domain
         start = domain.anywhere(options.rounds, self.generator)
         length = options.length or domain.horizon
-        plan = draw_views(domain, options.rounds, length, self.generator)
+        plan = draw_views(domain, options.rounds, length, self.generator, self._easy)
         epsilon = options.epsilon * options.epsilon_decay**self.phase
         self.starts.append(start)
         self.actions.append(
@@ -346,7 +349,9 @@ class _Trainer:
                 generator=self.generator,
                 device=self.generator.device,
             )
-            plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
+            plan = draw_views(
+                self.domain, options.batch, actions.shape[1], self.generator, self._easy
+            )
             start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
             lived = experience(
                 self.domain,
@@ -369,6 +374,10 @@ class _Trainer:
             elbo -= float(loss.negative_elbo) / options.steps
             bellman += float(loss.bellman) / options.steps
         return f"elbo {elbo:.2f} per observation, bellman error {bellman:.3f}"
+
+    @property
+    def _easy(self) -> bool:
+        return self.phase < self.options.easy
 
     def _first(self) -> int:
         """At which step the first of every ``stride`` steps is from which values are learned."""

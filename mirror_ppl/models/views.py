@@ -28,8 +28,8 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility
 
 KINDS = ("full", "dropout", "sight")
 KIND_PROBABILITIES = (0.1, 0.1, 0.8)
-SEARCHING_KINDS = (0.3, 0.1, 0.6)
-"""The same in worlds where one has to search, in which sight views tell little for long."""
+EASY_PRACTICE, EASY_TOLD = (0.25, 1.0), 0.5
+"""Where searching is made easy: how probably anything is noticed at a step, and is told."""
 ASSUMPTION_PROBABILITY = 0.7
 """Share of sight views in which each assumption is made."""
 TOLD_PROBABILITY = 0.4
@@ -139,16 +139,30 @@ class ViewPlan:
         return taken
 
 
-def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generator) -> ViewPlan:
-    """Draw a view for each of ``batch`` rounds of ``steps`` actions."""
+def draw_views(
+    domain: Domain, batch: int, steps: int, generator: torch.Generator, easy: bool = False
+) -> ViewPlan:
+    """Draw a view for each of ``batch`` rounds of ``steps`` actions.
+
+    Args:
+        domain: the world.
+        batch: number of rounds B.
+        steps: number of actions T.
+        generator: source of randomness.
+        easy: whether, in worlds where one has to search, nothing is overlooked for long.
+    """
     device = generator.device
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, device=device)
 
-    least, most = domain.notice_practice
-    kinds = SEARCHING_KINDS if least < most else KIND_PROBABILITIES
-    kind = torch.multinomial(torch.tensor(kinds, device=device), batch, True, generator=generator)
+    (least, most), most_told = domain.notice_practice, domain.told_practice
+    has_to_search = least < most
+    if has_to_search and easy:
+        (least, most), most_told = EASY_PRACTICE, EASY_TOLD
+    kind = torch.multinomial(
+        torch.tensor(KIND_PROBABILITIES, device=device), batch, True, generator=generator
+    )
     full, dropout, sight = (kind == index for index in range(len(KINDS)))
     bins = torch.tensor(domain.reach_bins, device=device)
     shape = (batch, len(domain.directions))
@@ -166,20 +180,20 @@ def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generato
     for modality in domain.modalities:
         visual = modality.name == "visual"
         seen = 1.0 if visual else 0.0
-        if least < most:
+        if has_to_search:
             drawn_rate = least * (most / least) ** uniform(batch)
             heard = (uniform(batch) < HEARD_PROBABILITY).to(drawn_rate)
             seen = torch.where(sight, drawn_rate if visual else heard, seen)
         rate = torch.where(dropout, uniform(batch), seen)
         keep[modality.name] = torch.where(full, 1.0, rate)
-        often = domain.told_practice * uniform(batch)
+        often = most_told * uniform(batch)
         told[modality.name] = torch.where(sight & spoken_to, often, 0.0)
         noise[modality.name] = uniform(batch, steps + 1, len(modality.items), 2)
     return ViewPlan(
         reach=torch.where(sight[:, None], bins[drawn], bins[-1]),
         keep=keep,
         told=told,
-        searches=sight & (least < most),
+        searches=sight & (has_to_search and not easy),
         remembers=sight,
         assumes={
             name: sight & (uniform(batch) < ASSUMPTION_PROBABILITY) for name in domain.assumptions
