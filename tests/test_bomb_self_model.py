@@ -1,6 +1,5 @@
 """Self-models of bomb defusal: what is practised, by whose rules, and how good one is."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -26,79 +25,17 @@ WORLD = BombDefusal()
 
 def test_terminals_are_noticed_at_the_rates_that_are_practised(generator):
     plan = draw_views(WORLD, 4000, 6, generator)
-    rates, sight = plan.keep["visual"], plan.remembers
-    assert torch.equal(plan.searches, sight)
-    assert ((rates[sight] >= 0.05) & (rates[sight] <= 1)).all()
-    # Log-uniform: the mean of n logarithms is within 4.5 standard errors of the middle.
-    logs = rates[sight].log()
-    assert abs(logs.mean() - 0.5 * math.log(0.05)) < 4.5 * logs.std() / len(logs) ** 0.5
+    rates = plan.keep["visual"]
+    sight = plan.remembers
+    assert ((rates[sight] >= 0.25) & (rates[sight] <= 1)).all()
+    # Uniform: the mean of n numbers from .25 to 1 is within 4.5 * .75 / sqrt(12 n).
+    assert abs(rates[sight].mean() - 0.625) < 4.5 * 0.75 / (12 * int(sight.sum())) ** 0.5
     assert (rates[~sight] == 1).any() and (rates[~sight] < 0.25).any()
-    heard = plan.keep["verbal"][sight]
-    assert set(heard.tolist()) == {0.0, 1.0}
-    assert abs(heard.mean() - 0.5) < 4.5 * 0.5 / len(heard) ** 0.5
+    assert not plan.keep["verbal"][sight].any()
     # Of worlds in which what is near is seen at once, everything is kept.
     for name in ("driving", "search_rescue"):
         plan = draw_views(get_domain(name), 400, 6, generator)
-        assert (plan.keep["visual"][plan.remembers] == 1).all() and not plan.searches.any()
-        assert not plan.keep["verbal"][plan.remembers].any()
-
-
-def test_in_easy_phases_nothing_is_overlooked_for_long(generator):
-    plan = draw_views(WORLD, 4000, 6, generator, easy=True)
-    sight = plan.remembers
-    assert not plan.searches.any()
-    assert ((plan.keep["visual"][sight] >= 0.25) & (plan.keep["visual"][sight] <= 1)).all()
-    assert 0.4 < float(plan.told["visual"].max()) <= 0.5
-    # Where nobody has to search it is the same as ever.
-    plans = [
-        draw_views(get_domain("driving"), 9, 3, torch.Generator().manual_seed(0), easy=easy)
-        for easy in (False, True)
-    ]
-    assert torch.equal(plans[0].noise["visual"], plans[1].noise["visual"])
-    assert torch.equal(plans[0].keep["visual"], plans[1].keep["visual"])
-
-
-def test_who_searches_sees_only_what_counts_and_hopes_to_see_it_soon(generator):
-    state = WORLD.initial(4000, generator)
-    observation = {name: value[:, None] for name, value in WORLD.observe(state).items()}
-    plan = draw_views(WORLD, 4000, 1, generator)
-    slow = replace(
-        plan,
-        searches=torch.ones_like(plan.searches),
-        keep={"visual": torch.full((4000,), 0.1), "verbal": torch.zeros(4000)},
-    )
-    lit = torch.arange(6) == state.live[:, :1]
-    for own, rate in ((slow, 0.1), (slow.hoping(WORLD), 0.5)):
-        seen = own.sees(WORLD, observation)
-        assert not seen["verbal"].any()
-        assert not seen["visual"][:, 0][~lit].any()
-        found = seen["visual"][:, 0][lit].float()
-        assert abs(found.mean() - rate) < 4.5 * (rate * (1 - rate) / 4000) ** 0.5
-    # Who is quicker than that, or does not search, hopes for nothing else.
-    quick = replace(slow, keep={**slow.keep, "visual": torch.full((4000,), 0.8)})
-    assert (quick.hoping(WORLD).keep["visual"] == 0.8).all()
-    idle = replace(slow, searches=torch.zeros_like(plan.searches))
-    assert (idle.hoping(WORLD).keep["visual"] == 0.1).all()
-    assert idle.sees(WORLD, observation)["visual"][:, 0][~lit].any()
-
-
-def test_what_follows_is_seen_as_hoped_for(generator):
-    """Nobody notices anything on the way, and everybody expects to: after the present step."""
-    start = WORLD.initial(4000, generator)
-    waits = torch.zeros(4000, 3, dtype=torch.long)
-    plan = draw_views(WORLD, 4000, 3, generator)
-    blind = replace(
-        plan,
-        searches=torch.ones_like(plan.searches),
-        remembers=torch.ones_like(plan.searches),
-        keep={"visual": torch.zeros(4000), "verbal": torch.zeros(4000)},
-        told={name: torch.zeros(4000) for name in plan.told},
-    )
-    lived = experience(WORLD, start, waits, blind)
-    assert not lived.rounds.visible["visual"].any()
-    for outcome in lived.outcomes:
-        found = outcome.visible["visual"].any(-1).float().mean(0)
-        assert ((found - 0.5).abs() < 4.5 * 0.5 / 4000**0.5).all()
+        assert (plan.keep["visual"][plan.remembers] == 1).all()
 
 
 def lived(generator, **plan):

@@ -103,9 +103,8 @@ class Domain(Protocol):
     lose when a round ends; where it does not, the end is only where recording stops.
     ``partial_views`` are reaches in each direction by name, in which self-models are measured.
     The robot practises to see only so far with weights ``reach_practice`` of the reaches (all alike
-    if empty), to notice what it looks for at a step with a probability between those of
-    ``notice_practice``, while it hopes for ``notice_hope`` at least, and to be told of an item with
-    one up to ``told_practice``.
+    if empty), to notice what is within reach at a step with a probability between those of
+    ``notice_practice``, and to be told of an item with one up to ``told_practice``.
     ``mishap`` is the reward term of what people should be kept from, and what several of them are
     called. ``counterparts`` has for each visual item the verbal item that tells of the same, where
     that tells more of it.
@@ -131,7 +130,6 @@ class Domain(Protocol):
     reach_practice: tuple[float, ...]
     told_practice: float
     notice_practice: tuple[float, float]
-    notice_hope: float
     partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...]
 

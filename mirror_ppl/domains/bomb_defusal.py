@@ -144,10 +144,9 @@ class BombDefusal:
     """Everybody reaches every terminal: they are all in front of them."""
     reach_unit = "steps"
     reach_practice: tuple[float, ...] = ()
-    told_practice = 0.1
-    # People search for long and go on searching, as if they were about to find it.
-    notice_practice = (0.05, 1.0)
-    notice_hope = 0.5
+    told_practice = 0.5
+    # The robot takes people to be about as quick as they would have to be for waiting to pay.
+    notice_practice = (0.25, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {}
     assumptions: tuple[str, ...] = ()
 

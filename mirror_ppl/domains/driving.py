@@ -144,7 +144,6 @@ class Driving:
     reach_practice: tuple[float, ...] = ()
     told_practice = 0.5
     notice_practice = (1.0, 1.0)
-    notice_hope = 1.0
     partial_views: Mapping[str, tuple[float, ...]] = {
         "fog": (FOG_REACH, FOG_REACH, 0.0, 0.0),
         "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),

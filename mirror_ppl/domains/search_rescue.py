@@ -173,7 +173,6 @@ class SearchRescue:
     )
     told_practice = 0.05
     notice_practice = (1.0, 1.0)
-    notice_hope = 1.0
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ()
 

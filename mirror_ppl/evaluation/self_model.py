@@ -56,7 +56,6 @@ def fixed_views(
         reach=torch.tensor(reach or farthest, device=generator.device).expand(batch, -1),
         keep=rates,
         told={name: torch.zeros_like(some) for name in rates},
-        searches=torch.zeros_like(limited),
         remembers=torch.ones_like(limited),
         assumes=dict.fromkeys(domain.assumptions, limited),
         noise={

@@ -101,13 +101,12 @@ def experience(
     )
 
     steps = slice(first, actions.shape[1], stride)
-    hoping = plan.hoping(domain)
     some, known = (map_state(lambda part: part[:, steps], whole) for whole in (current, so_far))
 
     def outcome(action: Tensor) -> Outcomes:
         following = domain.transition(some, action)
         observation = domain.observe(following)
-        seen, after = hoping.look(domain, known, observation, 1 + first, stride)
+        seen, after = plan.look(domain, known, observation, 1 + first, stride)
         taken = plan.taken(domain, after, observation)
         return Outcomes(
             reward=total_reward(domain.rewards(some, action, following)),

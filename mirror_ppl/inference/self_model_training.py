@@ -54,7 +54,6 @@ class SelfModelOptions:
         world_weight: weight of the negative ELBO per observation.
         length: steps of a round that is learned from; as many as a round has, if 0.
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
-        easy: phases at the beginning in which nobody has to search for long.
         exact: whether somebody who knows everything learns the exact planner's values, and not
             what a step leads to.
     """
@@ -75,7 +74,6 @@ class SelfModelOptions:
     length: int = 0
     stride: int = 1
     exact: bool = False
-    easy: int = 0
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
@@ -126,10 +124,8 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "discount": 0.95,
         "target_rate": 0.02,
         "world_weight": 0.01,
-        "length": 16,
+        "length": 12,
         "stride": 2,
-        "exact": True,
-        "easy": 80,
     },
 }
 """Settings that differ by domain; beta and epsilon are the supplement's."""
@@ -188,7 +184,7 @@ def self_model_loss(
     error = self_model.action_values(belief) - goal
     # When all is done, which may be so in every round, it does not matter what one does.
     under_way = error[~lived.over]
-    bellman = under_way.pow(2).sum() / max(under_way.numel(), 1)
+    bellman = under_way.pow(2).mean() if len(under_way) else under_way.sum()
     return Loss(
         options.world_weight * negative_elbo + bellman, negative_elbo.detach(), bellman.detach()
     )
@@ -321,7 +317,7 @@ class _Trainer:
         options, domain = self.options, self.domain
         start = domain.anywhere(options.rounds, self.generator)
         length = options.length or domain.horizon
-        plan = draw_views(domain, options.rounds, length, self.generator, self._easy)
+        plan = draw_views(domain, options.rounds, length, self.generator)
         epsilon = options.epsilon * options.epsilon_decay**self.phase
         self.starts.append(start)
         self.actions.append(
@@ -349,9 +345,7 @@ class _Trainer:
                 generator=self.generator,
                 device=self.generator.device,
             )
-            plan = draw_views(
-                self.domain, options.batch, actions.shape[1], self.generator, self._easy
-            )
+            plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
             start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
             lived = experience(
                 self.domain,
@@ -374,10 +368,6 @@ class _Trainer:
             elbo -= float(loss.negative_elbo) / options.steps
             bellman += float(loss.bellman) / options.steps
         return f"elbo {elbo:.2f} per observation, bellman error {bellman:.3f}"
-
-    @property
-    def _easy(self) -> bool:
-        return self.phase < self.options.easy
 
     def _first(self) -> int:
         """At which step the first of every ``stride`` steps is from which values are learned."""

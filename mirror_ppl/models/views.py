@@ -5,9 +5,8 @@ what they make of it. So each training round is seen in a way of its own, of thr
 
 - *full*: everything, in both modalities;
 - *dropout*: each item with a probability drawn for the round, in each modality;
-- *sight*: items up to a reach drawn for each direction; in worlds where one has to search, what one
-  looks for, noticed at each step with a probability drawn for the round. Now and then something is
-  told.
+- *sight*: items up to a reach drawn for each direction, in worlds where that takes time noticed at
+  each step with a probability drawn for the round; and now and then something is told.
 
 An observer with a sight view remembers: what follows from what they have seen and been told counts
 as visible. And they may take things for granted, such as that a car never seen is not there. For
@@ -18,7 +17,7 @@ observer would conclude; an item that is merely not visible stays unknown.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -28,13 +27,9 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility
 
 KINDS = ("full", "dropout", "sight")
 KIND_PROBABILITIES = (0.1, 0.1, 0.8)
-EASY_PRACTICE, EASY_TOLD = (0.25, 1.0), 0.5
-"""Where searching is made easy: how probably anything is noticed at a step, and is told."""
 ASSUMPTION_PROBABILITY = 0.7
 """Share of sight views in which each assumption is made."""
 TOLD_PROBABILITY = 0.4
-HEARD_PROBABILITY = 0.5
-"""Share of sight views, in worlds where one has to search, in which utterances need not be told."""
 ALIKE_PROBABILITY = 0.5
 """Share of sight views with the same reach in all directions of a group: most people's eyes."""
 
@@ -47,7 +42,6 @@ class ViewPlan:
         reach: sight threshold for each direction ``[B, D]``, in the domain's unit of distance.
         keep: for each modality, the probability ``[B]`` that an item within reach is visible.
         told: for each modality, the probability ``[B]`` that a communicable item is told.
-        searches: ``[B]``, whether only what one looks for is seen unaided.
         remembers: ``[B]``, whether what follows from earlier observations counts as visible.
         assumes: for each of the domain's assumptions, whether it is made, ``[B]``.
         noise: for each modality, uniform numbers ``[B, T + 1, K, 2]`` that decide keep and told.
@@ -56,7 +50,6 @@ class ViewPlan:
     reach: Tensor
     keep: Visibility
     told: Visibility
-    searches: Tensor
     remembers: Tensor
     assumes: dict[str, Tensor]
     noise: dict[str, Tensor]
@@ -72,19 +65,12 @@ class ViewPlan:
             for name, value in observation.items()
             if name != "ego"
         }
-        sought = domain.sought(observation) | ~self.searches[:, None, None]
-        seen["visual"] = sought & (distance <= self.reach[batch, direction])
+        seen["visual"] = distance <= self.reach[batch, direction]
         steps = slice(first, first + stride * distance.shape[1], stride)
         return {
             name: near & (self.noise[name][:, steps, :, 0] < self.keep[name][:, None, None])
             for name, near in seen.items()
         }
-
-    def hoping(self, domain: Domain) -> ViewPlan:
-        """The view of what comes next: who searches hopes to find what they look for soon."""
-        keep = self.keep["visual"]
-        hoped = torch.where(self.searches, keep.clamp(min=domain.notice_hope), keep)
-        return replace(self, keep={**self.keep, "visual": hoped})
 
     def visibility(
         self, domain: Domain, observation: Observation, first: int = 0, stride: int = 1
@@ -139,27 +125,13 @@ class ViewPlan:
         return taken
 
 
-def draw_views(
-    domain: Domain, batch: int, steps: int, generator: torch.Generator, easy: bool = False
-) -> ViewPlan:
-    """Draw a view for each of ``batch`` rounds of ``steps`` actions.
-
-    Args:
-        domain: the world.
-        batch: number of rounds B.
-        steps: number of actions T.
-        generator: source of randomness.
-        easy: whether, in worlds where one has to search, nothing is overlooked for long.
-    """
+def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generator) -> ViewPlan:
+    """Draw a view for each of ``batch`` rounds of ``steps`` actions."""
     device = generator.device
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, device=device)
 
-    (least, most), most_told = domain.notice_practice, domain.told_practice
-    has_to_search = least < most
-    if has_to_search and easy:
-        (least, most), most_told = EASY_PRACTICE, EASY_TOLD
     kind = torch.multinomial(
         torch.tensor(KIND_PROBABILITIES, device=device), batch, True, generator=generator
     )
@@ -175,25 +147,23 @@ def draw_views(
     for group in domain.direction_groups:
         for direction in group[1:]:
             drawn[:, direction] = torch.where(alike, drawn[:, group[0]], drawn[:, direction])
+    least, most = domain.notice_practice
     keep, told, noise = {}, {}, {}
     spoken_to = uniform(batch) < TOLD_PROBABILITY
     for modality in domain.modalities:
         visual = modality.name == "visual"
         seen = 1.0 if visual else 0.0
-        if has_to_search:
-            drawn_rate = least * (most / least) ** uniform(batch)
-            heard = (uniform(batch) < HEARD_PROBABILITY).to(drawn_rate)
-            seen = torch.where(sight, drawn_rate if visual else heard, seen)
+        if visual and least < most:
+            seen = torch.where(sight, least + (most - least) * uniform(batch), 1.0)
         rate = torch.where(dropout, uniform(batch), seen)
         keep[modality.name] = torch.where(full, 1.0, rate)
-        often = most_told * uniform(batch)
+        often = domain.told_practice * uniform(batch)
         told[modality.name] = torch.where(sight & spoken_to, often, 0.0)
         noise[modality.name] = uniform(batch, steps + 1, len(modality.items), 2)
     return ViewPlan(
         reach=torch.where(sight[:, None], bins[drawn], bins[-1]),
         keep=keep,
         told=told,
-        searches=sight & (has_to_search and not easy),
         remembers=sight,
         assumes={
             name: sight & (uniform(batch) < ASSUMPTION_PROBABILITY) for name in domain.assumptions
