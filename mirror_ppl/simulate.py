@@ -18,14 +18,16 @@ class Options:
     out: Path
     """The netCDF file to write; one that is there is replaced, missing folders are created."""
     domain: str = "driving"
-    """The world: driving (two lanes, four cars that never yield) or search_rescue (a burning house,
-    a victim, two corridors)."""
+    """The world: driving (two lanes, four cars that never yield), search_rescue (a burning house,
+    a victim, two corridors) or bomb_defusal (three stages, six terminals)."""
     setting: str | None = None
     """Its setting: of driving clear (the whole road in sight) or fog (2 cells ahead, nothing
-    behind), of search_rescue clear (the whole house in sight) or smoke (1.5 cells around). Default:
-    the one in which people see less."""
+    behind), of search_rescue clear (the whole house in sight) or smoke (1.5 cells around), of
+    bomb_defusal labelled (the type can be read) or unlabelled. Default: the one in which people see
+    less."""
     population: str = "paper"
-    """Who: paper (sight limited by the setting alone) or diverse (each their own sight)."""
+    """Who: paper (sight limited by the setting alone; in bomb_defusal as quick at every terminal)
+    or diverse (each their own sight)."""
     people: int = 10
     """How many people, at least 1."""
     rounds: int = 40

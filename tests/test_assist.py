@@ -192,7 +192,7 @@ def changed(posterior, path, **attributes):
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"domain": "chess"}, 'unknown domain "chess"; known: driving'),
+        ({"domain": "chess"}, 'unknown domain "chess"; known: bomb_defusal, driving'),
         ({"domain_version": "99"}, "is of domain version 99, not"),
         ({"self_model": "0" * 16}, f"is of self model {'0' * 16}, not"),
         ({"human_model": "LatePerson"}, "is of human model LatePerson, not HumanModel"),

@@ -164,14 +164,15 @@ def test_every_page_is_listed_in_the_readme():
 )
 def test_tables_of_settings_are_the_defaults(name, heading, options):
     shown = {row[0].strip("`"): float(row[1]) for row in table_of(page(name), heading)}
-    assert shown == {key: pytest.approx(value) for key, value in asdict(options).items()}
+    assert shown == {key: pytest.approx(float(value)) for key, value in asdict(options).items()}
 
 
 def test_options_and_communicators_of_assist_are_told_as_they_are():
     text, options = page("docs/communicator.md"), assist.Options()
     shown = {row[0].strip("`-"): row[1] for row in table_of(text, "Option")}
     assert shown.pop("communicator") == "all of them" and options.communicator == ()
-    assert shown.pop("horizon") == "the domain's" and options.horizon is None
+    for name in ("horizon", "branch"):
+        assert shown.pop(name) == "the domain's" and getattr(options, name) is None
     assert shown == {name: str(getattr(options, name)) for name in shown}
     first = " ".join(row[0] for row in table_of(text, "Communicator"))
     assert tuple(re.findall(r"`([\w-]+)`", first)) == COMMUNICATORS
