@@ -163,6 +163,10 @@ def test_rules_are_learned_from_rewards_and_planned_with():
             assert learned[kind][OLD_RULES[kind][symbol]] == RULES[kind][symbol]
     some = implants(human)
     assert human.known_world({name: value[None] for name, value in some.items()}).rules == RULES
+    # Asked again it learns the same.
+    before = human.rule_logits.clone()
+    human.learn_world(recorded)
+    assert torch.equal(human.rule_logits, before)
     # Without rewards there is nothing to learn.
     again = Searcher(human.self_model)
     again.learn_world(replace(recorded, rewards=None))

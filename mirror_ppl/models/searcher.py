@@ -29,7 +29,8 @@ from torch import Tensor
 
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, total_reward
-from mirror_ppl.domains.bomb_defusal import BombDefusal
+from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
+from mirror_ppl.domains.bomb_panel import BUTTONS, KINDS, STAGES
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants, View
 from mirror_ppl.models.self_model import SelfModel
@@ -40,6 +41,9 @@ SEARCHING = (1.0, 9.0)
 """Of the prior of how probably a terminal is noticed at a step: a Beta density of mean 0.1."""
 SAME = 0.5
 """Prior probability that the robot's rules for a type hold."""
+WAITS, MOST_WAITS, BLIND = 2.0, 8.0, 4.0
+"""In nats, what it takes to explain a wait although it was found, several of them at most, and a
+press although it was not."""
 REWARD_SCALE = 1.0
 """Standard deviation of recorded rewards, in units of reward."""
 
@@ -51,37 +55,32 @@ class Searcher(HumanModel):
         self_model: the robot's networks, of bomb defusal.
 
     Attributes:
+        kinds: types of bombs, as sites name them.
         rule_logits: of each permutation of buttons, by type, ``[2, 24]``; the prior until
             :meth:`learn_world` was called.
+        exchanges: these permutations, ``[24, 4, 4]``: the button that somebody presses, and that
+            which the robot would.
     """
 
     stepwise = True
+    kinds = tuple(kind.lower().replace(" ", "_") for kind in KINDS)
     rule_logits: Tensor
     exchanges: Tensor
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__(self_model)
-        buttons = len(self.domain.actions) - 1
-        orders = torch.tensor(list(permutations(range(buttons))))  # the first changes nothing
+        orders = torch.tensor(list(permutations(range(len(BUTTONS)))))  # the first changes nothing
         # [24, 4, 4]: row a has a 1 at the button that the robot would press where they press a.
         self.register_buffer(
             "exchanges", torch.nn.functional.one_hot(orders).transpose(1, 2).float()
         )
-        number = len(orders)
-        prior = torch.full((len(self.kinds), number), (1 - SAME) / (number - 1))
+        self.register_buffer("rule_logits", self._prior_of_rules())
+
+    def _prior_of_rules(self) -> Tensor:
+        number = len(self.exchanges)
+        prior = self.exchanges.new_full((len(KINDS), number), (1 - SAME) / (number - 1))
         prior[:, 0] = SAME
-        self.register_buffer("rule_logits", prior.log())
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Types of bombs, as sites name them."""
-        (utterances,) = next(m.utterances for m in self.domain.modalities if m.utterances)
-        return tuple(text.lower().removesuffix(" bomb").replace(" ", "_") for text in utterances)
-
-    @property
-    def stages(self) -> int:
-        """Number of stages of a round."""
-        return self.domain.symbol_sizes["ego"] - 1
+        return prior.log()
 
     def prior(self) -> dict[str, Tensor]:
         """Sample how quick they are, whether they read the type, their rules and choices."""
@@ -104,7 +103,7 @@ class Searcher(HumanModel):
         each = [implants[implant_priors.NOTICES + item] for item in items]
         notices = torch.stack(torch.broadcast_tensors(*each), -1)
         sites = {GUESS: pyro.sample(GUESS, dist.Categorical(notices.new_full((2,), 0.5)))}
-        for stage in range(self.stages):
+        for stage in range(STAGES):
             sought = implants.get(f"{SOUGHT}{stage}", one.new_zeros(1, 1, dtype=torch.long))
             shape = torch.broadcast_shapes(notices.shape[:-1], sought.shape)
             own = notices.expand(*shape, -1).gather(-1, sought.expand(shape)[..., None])
@@ -118,7 +117,7 @@ class Searcher(HumanModel):
         stage = observation["ego"][..., 0].long()
         sought = self.domain.sought(observation).long().argmax(-1)
         last, found = None, {}
-        for number in range(self.stages):
+        for number in range(STAGES):
             here = stage == number
             place = here.long().argmax(-1, keepdim=True)
             own = sought.gather(-1, place).squeeze(-1)
@@ -131,17 +130,17 @@ class Searcher(HumanModel):
         steps = torch.arange(self.domain.horizon + 1, device=actions.device)
         stage, since = (part[: len(actions)] for part in observation["ego"].long().unbind(-1))
         found = {}
-        for number in range(self.stages):
+        for number in range(STAGES):
             here = stage == number
             if not here.any():
                 continue
             waited = since[here].max()
-            pressed = bool((here & (actions != 0)).any())
+            pressed = bool((here & (actions != WAIT)).any())
             before = (waited - steps).clamp(min=0).float()
             # Each step earlier is a wait that needs explaining, up to a few nats.
-            log = -(2.0 * before).clamp(max=8.0)
+            log = -(WAITS * before).clamp(max=MOST_WAITS)
             if pressed:
-                log = torch.where(steps > waited, -4.0, log)
+                log = torch.where(steps > waited, -BLIND, log)
             found[f"{FOUND}{number}"] = log
         return found
 
@@ -149,10 +148,10 @@ class Searcher(HumanModel):
         """What one looks for, once it was found, and the type of those who read it."""
         del step
         stage, since = observation["ego"].long().unbind(-1)
-        times = [implants[f"{FOUND}{number}"] for number in range(self.stages)]
+        times = [implants[f"{FOUND}{number}"] for number in range(STAGES)]
         times = torch.stack(torch.broadcast_tensors(*times), -1)
         shape = torch.broadcast_shapes(times.shape[:-1], stage.shape)
-        place = stage.clamp(max=self.stages - 1).expand(shape)[..., None]
+        place = stage.clamp(max=STAGES - 1).expand(shape)[..., None]
         found = times.expand(*shape, -1).gather(-1, place).squeeze(-1) <= since
         verbal = observation["verbal"][..., 0]
         reads = (implants[READS] == 1)[..., None]
@@ -219,11 +218,12 @@ class Searcher(HumanModel):
             expected = total_reward(world.rewards(state, action, world.transition(state, action)))
             scores.append(dist.Normal(expected, REWARD_SCALE).log_prob(reward))
         scores = torch.stack(scores, -1)  # [n, 4]
-        for number in range(len(self.kinds)):
+        logits = self._prior_of_rules()
+        for number in range(len(KINDS)):
             some = kind == number
             under = self.exchanges[:, button[some]]  # [24, n, 4]
-            self.rule_logits[number] += (under * scores[some]).sum((1, 2))
-        self.rule_logits -= self.rule_logits.logsumexp(-1, keepdim=True)
+            logits[number] += (under * scores[some]).sum((1, 2))
+        self.rule_logits.copy_(logits - logits.logsumexp(-1, keepdim=True))
 
     def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
         """The bomb by the rules that are likeliest to hold."""
