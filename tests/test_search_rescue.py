@@ -78,6 +78,19 @@ def test_the_same_seed_starts_the_same_round():
     assert ((counts - 1000).abs() < 5 * 1000**0.5).all()
 
 
+def test_the_robot_learns_from_rounds_that_begin_anywhere_and_often_where_rounds_do(generator):
+    state = WORLD.anywhere(8000, generator)
+    entrance = (state.place == torch.tensor(ENTRANCE)).all(-1)
+    begins = entrance & ~state.found
+    # A quarter begin there, and of the others one in 60 cells, half of them without the victim.
+    share = 0.25 + 0.75 / 60 / 2
+    assert abs(begins.float().mean() - share) < 4.5 * (share * (1 - share) / 8000) ** 0.5 + 0.005
+    others = state.found[~begins].float()
+    assert abs(others.mean() - 0.5) < 0.05
+    assert (state.home == (state.found & entrance)).all()
+    assert len(set(map(tuple, state.place.tolist()))) == 60
+
+
 def test_a_rescue_by_hand():
     states, terms = walk(alone(0), TO_LEFT + [DOWN] * 7 + [RIGHT] * 3 + [UP])
     assert states[10].place.tolist() == [1, 1] and states[10].found and not states[9].found
