@@ -404,7 +404,7 @@ class BombDefusal:
         side = PICTURE[0] * cell
         columns = TERMINALS // 2
         height, width = 3 * gap + 2 * side + 12, (columns + 1) * gap + columns * side
-        picture = np.full((height, width, 3), 90, dtype=np.uint8)
+        picture = np.full((height, width, 3), 170, dtype=np.uint8)
         pixels = self.observe(state)["visual"].unflatten(-1, PICTURE).numpy()
         for number, terminal in enumerate((255 * pixels).round().astype(np.uint8)):
             row, column = divmod(number, columns)
