@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from mirror_ppl.domains import require_known
 from mirror_ppl.errors import DemonstrationsError
@@ -68,3 +71,32 @@ def round_of(dataset: xr.Dataset, dimension: str, number: int) -> xr.Dataset:
             f"expected one of {recorded}, counted from 0"
         )
     return dataset.isel({dimension: number})
+
+
+def label_columns(axes: Iterable[Axes], titles: Iterable[str]) -> None:
+    """Titles above the first row of panels."""
+    for ax, title in zip(axes, titles, strict=True):
+        ax.set_title(title, fontsize=10, loc="left")
+
+
+def explain(figure: Figure, data: az.InferenceData, title: str, shown: int, legend: str) -> None:
+    """What a figure of people shows, above it, and what its colours mean, below it.
+
+    Args:
+        figure: the figure.
+        data: what it shows people of.
+        title: what it shows of them.
+        shown: how many of them, from the first on.
+        legend: of its colours.
+    """
+    setting = data["posterior"].attrs.get("setting")
+    everybody = len(people(data))
+    some = "" if shown == everybody else f" (the first {shown} of {everybody} people)"
+    figure.suptitle(
+        f"{title}{f', {setting}' if setting else ''}{some}",
+        x=0.01,
+        ha="left",
+        fontsize=14,
+        fontweight="bold",
+    )
+    figure.supxlabel(legend, x=0.01, ha="left", fontsize=9)

@@ -22,7 +22,7 @@ from mirror_ppl.plots.driving import (
     true_sight,
 )
 from mirror_ppl.plots.picture import Picture
-from mirror_ppl.plots.reading import people
+from mirror_ppl.plots.reading import explain, label_columns, people
 
 if TYPE_CHECKING:
     import arviz as az
@@ -68,23 +68,13 @@ def samples_picture(data: az.InferenceData) -> Picture:
         for ax, number in zip(panels, chosen, strict=True):
             _draw(ax, drawn[number])
         row[0].set_ylabel(person, fontsize=9, rotation=0, ha="right", va="center")
-    for ax, title in zip(grid[0], columns, strict=True):
-        ax.set_title(title, fontsize=10, loc="left")
-    attributes = data["posterior"].attrs
-    setting = f", {attributes['setting']}" if "setting" in attributes else ""
-    some = "" if shown == everybody else f" (the first {len(shown)} of {len(everybody)} people)"
-    figure.suptitle(
-        f"What each person may see of the road{setting}{some}",
-        x=0.01,
-        ha="left",
-        fontsize=14,
-        fontweight="bold",
-    )
-    figure.supxlabel(
+    label_columns(grid[0], columns)
+    explain(
+        figure,
+        data,
+        "What each person may see of the road",
+        len(shown),
         "Black: not seen. Blue: the person, who drives to the right. Red: other cars.",
-        x=0.01,
-        ha="left",
-        fontsize=9,
     )
     return figure
 

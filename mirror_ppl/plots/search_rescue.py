@@ -13,7 +13,15 @@ from mirror_ppl.domains.rescue_house import PORTION, SIDE, as_image
 from mirror_ppl.domains.search_rescue import RescueState, SearchRescue
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture
-from mirror_ppl.plots.reading import BLUE, draws, of_person, people, truth
+from mirror_ppl.plots.reading import (
+    BLUE,
+    draws,
+    explain,
+    label_columns,
+    of_person,
+    people,
+    truth,
+)
 
 if TYPE_CHECKING:
     import arviz as az
@@ -78,24 +86,14 @@ def sight_picture(data: az.InferenceData) -> Picture:
         for ax, value in zip(panels, drawn[chosen], strict=True):
             _draw(ax, _seen(np.array([value]))[0], f"{value:g} cells")
         row[0].set_ylabel(person, fontsize=10)
-    for ax, title in zip(grid[0], columns, strict=True):
-        ax.set_title(title, fontsize=10, loc="left")
-    attributes = data["posterior"].attrs
-    setting = f", {attributes['setting']}" if "setting" in attributes else ""
-    some = "" if shown == everybody else f" (the first {len(shown)} of {len(everybody)} people)"
-    figure.suptitle(
-        f"What each person sees of the house{setting}{some}",
-        x=0.01,
-        ha="left",
-        fontsize=14,
-        fontweight="bold",
-    )
-    figure.supxlabel(
+    label_columns(grid[0], columns)
+    explain(
+        figure,
+        data,
+        "What each person sees of the house",
+        len(shown),
         "Black: not seen. Blue: the firefighter, before the left corridor. Green: the victim.\n"
         "Purple: the obstacle. Yellow: the entrance.",
-        x=0.01,
-        ha="left",
-        fontsize=9,
     )
     return figure
 
