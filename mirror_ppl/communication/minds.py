@@ -24,7 +24,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility, map_state
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.models.attention import Proposal
+from mirror_ppl.models.attention import AttentionValues, Proposal
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.sites import latent_sites
@@ -92,9 +92,10 @@ class Person:
             return self
         so_far = {name: value[: past.time] for name, value in past.observation.items()}
         facts = {name: fact.view(1, 1) for name, fact in self.human.facts(past.observation).items()}
-        values = self._attention.values(
-            None, 0, facts, self.human.explanations(so_far, past.actions)
-        )
+        explanations = self.human.explanations(so_far, past.actions)
+        values = self._attention_of_any_round
+        if facts or explanations:
+            values = self._attention.values(None, 0, facts, explanations)
         log_chances = self._log_chances(values.values, past)
         with self._conditioned():
             log_chances = log_chances + self.human.log_attention(
@@ -116,6 +117,11 @@ class Person:
     def _attention(self) -> Proposal:
         """Proposes values of attention that stand for all that this person may attend to."""
         return Proposal(self.human, self.draws, self.draws, ATTENTION_VALUES)
+
+    @cached_property
+    def _attention_of_any_round(self) -> AttentionValues:
+        """These values where nothing is known of the round; always the same."""
+        return self._attention.values(None, 0)
 
     def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
         """Log-probability ``[S, G]`` of what was done so far under values of attention ``[G]``."""

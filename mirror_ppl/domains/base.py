@@ -168,10 +168,6 @@ class Domain(Protocol):
         """What an unaided person sees in a setting, limited by the setting alone."""
         ...
 
-    def sought(self, observation: Observation) -> Tensor:
-        """Which visual items ``[..., K]`` somebody looks for; they overlook the others."""
-        ...
-
     def communicable(self, observation: Observation) -> Visibility:
         """Which items may be communicated now."""
         ...

@@ -236,10 +236,6 @@ class Driving:
             seen = (ahead >= 0) & (ahead <= FOG_REACH)
         return {"visual": seen, "verbal": torch.zeros_like(seen)}
 
-    def sought(self, observation: Observation) -> Tensor:
-        """Everything."""
-        return torch.ones_like(observation["visual"][..., 0], dtype=torch.bool)
-
     def communicable(self, observation: Observation) -> Visibility:
         """Only cars in front on the visible road may be shown; any car on it may be spoken of."""
         ahead = observation["visual"][..., 0]

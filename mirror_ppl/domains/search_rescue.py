@@ -285,10 +285,6 @@ class SearchRescue:
             return {"visual": torch.ones_like(distance, dtype=torch.bool), "verbal": everything}
         return {"visual": distance <= SMOKE_REACH, "verbal": ~everything}
 
-    def sought(self, observation: Observation) -> Tensor:
-        """Everything."""
-        return torch.ones_like(observation["visual"][..., 0], dtype=torch.bool)
-
     def communicable(self, observation: Observation) -> Visibility:
         """Every portion can be shown, and of every corridor and room can be spoken."""
         return {

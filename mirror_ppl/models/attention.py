@@ -221,10 +221,10 @@ class Proposal:
             explanations: of what was done, see `HumanModel.explanations`.
         """
         facts = dict(facts or {})
-        prior = self._of_anybody(facts)
+        prior = self._known("anybody", self.anybody, facts)
         likely = prior
         if self.likely is not None:
-            likely = self._of_this_person(facts)
+            likely = self._known("likely", self.likely, facts)
         elif weights is not None:
             likely = site_probabilities(self.human, self.anybody, weights, facts)
         chances = {}
@@ -236,12 +236,6 @@ class Proposal:
         generator = torch.Generator(next(iter(chances.values())).device).manual_seed(seed)
         chosen = choose_values(self.supports, chances, self.number, generator)
         return replace(chosen, facts=facts)
-
-    def _of_anybody(self, facts: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return self._known("anybody", self.anybody, facts)
-
-    def _of_this_person(self, facts: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return self._known("likely", self.likely or {}, facts)
 
     def _known(
         self, whom: str, draws: Mapping[str, Tensor], facts: Mapping[str, Tensor]

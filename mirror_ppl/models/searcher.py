@@ -76,6 +76,13 @@ class Searcher(HumanModel):
         )
         self.register_buffer("rule_logits", self._prior_of_rules())
 
+    @property
+    def domain(self) -> BombDefusal:
+        """Bomb defusal."""
+        world = self.self_model.domain
+        assert isinstance(world, BombDefusal)
+        return world
+
     def _prior_of_rules(self) -> Tensor:
         number = len(self.exchanges)
         prior = self.exchanges.new_full((len(KINDS), number), (1 - SAME) / (number - 1))
@@ -227,10 +234,8 @@ class Searcher(HumanModel):
 
     def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
         """The bomb by the rules that are likeliest to hold."""
-        taught = self.domain.as_believed
-        assert isinstance(taught, BombDefusal)
         rules = []
-        for kind, row in zip(self.kinds, taught.rules, strict=True):
+        for kind, row in zip(self.kinds, self.domain.as_believed.rules, strict=True):
             likeliest = int(draws[RULE + kind].flatten().long().mode().values)
             pressed = self.exchanges[likeliest].argmax(0)  # by the button that the robot would
             rules.append(tuple(int(pressed[button]) for button in row))
