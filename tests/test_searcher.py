@@ -11,13 +11,15 @@ from pyro import poutine
 from mirror_ppl.communication import Person, RoundSoFar
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
-from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
+from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES, read_panel
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.attention import Proposal, site_probabilities
 from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.people import simulate
@@ -25,6 +27,7 @@ from mirror_ppl.people import simulate
 WORLD = BombDefusal()
 WAIT = 0
 ORDERS = list(permutations(range(4)))
+RESIDUAL = {"residual_in": (49, 8), "residual_out": (9, 5)}
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +130,50 @@ def test_an_unknown_type_is_taken_for_what_is_guessed(searcher):
         assert heard.visible["verbal"].all() and not heard.taken["verbal"].any()
 
 
+def test_beliefs_stay_as_they_are_while_there_is_no_news(searcher):
+    """News: the first look, the terminal once found, what is told, and the next stage."""
+    actions = [WAIT] * 5 + [2] + [WAIT] * 4
+    observation, _ = course(actions)
+    own = {f"found_{stage}": torch.tensor([when]) for stage, when in enumerate((2, 60, 60))}
+    own |= {"guess": torch.tensor([1]), "reads_type": torch.tensor([0])}
+    told = {"visual": torch.zeros(1, 11, 6).bool(), "verbal": torch.zeros(1, 11, 1).bool()}
+    told["verbal"][0, [4, 5]] = True
+    view = searcher.perceive(own, observation, told)
+    assert view.still is not None
+    news = (~view.still[0]).nonzero().flatten().tolist()
+    assert news == [0, 2, 4, 6]
+    belief = searcher.believe(view, observation, torch.tensor([[*actions, WAIT]]))[0]
+    assert (belief[1:] != belief[:-1]).any(-1).nonzero().flatten().tolist() == [1, 3, 5]
+    # The same step by step.
+    state = torch.zeros(1, searcher.self_model.latent)
+    last = torch.tensor([5])
+    for step in range(11):
+        now = {name: value[:, step] for name, value in observation.items()}
+        at = view.map(lambda part: part[:, step])  # noqa: B023 - used at once
+        state = searcher.advance(state, searcher.evidence(at, now), last, at.still).mean
+        torch.testing.assert_close(state[0], belief[step])
+        last = torch.tensor([[*actions, WAIT][step]])
+
+
+def test_who_is_asked_to_play_searches_for_what_each_stage_shows():
+    """Terminal 1 is found at once, all others never: a stage ends if it shows terminal 1."""
+    torch.manual_seed(0)
+    human = Searcher(Knowing(WORLD))
+    quick = {f"notices_terminal {k}": torch.tensor([[1e-6]]) for k in range(2, 7)}
+    quick |= {"notices_terminal 1": torch.tensor([[1 - 1e-6]])}
+    quick |= {"consistency": torch.tensor([[20.0]]), "lapse": torch.tensor([[1e-6]])}
+    quick |= {name: torch.zeros(1, 1, *shape) for name, shape in RESIDUAL.items()}
+    played = play_rounds(human, quick, 200, "labelled", torch.Generator().manual_seed(0))
+    live, _ = read_panel(played.observations["visual"][0])
+    stage = played.ego[0, ..., 0]
+    for first, after, where in zip(stage[:, 0], stage[:, 20], live[:, :20], strict=True):
+        assert int(first) == 0
+        assert int(after) == sum(bool((where[: number + 1] == 0).all()) for number in range(3))
+    assert (stage[:, 20] > 0).float().mean() == pytest.approx(
+        1 / 6, abs=4.5 * (5 / 36 / 200) ** 0.5
+    )
+
+
 def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(searcher, monkeypatch):
     """Where the robot would press b, they press ORDERS[rule][b]: values go with the buttons."""
     values = torch.tensor([0.5, 1.0, 2.0, 3.0, 4.0]).expand(1, 1, 1, 5)
@@ -136,8 +183,7 @@ def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(searcher, mon
             searcher, "believed_kind", lambda belief, kind=kind: torch.full((1, 1, 1), float(kind))
         )
         some = implants(searcher, lapse=1e-9, consistency=1.0) | {
-            "residual_in": torch.zeros(1, 1, 49, 8),
-            "residual_out": torch.zeros(1, 1, 9, 5),
+            **{name: torch.zeros(1, 1, *shape) for name, shape in RESIDUAL.items()},
             "rule_type_a": torch.tensor([[1]]),
             "rule_type_b": torch.tensor([[9]]),
         }
@@ -265,7 +311,7 @@ class Knowing(SelfModel):
 
         def forward(self, previous, evidence):
             mean = evidence[..., :48]
-            return type("Belief", (), {"mean": mean, "scale": torch.ones_like(mean)})
+            return Gaussian(mean, torch.ones_like(mean))
 
     def __init__(self, domain):
         super().__init__(domain)

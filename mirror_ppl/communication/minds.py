@@ -357,7 +357,10 @@ class StepwiseBeliefs:
             torch.cat([torch.stack([looks.parent, looks.action, which], -1), *known], -1)
         )
         state = human.advance(
-            self.state.mean[looks.parent[first]], evidence[which[first]], looks.action[first]
+            self.state.mean[looks.parent[first]],
+            evidence[which[first]],
+            looks.action[first],
+            None if view.still is None else view.still[first],
         )
         after = StepwiseBeliefs(self.person, state, _rows(knowledge, first), self.step + 1)
         return after, index

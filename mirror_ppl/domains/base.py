@@ -253,6 +253,13 @@ class Domain(Protocol):
         """
         ...
 
+    def decisive(self, observation: Observation) -> Visibility:
+        """The items ``[..., K]`` that somebody has to know to choose as who knows everything.
+
+        Too many do no harm. Self-models learn exact values where these are known.
+        """
+        ...
+
     def describe(self, observation: Observation, modality: str, item: str) -> str:
         """An item of one observation ``[K, F]`` in words, such as "rear car, closing"."""
         ...

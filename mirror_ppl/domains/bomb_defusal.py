@@ -363,12 +363,14 @@ class BombDefusal:
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
         """The terminal that counts, and the type (supplement, section F)."""
+        return {"terminal_and_type": self.decisive(observation)}
+
+    def decisive(self, observation: Observation) -> Visibility:
+        """The terminal that is lit, and the type, until all is done."""
         under_way = observation["ego"][..., :1] < STAGES
         return {
-            "terminal_and_type": {
-                "visual": self.sought(observation),
-                "verbal": under_way.expand(observation["verbal"].shape[:-1]),
-            }
+            "visual": self.sought(observation),
+            "verbal": under_way.expand(observation["verbal"].shape[:-1]),
         }
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:

@@ -430,6 +430,13 @@ class SearchRescue:
         portions[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = holds
         return {"goal_and_obstacle": {"visual": portions, "verbal": holds}}
 
+    def decisive(self, observation: Observation) -> Visibility:
+        """Everything."""
+        return {
+            m.name: torch.ones_like(observation[m.name][..., 0], dtype=torch.bool)
+            for m in self.modalities
+        }
+
     def describe(self, observation: Observation, modality: str, item: str) -> str:
         """Such as "victim in top-right", or "the middle-left of the map (left corridor clear)"."""
         holds = observation["verbal"][:, 0].int().tolist()

@@ -74,7 +74,8 @@ def _step_by_step(
             # Before the first step every belief is zero, as the whole of ``belief`` still is.
             parent = belief[node[of[some], max(time - 1, 0)]]
             action = before[time].expand(len(some))
-            belief[some] = human.advance(parent, evidence[some], action).mean
+            still = None if view.still is None else view.still[of[some], step[some]]
+            belief[some] = human.advance(parent, evidence[some], action, still).mean
     return belief
 
 

@@ -42,7 +42,7 @@ class Experience:
         rounds: what happened.
         outcomes: of every action.
         over: whether nothing could be won or lost any more, at these steps ``[B, T']``.
-        informed: whether the observer knows everything there ``[B, T']``.
+        informed: whether the observer knows there all that counts ``[B, T']``.
         exact: values of every action for somebody who does, if asked for, ``[B, T', A]``.
         first: first step at which they were worked out.
         stride: how far these steps are apart.
@@ -118,7 +118,9 @@ def experience(
     observation = domain.observe(believed)
     taken = plan.taken(domain, knowledge, observation)
     visible = {name: mask | taken[name] for name, mask in visible.items()}
-    everything = torch.stack([mask.all(-1) for mask in visible.values()]).all(0)
+    informed = torch.stack(
+        [(visible[name] | ~needed).all(-1) for name, needed in domain.decisive(observation).items()]
+    ).all(0)
     return Experience(
         rounds=Rounds(
             observation=observation,
@@ -134,7 +136,7 @@ def experience(
         ),
         over=domain.over(some),
         exact=None if discount is None else domain.reference_values(some, discount),
-        informed=everything[:, steps],
+        informed=informed[:, steps],
         first=first,
         stride=stride,
     )

@@ -54,8 +54,8 @@ class SelfModelOptions:
         world_weight: weight of the negative ELBO per observation.
         length: steps of a round that is learned from; as many as a round has, if 0.
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
-        exact: whether somebody who knows everything learns the exact planner's values, and not
-            what a step leads to.
+        exact: whether somebody who knows all that counts learns the exact planner's values, and
+            not what a step leads to.
     """
 
     phases: int = 40
@@ -126,6 +126,7 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "world_weight": 0.01,
         "length": 12,
         "stride": 2,
+        "exact": True,
     },
 }
 """Settings that differ by domain; beta and epsilon are the supplement's."""

@@ -53,7 +53,7 @@ def play_rounds(
         m.name: torch.zeros(people, rounds, steps, len(m.items), dtype=torch.bool, device=device)
         for m in domain.modalities
     }
-    sites = dict(implants)
+    sites, attends = dict(implants), human.attends
     lengths = torch.zeros(people, rounds, dtype=torch.long, device=device)
     under_way = lengths == 0
     follow = (_Stepwise if human.stepwise else _Courses)(human, told, actions)
@@ -66,16 +66,18 @@ def play_rounds(
         lengths += under_way
         with (
             torch.random.fork_rng(devices=[]),
-            poutine.trace() as trace,
             poutine.condition(data=sites),
             pyro.plate("person", people, dim=-2),
         ):
             torch.manual_seed(seed)
-            drawn = human.prior()
-            with pyro.plate("round", rounds, dim=-1):
-                drawn = {**drawn, **human.attend(drawn)}
-            log_probability = follow.act(drawn, observed, step)
-        # What was drawn at the first step stays, of a person for all rounds.
+            with poutine.trace() as trace:
+                drawn = human.prior()
+            # What was drawn at the first step stays, of a person for all rounds.
+            sites |= latent_values(trace.trace)
+            if attends:
+                drawn = drawn | _attention(human, drawn, observed, seed + 1)
+            with poutine.trace() as trace:
+                log_probability = follow.act(drawn, observed, step)
         sites |= latent_values(trace.trace)
         probability = log_probability.exp().flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)
@@ -102,6 +104,19 @@ def play_rounds(
     )
 
 
+def _attention(
+    human: HumanModel, implants: dict[str, Tensor], observed: list[Observation], seed: int
+) -> dict[str, Tensor]:
+    """What people attend to in a round so far, ``[P, B]``; the same while they attend to the same.
+
+    Runs inside the person plate.
+    """
+    so_far = {name: torch.stack([one[name] for one in observed], 2) for name in observed[0]}
+    torch.manual_seed(seed)
+    with pyro.plate("round", observed[0]["ego"].shape[1], dim=-1):
+        return human.attend(implants | human.facts(so_far))
+
+
 class _Stepwise:
     """People of whom each step follows from the one before."""
 
@@ -119,7 +134,8 @@ class _Stepwise:
         told = {name: mask[..., step, :] for name, mask in self.told.items()}
         last = self.actions[..., step - 1] if step else self.last
         view, self.knowledge = human.look(implants, self.knowledge, now, told, step)
-        self.belief = human.advance(self.belief, human.evidence(view, now), last).mean
+        evidence = human.evidence(view, now)
+        self.belief = human.advance(self.belief, evidence, last, view.still).mean
         belief = self.belief[..., None, :]
         return human.act(implants, belief, human.self_model.action_values(belief))[..., 0, :]
 

@@ -56,11 +56,14 @@ class View:
         visible: seen, told or remembered.
         taken: neither, but taken for granted; empty if nothing is.
         imagined: the observation ``[..., K, F]`` in which the taken items are as they take them.
+        still: where nothing came up since the step before ``[...]``, so that the belief stays as
+            it is; ``None`` if something always does.
     """
 
     visible: Visibility
     taken: Visibility = field(default_factory=dict)
     imagined: Observation = field(default_factory=dict)
+    still: Tensor | None = None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> View:
         """A view of each mask and each imagined item changed alike, along leading dimensions."""
@@ -68,6 +71,7 @@ class View:
             {name: function(mask) for name, mask in self.visible.items()},
             {name: function(mask) for name, mask in self.taken.items()},
             {name: function(value) for name, value in self.imagined.items()},
+            None if self.still is None else function(self.still),
         )
 
     @classmethod
@@ -83,15 +87,19 @@ class View:
                 for name in parts[0]
             }
 
+        still = [step.still for step in steps if step.still is not None]
         return cls(
             stacked([step.visible for step in steps], 1),
             stacked([step.taken for step in steps], 1),
             stacked([step.imagined for step in steps], 2),
+            torch.stack(torch.broadcast_tensors(*still), -1) if still else None,
         )
 
     def numbers(self) -> Tensor:
         """Everything that counts as one whole number ``[...]``, equal where views are equal."""
         masks = {**self.visible, **{f"{name}, taken": mask for name, mask in self.taken.items()}}
+        if self.still is not None:
+            masks["still"] = self.still[..., None]
         sizes = [mask.shape[-1] for mask in masks.values()]
         sizes += [self.imagined[name].shape[-2:].numel() for name in self.taken]
         device = next(iter(masks.values())).device
@@ -346,7 +354,7 @@ class HumanModel(nn.Module):
         """
         evidence = self.evidence(view, observation)
         evidence = evidence + self.self_model.encoder.previous_actions(actions[..., :-1])
-        return self.self_model.believe(evidence)
+        return self.self_model.believe(evidence, view.still)
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
         """What views ``[..., K]`` of observations tell the encoder at each step, ``[..., H]``."""
@@ -357,16 +365,22 @@ class HumanModel(nn.Module):
         imagined = encoder.embed(domain.symbols(view.imagined))
         return encoder.combine(embedded, view.visible, imagined, view.taken)
 
-    def advance(self, belief: Tensor, evidence: Tensor, action: Tensor) -> Gaussian:
+    def advance(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
+    ) -> Gaussian:
         """One step of :meth:`believe`: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.
 
         Args:
             belief: of the step before ``[..., Z]``; zero before the first.
             evidence: of this step ``[..., H]``, from :meth:`evidence`.
             action: what was done in between ``[...]``; the number of actions if nothing was.
+            still: where nothing came up and the mean stays ``[...]``, see :class:`View`.
         """
         encoder = self.self_model.encoder
-        return encoder(belief, evidence + encoder.action(action))
+        state = encoder(belief, evidence + encoder.action(action))
+        if still is None:
+            return state
+        return state._replace(mean=torch.where(still[..., None], belief, state.mean))
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of actions ``[..., T, A]``.

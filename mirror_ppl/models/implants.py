@@ -61,13 +61,13 @@ def noticed_sites(domain: Domain) -> tuple[str, ...]:
 
 
 def notice_implants(
-    domain: Domain, like: Tensor, success: float = 1.0, failure: float = 1.0
+    domain: Domain, like: Tensor, success: Tensor | float = 1.0, failure: Tensor | float = 1.0
 ) -> dict[str, Tensor]:
     """Sample how probably somebody notices each item at a step: ``notices_<item>``.
 
     The prior is a Beta density, uniform unless its parameters are given.
     """
-    first, second = like.new_tensor(success), like.new_tensor(failure)
+    first, second = (torch.as_tensor(part).to(like) for part in (success, failure))
     return {
         site: pyro.sample(site, dist.Beta(first, second))
         for site in (NOTICES + item for item in _visual_items(domain))

@@ -2,7 +2,9 @@
 
 Implements the implants of the supplement's section C for bomb defusal::
 
-    notices_k  ~ Beta(1, 9)                    probability of noticing terminal k at a step
+    quickness  ~ Beta(1, 9)                    how probably they notice a terminal at a step
+    evenness   ~ LogNormal(log 100, 1)         how little terminals differ in that
+    notices_k  ~ Beta(evenness * quickness, evenness * (1 - quickness))    terminal k
     reads      ~ Bernoulli                     whether they can read the type of the bomb
     rule_j     ~ Categorical(permutations)     policy: which button they press for that of the robot
     guess_b    ~ Bernoulli                     in each round: the type they take it for
@@ -35,10 +37,14 @@ from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants, View
 from mirror_ppl.models.self_model import SelfModel
 
+QUICKNESS, EVENNESS = "quickness", "evenness"
 READS, RULE, GUESS, FOUND, SOUGHT = "reads_type", "rule_", "guess", "found_", "sought_"
 """Names of sites, and of the fact what is looked for at a stage."""
 SEARCHING = (1.0, 9.0)
 """Of the prior of how probably a terminal is noticed at a step: a Beta density of mean 0.1."""
+EVEN = (100.0, 1.0)
+"""Of the prior of how alike terminals are to somebody: as if they had been searched so often
+before; median, and standard deviation of its logarithm."""
 SAME = 0.5
 """Prior probability that the robot's rules for a type hold."""
 WAITS, MOST_WAITS, BLIND = 2.0, 8.0, 4.0
@@ -93,8 +99,13 @@ class Searcher(HumanModel):
         """Sample how quick they are, whether they read the type, their rules and choices."""
         domain, like = self.domain, next(self.self_model.parameters())
         half = like.new_full((2,), 0.5)
+        quickness = pyro.sample(QUICKNESS, dist.Beta(*like.new_tensor(SEARCHING)))
+        median, spread = like.new_tensor(EVEN)
+        evenness = pyro.sample(EVENNESS, dist.LogNormal(median.log(), spread))
+        alike = (evenness * quickness, evenness * (1 - quickness))
         return (
-            implant_priors.notice_implants(domain, like, *SEARCHING)
+            {QUICKNESS: quickness, EVENNESS: evenness}
+            | implant_priors.notice_implants(domain, like, *alike)
             | {READS: pyro.sample(READS, dist.Categorical(half))}
             | {
                 RULE + kind: pyro.sample(RULE + kind, dist.Categorical(logits=logits))
@@ -168,7 +179,12 @@ class Searcher(HumanModel):
         }
 
     def look(self, implants, knowledge, observation, told, step):
-        """As everywhere; and who does not know the type takes it for what they guess."""
+        """As everywhere; and who does not know the type takes it for what they guess.
+
+        Bombs do nothing by themselves: at a step without news the belief stays as it is, however
+        long they search.
+        """
+        before = knowledge
         view, knowledge = super().look(implants, knowledge, observation, told, step)
         guess = implants[GUESS].to(observation["verbal"])[..., None, None]
         known = view.visible["verbal"]
@@ -178,7 +194,10 @@ class Searcher(HumanModel):
             "visual": torch.zeros_like(view.visible["visual"]),
             "verbal": ~known.expand(shape),
         }
-        return View(view.visible, taken, imagined), knowledge
+        still = (knowledge.stage == before.stage).squeeze(-1) & (step > 0)
+        for name, mask in self.domain.known(before).items():
+            still = still & (mask == view.visible[name]).all(-1)
+        return View(view.visible, taken, imagined, still), knowledge
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Choose as the robot would, with buttons exchanged by the rules they know."""

@@ -167,16 +167,18 @@ class SelfModel(nn.Module):
         steps = self.encoder.previous_actions(actions)
         return self.encoder.combine(embedded, visible) + steps[..., : embedded["ego"].shape[-2], :]
 
-    def believe(self, evidence: Tensor) -> Tensor:
+    def believe(self, evidence: Tensor, still: Tensor | None = None) -> Tensor:
         """Beliefs ``[..., T, Z]``: the encoder's means, each step starting from the last mean.
 
         Args:
             evidence: ``[..., T, H]`` from :meth:`evidence`.
+            still: where the belief stays as it is ``[..., T]``; nowhere unless given.
         """
         belief = evidence.new_zeros(*evidence.shape[:-2], self.latent)
         beliefs = []
-        for step in evidence.unbind(-2):
-            belief = self.encoder(belief, step).mean
+        for number, step in enumerate(evidence.unbind(-2)):
+            mean = self.encoder(belief, step).mean
+            belief = mean if still is None else torch.where(still[..., number, None], belief, mean)
             beliefs.append(belief)
         return torch.stack(beliefs, -2)
 
