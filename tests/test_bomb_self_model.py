@@ -45,7 +45,7 @@ def lived(generator, **plan):
     return start, actions, experience(WORLD, start, actions, view, discount=0.9)
 
 
-def test_who_knows_everything_has_exact_values_to_learn_from(generator):
+def test_who_knows_what_counts_has_exact_values_to_learn_from(generator):
     start, actions, full = lived(generator)
     assert full.informed.all()
     state = start
@@ -54,7 +54,15 @@ def test_who_knows_everything_has_exact_values_to_learn_from(generator):
         torch.testing.assert_close(full.exact[:, step], values)
         state = WORLD.transition(state, actions[:, step])
     deaf = {"visual": torch.ones(30), "verbal": torch.zeros(30)}
-    assert not lived(generator, keep=deaf)[2].informed.any()
+    uninformed = lived(generator, keep=deaf)[2]
+    assert torch.equal(uninformed.informed, uninformed.over)
+    # The terminal that is lit is all that counts besides the type.
+    some = {"visual": torch.full((30,), 0.5), "verbal": torch.ones(30)}
+    part = lived(generator, keep=some, remembers=torch.zeros(30, dtype=torch.bool))[2]
+    now = {name: value[:, :4] for name, value in part.rounds.observation.items()}
+    seen = (part.rounds.visible["visual"][:, :4] & WORLD.sought(now)).any(-1)
+    assert torch.equal(part.informed, seen | part.over)
+    assert 0.2 < seen.float().mean() < 0.8
     # Where they are, they are what is learned.
     torch.manual_seed(0)
     self_model, options = SelfModel(WORLD), SelfModelOptions()

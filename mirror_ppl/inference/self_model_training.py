@@ -116,7 +116,8 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
     "bomb_defusal": {
         "phases": 200,
         "rounds": 400,
-        "steps": 40,
+        "steps": 30,
+        "batch": 192,
         "learning_rate": 2e-3,
         "beta": 1.0,
         "beta_decay": 0.98,
@@ -124,7 +125,7 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "discount": 0.95,
         "target_rate": 0.02,
         "world_weight": 0.01,
-        "length": 12,
+        "length": 10,
         "stride": 2,
         "exact": True,
     },

@@ -99,7 +99,8 @@ class Searcher(HumanModel):
         """Sample how quick they are, whether they read the type, their rules and choices."""
         domain, like = self.domain, next(self.self_model.parameters())
         half = like.new_full((2,), 0.5)
-        quickness = pyro.sample(QUICKNESS, dist.Beta(*like.new_tensor(SEARCHING)))
+        success, failure = like.new_tensor(SEARCHING)
+        quickness = pyro.sample(QUICKNESS, dist.Beta(success, failure))
         median, spread = like.new_tensor(EVEN)
         evenness = pyro.sample(EVENNESS, dist.LogNormal(median.log(), spread))
         alike = (evenness * quickness, evenness * (1 - quickness))
