@@ -6,7 +6,8 @@ depends on, each with its prior and likelihood, without sampling or optimization
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import pyro
 import torch
@@ -80,13 +81,7 @@ def log_joints(
     parts = []
     for begin in range(0, number, size):
         some = {name: value[begin : begin + size] for name, value in draws.items()}
-        with (
-            torch.random.fork_rng(devices=[]),
-            poutine.block(),
-            poutine.condition(data=some),
-            pyro.plate("draw", min(size, number - begin), dim=-3),
-            pyro.plate("person", table.people, dim=-2),
-        ):
+        with conditioned(some, min(size, number - begin), table.people):
             likelihoods = human.log_likelihoods(human.prior(), table)
         scores = combination_scores(table, likelihoods, combinations)
         if log_prior is None:
@@ -94,6 +89,56 @@ def log_joints(
         else:
             parts.append(log_prior[None, None] + scores)
     return torch.cat(parts)
+
+
+@contextmanager
+def conditioned(draws: Mapping[str, Tensor], number: int, people: int) -> Iterator[None]:
+    """The program runs for S draws ``[S, P, 1, ...]`` of its sites; the rest is sampled."""
+    with (
+        torch.random.fork_rng(devices=[]),
+        poutine.block(),
+        poutine.condition(data=dict(draws)),
+        pyro.plate("draw", number, dim=-3),
+        pyro.plate("person", people, dim=-2),
+    ):
+        yield
+
+
+def expected_counts(
+    human: HumanModel,
+    table: ViewTable,
+    draws: Mapping[str, Tensor],
+    log_weights: Tensor,
+    combinations: Tensor,
+    log_prior: Tensor | None,
+) -> Tensor:
+    """How often each action is expected to have been taken at each moment, ``[N, T', A]``.
+
+    It is not known what somebody saw and attended to. By Fisher's identity this is the gradient of
+    the log-likelihood by the log-probabilities of actions.
+
+    Args:
+        human: the model of people.
+        table: views of one person's rounds.
+        draws: of the other sites ``[S, 1, 1, ...]``.
+        log_weights: of these, ``[S]``.
+        combinations: of discrete sites that are possible, ``[G]``.
+        log_prior: of these ``[G]``, if it does not hang on the other sites.
+    """
+    number = len(log_weights)
+    grid = {name: one[combinations] for name, one in combination_values(human, table).items()}
+    with conditioned(draws, number, 1), torch.enable_grad():
+        implants = human.prior()
+        chances = human.act(implants, table.belief, table.values)
+        chances = chances.expand(number, *chances.shape[-4:]).detach().requires_grad_()
+        likelihoods = human.of_actions(implants, table, chances)
+        joint = combination_scores(table, likelihoods, combinations)[:, 0]
+        if log_prior is None:
+            log_prior = log_priors(human, grid, draws, 1)[:, 0]
+        total = (joint + log_prior).logsumexp(-1)
+        (counts,) = torch.autograd.grad(total.sum(), chances)
+    weights = log_weights.softmax(0).to(counts)
+    return (weights @ counts.flatten(1)).view(counts.shape[2:])
 
 
 @torch.no_grad()

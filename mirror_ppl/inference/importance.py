@@ -24,14 +24,22 @@ from torch.distributions import MultivariateNormal, biject_to
 from mirror_ppl.inference.alike import Alike, fixed_prior
 from mirror_ppl.inference.exact import (
     combination_values,
+    expected_counts,
     log_joints,
     require_acting_on_beliefs,
 )
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
+from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
 from mirror_ppl.inference.views import restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
+ANYHOW = 0.1
+"""Share of what is proposed with a residual from the prior."""
+PLAIN_STAGES = 2
+"""Stages that propose scalar sites alone, which is enough where a residual hardly matters."""
+LEARNED_FROM = 64
+"""Draws by which it is learned where to look for the residual."""
 PRUNING_DRAWS = 64
 """Draws from the prior after which combinations of discrete sites are given up."""
 
@@ -160,6 +168,8 @@ class Sampler:
         self._policies: list[Draws] = []
         self._joints: list[Tensor] = []
         self._log_prior = torch.zeros(0, device=table.index.device)
+        self._residual: ResidualProposal | None = None
+        self._log_residual = torch.zeros(2, 0, device=table.index.device)
 
     def draw(self, number: int) -> None:
         """Draw from the prior."""
@@ -185,6 +195,34 @@ class Sampler:
             alive[0, self.alike.members] = True
             self.table = restricted(self.table, alive)
 
+    def learn_residual(self) -> None:
+        """From now on propose the residual, too, by what is known so far.
+
+        A share of :data:`ANYHOW` of what is proposed has a residual from the prior all the same.
+        """
+        found = self.weighted()
+        if SITE not in found.policy or not self.table.real.any():
+            return
+        best = found.log_weights.topk(min(LEARNED_FROM, len(found.log_weights))).indices
+        counts = expected_counts(
+            self.human,
+            self.table,
+            {name: value[best] for name, value in found.policy.items()},
+            found.log_weights[best],
+            self.alike.first,
+            self.alike.log_prior if self.alike.fixed else None,
+        )
+        self._residual = ResidualProposal.of(self.human, self.table, counts)
+        self._log_residual = self._residual_densities(
+            found.policy, self._residual.gaussian(found.policy)
+        )
+
+    def _residual_densities(self, policy: Draws, gaussian: MultivariateNormal) -> Tensor:
+        """Log densities ``[2, S]`` of residuals, by the prior and as proposed."""
+        own = {SITE: policy[SITE]}
+        _, prior = complete(self.human, self.table, own, len(policy[SITE]))
+        return torch.stack([prior, gaussian.log_prob(policy[SITE].flatten(1))])
+
     def propose(self, proposal: Proposal, number: int) -> None:
         """Draw some more."""
         place = proposal.sample(torch.Size([number]))
@@ -193,6 +231,14 @@ class Sampler:
             for column, (name, site) in enumerate(self.sites.items())
         }
         policy, log_prior = complete(self.human, self.table, given, number)
+        if self._residual is not None:
+            gaussian = self._residual.gaussian(policy)
+            own = policy[SITE]
+            drawn = gaussian.sample().view(own.shape)
+            anyhow = torch.arange(number, device=own.device) < ANYHOW * number
+            policy[SITE] = torch.where(anyhow.view(number, *(1,) * (own.dim() - 1)), own, drawn)
+            found = self._residual_densities(policy, gaussian)
+            self._log_residual = torch.cat([self._log_residual, found], 1)
         self._add(policy, self._joint(policy, number), place, log_prior)
         self._proposals.append((number, proposal))
 
@@ -205,11 +251,16 @@ class Sampler:
     def weighted(self) -> Weighted:
         """All draws, with their weights."""
         joint = torch.cat(self._joints)
-        parts = [self._log_prior + math.log(self._from_prior / len(joint))]
+        log_prior, either = self._log_prior, torch.zeros_like(self._log_prior)
+        if self._residual is not None:
+            prior, proposed = self._log_residual
+            log_prior = log_prior + prior
+            either = torch.logaddexp(prior + math.log(ANYHOW), proposed + math.log1p(-ANYHOW))
+        parts = [log_prior + math.log(self._from_prior / len(joint))]
         for number, proposal in self._proposals:
-            parts.append(proposal.log_prob(self.place) + math.log(number / len(joint)))
+            parts.append(proposal.log_prob(self.place) + either + math.log(number / len(joint)))
         mixture = torch.logsumexp(torch.stack(parts), 0)
-        log_weights, pareto_k = _smoothed(joint.logsumexp(-1) + self._log_prior - mixture)
+        log_weights, pareto_k = _smoothed(joint.logsumexp(-1) + log_prior - mixture)
         policy = {
             name: torch.cat([one[name] for one in self._policies]) for name in self._policies[0]
         }
@@ -232,7 +283,8 @@ def sample_exactly(
     """Weighted draws of one person by adaptive importance sampling.
 
     The first stage draws from the prior; each that follows draws the scalar sites from a Gaussian,
-    in unconstrained space, that has the moments of the weighted draws so far.
+    in unconstrained space, that has the moments of the weighted draws so far. If that is not
+    enough after a few stages, those that follow propose the residual of the policy, too.
 
     Args:
         human: the model of people.
@@ -249,10 +301,12 @@ def sample_exactly(
         sampler.propose(_gaussian(found, near.log_weights, options.wider), options.proposals)
     elif options.proposals > few:
         sampler.draw(options.proposals - few)
-    for _ in range(options.stages if sampler.sites else 0):
+    for stage in range(options.stages if sampler.sites else 0):
         found = sampler.weighted()
         if found.effective >= options.enough:
             return found
+        if stage == PLAIN_STAGES:
+            sampler.learn_residual()
         gaussian = _gaussian(sampler.place, found.log_weights, options.wider)
         sampler.propose(gaussian, options.proposals)
     return sampler.weighted()

@@ -408,7 +408,10 @@ class HumanModel(nn.Module):
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
             table: the rounds of P people and the distinct views of them.
         """
-        log_probabilities = self.act(implants, table.belief, table.values)
+        return self.of_actions(implants, table, self.act(implants, table.belief, table.values))
+
+    def of_actions(self, implants: Implants, table: ViewTable, log_probabilities: Tensor) -> Tensor:
+        """The same, given log-probabilities ``[..., P, N, T', A]`` of actions at each moment."""
         attention = table.attention
         if attention is None:
             return table.log_likelihoods(log_probabilities)

@@ -186,6 +186,12 @@ def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
     return _layer(implants["residual_out"], hidden)
 
 
+def residual_features(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
+    """What the rows of ``residual_out`` weigh in the residual, ``[..., T, R + 1]``."""
+    hidden = torch.tanh(_layer(implants["residual_in"], belief))
+    return torch.nn.functional.pad(hidden, [0, 1], value=1.0)
+
+
 def _layer(weights: Tensor, inputs: Tensor) -> Tensor:
     """Per-person linear layer: weights ``[..., I + 1, O]`` on inputs ``[..., T, I]``."""
     if weights.dim() <= 2 or weights.shape[-3] != 1 or inputs.dim() <= 3:

@@ -1,0 +1,135 @@
+"""Where to look for the residual of a policy: near the weights that explain a person's rounds best.
+
+Given all else of a draw, the residual's last layer enters logits linearly, so what rounds say of
+its weights ``w`` is nearly Gaussian (a Laplace approximation)::
+
+    q(w | rest) = Normal(mode, (prior precision + Fisher information at the mode)^-1)
+
+under rounds in which each moment counts as often as it is likely to have come about: what somebody
+saw, and attended to, is not known. Those expected counts are the gradient of the log-likelihood by
+the log-probabilities of actions (Fisher's identity), so they are right for whatever a human model
+sums out. It is a proposal only: draws are weighted by what their rounds really say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from pyro import poutine
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from mirror_ppl.inference.exact import conditioned
+from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.view_table import ViewTable
+
+SITE = "residual_out"
+NEWTON_STEPS, CURVATURES = 4, 2
+"""Steps to the best weights; at so many of them is it worked out how curved the likelihood is."""
+DRAWS = 128
+"""What is worked out at once; bounds memory."""
+MOMENTS = 1024
+"""So many moments are looked at, those that are expected to have come about most often."""
+
+
+@dataclass(frozen=True)
+class ResidualProposal:
+    """Proposes a residual's last layer for draws of all else of one person.
+
+    Attributes:
+        human: the model of people; it samples ``residual_in`` and ``residual_out``.
+        belief: of the moments that count ``[1, N, 1, Z]``.
+        values: action values there ``[1, N, 1, A]``.
+        counts: how often each action is expected to have been taken there ``[N, A]``.
+    """
+
+    human: HumanModel
+    belief: Tensor
+    values: Tensor
+    counts: Tensor
+
+    @classmethod
+    def of(cls, human: HumanModel, table: ViewTable, counts: Tensor) -> ResidualProposal:
+        """Of a table of one person.
+
+        Args:
+            human: the model of people.
+            table: views of the person's rounds.
+            counts: how often each action is expected at each moment, ``[N, T', A]``.
+        """
+        counts = counts.flatten(0, 1)
+        belief, values = (part[0].flatten(0, 1) for part in (table.belief, table.values))
+        often = counts.sum(-1)
+        some = often.topk(min(MOMENTS, len(often))).indices
+        # Each of the others counts as the one in which somebody believes much the same.
+        nearest = torch.cdist(belief, belief[some]).argmin(-1)
+        counts = counts.new_zeros(len(some), counts.shape[-1]).index_add(0, nearest, counts)
+        return cls(human, belief[some][None, :, None], values[some][None, :, None], counts)
+
+    def gaussian(self, draws: Mapping[str, Tensor]) -> MultivariateNormal:
+        """``q(w | rest)`` of draws ``[S, 1, 1, ...]`` of everything else, of ``[S, W]``."""
+        number = len(draws[SITE])
+        rest = {**draws, SITE: torch.zeros_like(draws[SITE])}
+        with conditioned(rest, number, 1), poutine.trace() as trace:
+            implants = self.human.prior()
+            without = self.human.act(implants, self.belief, self.values)
+        without = without.expand(number, *without.shape[1:])[:, 0, :, 0]  # [S, N, A]
+        features = implant_priors.residual_features(implants, self.belief)[:, 0, :, 0]  # [S, N, R]
+        scale = trace.trace.nodes[SITE]["fn"].base_dist.scale.flatten()[0]
+        return _laplace(without, features, self.counts, scale)
+
+
+def _laplace(
+    without: Tensor, features: Tensor, counts: Tensor, scale: Tensor
+) -> MultivariateNormal:
+    """The Laplace approximation of weights ``[S, R A]`` of a multinomial logistic regression.
+
+    Args:
+        without: logits ``[S, N, A]`` that are there without it.
+        features: ``[S, N, R]``.
+        counts: ``[N, A]``.
+        scale: standard deviation of the weights' prior.
+    """
+    weights, precision = [], []
+    for some in torch.arange(len(features)).split(DRAWS):
+        best, curvature = _mode(without[some], features[some], counts, scale)
+        weights.append(best)
+        precision.append(curvature)
+    return MultivariateNormal(torch.cat(weights), precision_matrix=torch.cat(precision))
+
+
+def _mode(
+    without: Tensor, features: Tensor, counts: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The best weights ``[S, R A]`` by Newton's method, and the precision there."""
+    number, _, size = features.shape
+    actions = without.shape[-1]
+    weights = without.new_zeros(number, size, actions)
+    precision = without.new_zeros(0)
+    total = counts.sum(-1, keepdim=True)
+    rows, first, second = _pairs(size)
+    columns, one, other = _pairs(actions)
+    products = features[..., first] * features[..., second]  # [S, N, pairs of R]
+    prior = torch.eye(size * actions).to(without) / scale**2
+    for step in range(NEWTON_STEPS):
+        chances = (without + features @ weights).softmax(-1)
+        slope = features.mT @ (counts - total * chances) - weights / scale**2
+        if step < CURVATURES:
+            shares = total * chances[..., one] * ((one == other).to(total) - chances[..., other])
+            blocks = shares.mT @ products  # [S, pairs of A, pairs of R]
+            whole = blocks[:, columns][..., rows].permute(0, 3, 1, 4, 2)  # [S, R, A, R, A]
+            precision = whole.flatten(3).flatten(1, 2) + prior
+        change = torch.linalg.solve(precision, slope.flatten(1))
+        weights = weights + change.unflatten(1, (size, actions))
+    return weights.flatten(1), precision
+
+
+def _pairs(size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The unordered pair that each ``[size, size]`` is, and the members of each pair."""
+    first, second = torch.triu_indices(size, size)
+    which = torch.zeros(size, size, dtype=torch.long)
+    which[first, second] = which[second, first] = torch.arange(len(first))
+    return which, first, second

@@ -1,0 +1,151 @@
+"""Where to look for a residual: the Gaussian that is proposed, what it is learned from, weights."""
+
+import pytest
+import torch
+
+from mirror_ppl.inference import importance, residual_proposal
+from mirror_ppl.inference.exact import expected_counts
+from mirror_ppl.inference.importance import ImportanceOptions, Sampler, complete, sample_exactly
+from mirror_ppl.inference.residual_proposal import ResidualProposal, _laplace
+from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+
+@pytest.fixture(scope="module")
+def human():
+    return HumanModel(load_self_model(shipped_weights("driving"))[0])
+
+
+@pytest.fixture(scope="module")
+def played(human):
+    """Somebody who changes lanes whenever they can, by a residual twice as large as usual."""
+    generator = torch.Generator().manual_seed(0)
+    out = torch.zeros(1, 1, 9, 2)
+    out[..., -1, :] = torch.tensor([-0.2, 0.2])
+    implants = {"residual_out": out, "lapse": torch.full((1, 1), 0.02)}
+    return play_rounds(human, implants, 6, "fog", generator)
+
+
+@pytest.fixture(scope="module")
+def table(human, played):
+    sightings = Sightings(human, Screening())
+    for one_round in rounds_of(played, 0):
+        sightings.add(*one_round)
+    return sightings.table()
+
+
+def test_the_gaussian_is_at_the_mode_and_as_curved_as_the_likelihood():
+    torch.manual_seed(0)
+    without, features = torch.randn(3, 40, 4).double(), torch.randn(3, 40, 5).double()
+    counts, scale = torch.rand(40, 4).double() * 2, torch.tensor(0.4).double()
+
+    def log_joint(weights, place):
+        logits = without[place] + features[place] @ weights.view(5, 4)
+        return (counts * logits.log_softmax(-1)).sum() - (weights / scale).pow(2).sum() / 2
+
+    found = _laplace(without, features, counts, scale)
+    for place in range(3):
+        mode = found.mean[place].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(log_joint(mode, place), mode)
+        assert slope.abs().max() < 0.02
+        curved = torch.autograd.functional.hessian(lambda w: log_joint(w, place), mode)  # noqa: B023
+        error = (found.precision_matrix[place] + curved).abs().max() / curved.abs().max()
+        assert error < 0.1
+
+
+def test_expected_counts_are_of_what_was_done(human, played, table):
+    """They add up to the actions; where one combination is left they are those that were taken."""
+    sampler = Sampler(human, table)
+    sampler.draw(20)
+    found = sampler.weighted()
+    even = torch.zeros(20)
+    counts = expected_counts(
+        human, table, found.policy, even, sampler.alike.first, sampler.alike.log_prior
+    )
+    steps = int(played.mask.sum())
+    assert float(counts.sum()) == pytest.approx(steps, rel=1e-4)
+    by_action = counts.sum((0, 1))
+    assert float(by_action[1]) == pytest.approx(int((played.actions == 1).sum()), rel=1e-4)
+    one = sampler.alike.first[:1]
+    counts = expected_counts(human, table, found.policy, even, one, torch.zeros(1))
+    torch.testing.assert_close(counts, counts.round(), rtol=0, atol=1e-4)
+    # In moments of the views that this combination has, and in no others.
+    views = table.index[0, :, one[0]]
+    moments = table.moments[0, views]
+    expected = torch.zeros(counts.shape[:2]).flatten()
+    real = table.steps[0]
+    expected.index_add_(0, moments[real], torch.ones(steps))
+    torch.testing.assert_close(counts.sum(-1).flatten(), expected, rtol=0, atol=1e-4)
+
+
+def test_what_is_left_out_counts_as_what_is_nearest(human, table, monkeypatch):
+    monkeypatch.setattr(residual_proposal, "MOMENTS", 5)
+    torch.manual_seed(0)
+    counts = torch.rand(*table.acted[0].shape, 2)
+    counts[7] = 10
+    found = ResidualProposal.of(human, table, counts)
+    assert found.counts.shape == (5, 2)
+    torch.testing.assert_close(found.counts.sum(0), counts.sum((0, 1)))
+    assert found.counts.sum(-1).max() >= 20
+
+
+def test_weights_are_right_whatever_is_proposed(human, table, monkeypatch):
+    """Means with the residual proposed and without agree within what chance explains."""
+    torch.manual_seed(0)
+    plain = Sampler(human, table)
+    plain.draw(6000)
+    proposed = Sampler(human, table)
+    proposed.draw(300)
+    proposed.learn_residual()
+    gaussian = importance._gaussian(proposed.place, proposed.weighted().log_weights, 1.5)
+    for _ in range(3):
+        proposed.propose(gaussian, 400)
+    assert proposed._log_residual.shape == (2, 1500)
+    one, other = plain.weighted(), proposed.weighted()
+    assert other.effective > 200 and other.pareto_k < 0.7
+
+    def moments(found, value):
+        weights = found.log_weights.exp()
+        mean = float((weights * value).sum())
+        variance = float((weights * (value - mean).square()).sum())
+        return mean, variance / found.effective
+
+    for name, value in {
+        "consistency": lambda policy: policy["consistency"].flatten(),
+        "bias": lambda policy: policy["residual_out"][..., -1, 1].flatten(),
+        "size": lambda policy: policy["residual_out"].square().sum((-1, -2)).flatten(),
+    }.items():
+        (first, error), (second, more) = (moments(w, value(w.policy)) for w in (one, other))
+        assert abs(first - second) < 4.5 * (error + more) ** 0.5, name
+
+
+def test_proposed_residuals_are_of_the_gaussian_and_some_of_the_prior(human, table):
+    torch.manual_seed(0)
+    sampler = Sampler(human, table)
+    sampler.draw(100)
+    sampler.learn_residual()
+    gaussian = importance._gaussian(sampler.place, sampler.weighted().log_weights, 1.5)
+    torch.manual_seed(1)
+    sampler.propose(gaussian, 200)
+    prior, proposed = sampler._log_residual[:, 100:]
+    # Each kind is likelier where it came from.
+    assert (proposed - prior)[20:].mean() > (proposed - prior)[:20].mean()
+    last = sampler._policies[-1]["residual_out"]
+    _, density = complete(human, table, {"residual_out": last}, 200)
+    torch.testing.assert_close(prior, density)
+
+
+def test_the_residual_is_proposed_only_where_scalars_are_not_enough(human, table, monkeypatch):
+    learned = []
+    learn = Sampler.learn_residual
+    monkeypatch.setattr(
+        Sampler, "learn_residual", lambda self: (learned.append(len(self.place)), learn(self))
+    )
+    torch.manual_seed(0)
+    sample_exactly(human, table, ImportanceOptions(proposals=256, enough=100))
+    assert not learned
+    sample_exactly(human, table, ImportanceOptions(proposals=256, enough=1e6, stages=4))
+    assert learned == [256 * 3]
