@@ -34,7 +34,7 @@ class Options:
     """What to calibrate, and where the results go."""
 
     domain: str = "driving"
-    """The world: driving or search_rescue."""
+    """The world: driving, search_rescue or bomb_defusal."""
     setting: str | None = None
     """The setting under which rounds are recorded; what people see is up to their implants.
     Default: the one in which people see less."""

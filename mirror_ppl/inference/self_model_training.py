@@ -52,6 +52,7 @@ class SelfModelOptions:
         discount: discount of rewards per step.
         target_rate: rate at which the target network follows the Q-network, per step.
         world_weight: weight of the negative ELBO per observation.
+        speech_weight: how often what is said counts in that; pictures have many more numbers.
         length: steps of a round that is learned from; as many as a round has, if 0.
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
         exact: whether somebody who knows all that counts learns the exact planner's values, and
@@ -71,6 +72,7 @@ class SelfModelOptions:
     discount: float = 0.9
     target_rate: float = 0.01
     world_weight: float = 0.01
+    speech_weight: float = 1.0
     length: int = 0
     stride: int = 1
     exact: bool = False
@@ -125,6 +127,7 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "discount": 0.95,
         "target_rate": 0.02,
         "world_weight": 0.01,
+        "speech_weight": 30.0,
         "length": 10,
         "stride": 2,
         "exact": True,
@@ -252,6 +255,7 @@ class _Trainer:
         self.generator = generator
         embedding = EMBEDDINGS[speech]
         self.self_model = SelfModel(domain, sizes, embedding).to(generator.device)
+        self.self_model.emphasis = {"verbal": options.speech_weight}
         self.target = copy.deepcopy(self.self_model.q_network)
         self.optimizer = torch.optim.Adam(
             self.self_model.parameters(), options.learning_rate, fused=True

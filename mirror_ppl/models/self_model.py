@@ -98,6 +98,8 @@ class SelfModel(nn.Module):
         self.scales: dict[str, tuple[float, ...]] = {"ego": (1.0,) * len(domain.ego_features)} | {
             modality.name: modality.scales for modality in domain.modalities
         }
+        # How much more than once each number of a modality counts in the bound; for training.
+        self.emphasis: dict[str, float] = {}
 
     def model(self, rounds: Rounds) -> Tensor:
         """The generative program, conditioned on what is true; returns ``z`` ``[B, T + 1, Z]``."""
@@ -108,7 +110,8 @@ class SelfModel(nn.Module):
             )
             for name, target in self.targets(rounds.observation).items():
                 mean, scale = self.decoders[name](z)
-                pyro.sample(f"x_{name}", dist.Normal(mean, scale).to_event(3), obs=target)
+                with poutine.scale(scale=self.emphasis.get(name, 1.0)):
+                    pyro.sample(f"x_{name}", dist.Normal(mean, scale).to_event(3), obs=target)
             mean, scale = self.reward(z[..., :-1, :], actions)
             pyro.sample("reward", dist.Normal(mean, scale).to_event(1), obs=rounds.rewards)
         return z

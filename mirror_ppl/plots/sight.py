@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mirror_ppl.plots import driving, road_samples, search_rescue
+from mirror_ppl.plots import driving, notices, road_samples, search_rescue
 from mirror_ppl.plots.picture import Picture
 
 if TYPE_CHECKING:
@@ -28,6 +28,9 @@ class SightPicture:
     shows: str
 
 
+NOTICES = SightPicture(
+    notices.has_notices, notices.notices_picture, "how probably each person notices what is there"
+)
 PICTURES: dict[str, dict[str, SightPicture]] = {
     "driving": {
         "sight.png": SightPicture(
@@ -38,6 +41,7 @@ PICTURES: dict[str, dict[str, SightPicture]] = {
             road_samples.samples_picture,
             "the same in samples, beside what they really see",
         ),
+        "notices.png": NOTICES,
     },
     "search_rescue": {
         "sight.png": SightPicture(
@@ -46,6 +50,7 @@ PICTURES: dict[str, dict[str, SightPicture]] = {
             "the house as each person sees it",
         ),
     },
+    "bomb_defusal": {"notices.png": NOTICES},
 }
 """By domain and file name."""
 FILES = tuple(sorted({name for own in PICTURES.values() for name in own}))
