@@ -81,6 +81,32 @@ def test_who_knows_what_counts_has_exact_values_to_learn_from(generator):
     assert bellman(none) < 100
 
 
+def test_errors_that_all_actions_share_count_once(generator):
+    """The same for all: nothing more. One action alone of five: 4 / 5 of its square."""
+    _, _, full = lived(generator)
+    torch.manual_seed(0)
+    self_model = SelfModel(WORLD)
+    values = self_model.action_values
+    some = replace(full, informed=torch.ones_like(full.informed))
+
+    def total(weight, off):
+        torch.manual_seed(1)
+        options = SelfModelOptions(world_weight=0.0, difference_weight=weight)
+        self_model.action_values = lambda belief: full.exact + off
+        try:
+            return self_model_loss(
+                self_model, self_model.q_network, some, options, on_means=True
+            ).total.item()
+        finally:
+            self_model.action_values = values
+
+    shared, alone = torch.full((5,), 2.0), torch.tensor([2.0, 0, 0, 0, 0])
+    assert total(0.0, shared) == pytest.approx(4.0)
+    assert total(3.0, shared) == pytest.approx(4.0)
+    assert total(0.0, alone) == pytest.approx(4 / 5)
+    assert total(3.0, alone) == pytest.approx(4 / 5 + 3 * 4 / 5 * (4 / 5))
+
+
 def test_a_robot_is_taught_and_judged_by_the_rules_that_it_was_taught(tmp_path):
     """By hand: a self-model that presses what the old rules say."""
 

@@ -55,6 +55,8 @@ class SelfModelOptions:
         speech_weight: how often what is said counts in that; pictures have many more numbers.
         length: steps of a round that is learned from; as many as a round has, if 0.
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
+        difference_weight: how often errors count by which actions differ, besides the errors
+            themselves. What people choose hangs on differences alone.
         exact: whether somebody who knows all that counts learns the exact planner's values, and
             not what a step leads to.
     """
@@ -75,6 +77,7 @@ class SelfModelOptions:
     speech_weight: float = 1.0
     length: int = 0
     stride: int = 1
+    difference_weight: float = 0.0
     exact: bool = False
 
     @classmethod
@@ -113,6 +116,7 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "world_weight": 0.01,
         "length": 16,
         "stride": 2,
+        "difference_weight": 4.0,
         "exact": True,
     },
     "bomb_defusal": {
@@ -186,13 +190,12 @@ def self_model_loss(
     goal = torch.stack(goals, -1)
     if lived.exact is not None:
         goal = torch.where(lived.informed[..., None], lived.exact, goal)
-    error = self_model.action_values(belief) - goal
     # When all is done, which may be so in every round, it does not matter what one does.
-    under_way = error[~lived.over]
-    bellman = under_way.pow(2).mean() if len(under_way) else under_way.sum()
-    return Loss(
-        options.world_weight * negative_elbo + bellman, negative_elbo.detach(), bellman.detach()
-    )
+    error = (self_model.action_values(belief) - goal)[~lived.over]
+    unlike = error - error.mean(-1, keepdim=True)
+    bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
+    total = options.world_weight * negative_elbo + bellman + options.difference_weight * apart
+    return Loss(total, negative_elbo.detach(), bellman.detach())
 
 
 def train_self_model(
