@@ -263,7 +263,7 @@ def decision(chosen):
     gain = Gain(0.0, 0.0, 0.0) if chosen == 0 else Gain(1.5, 0.5, 1.0)
     found = Found(candidates, Valued(utility, actions))
     message = CHANNELS.message(flags)
-    return Decision(message, flags, gain, DOMAIN, DOMAIN.observe(state), found, chosen)
+    return Decision(message, flags, gain, DOMAIN, DOMAIN.observe(state), found, chosen, DOMAIN)
 
 
 def test_an_audit_is_the_decision_as_plain_data():

@@ -6,7 +6,9 @@ from example_person import CHANNELS, DOMAIN, begun, flags, plan
 
 from mirror_ppl.communication import Decision, Gain, Valued
 from mirror_ppl.communication.communicator import gain_over_silence
+from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.search import Found
+from mirror_ppl.domains.bomb_defusal import BombDefusal, BombState
 
 SHOWN, SAID = flags(visual=["front-left"]), flags(verbal=["front-left"])
 OTHER = flags(verbal=["rear-right"])
@@ -21,7 +23,7 @@ def decision(chosen, candidates, utility, actions=None):
     found = Found(torch.stack(candidates), values)
     flags_ = found.candidates[chosen, 0]
     gain = gain_over_silence(values, chosen)
-    return Decision(CHANNELS.message(flags_), flags_, gain, DOMAIN, now, found, chosen)
+    return Decision(CHANNELS.message(flags_), flags_, gain, DOMAIN, now, found, chosen, DOMAIN)
 
 
 def four(chosen=3, actions=None):
@@ -100,11 +102,43 @@ def test_what_each_item_adds():
     assert partly.matters == pytest.approx({("visual", "front-left"): 0.5})
 
 
+def test_advice_follows_the_rules_that_the_robot_learned():
+    """Type A, a frame on terminal 3: yellow holds, blue was taught."""
+    world = BombDefusal()
+    state = BombState(
+        stage=torch.tensor(1),
+        since=torch.tensor(4),
+        kind=torch.tensor(0),
+        live=torch.tensor([2, 2, 2]),
+        symbols=torch.full((3, 6), 2),
+    )
+    now, none = world.observe(state), torch.zeros(7, dtype=torch.bool)
+    gain, silence = Gain(0.0, 0.0, 0.0), Channels(world).message(none)
+    one, taught = (
+        Decision(silence, none, gain, world, now, None, 0, known)
+        for known in (world, world.as_believed)
+    )
+    assert one.advice == "press yellow: terminal 3 (lit, frame), and Type A bomb"
+    assert taught.advice == "press blue: terminal 3 (lit, frame), and Type A bomb"
+    assert Decision(silence, none, gain, world, now, None, 0, world, True).advice == (
+        "the round is over"
+    )
+
+
+def test_advice_in_driving_is_about_cars_in_the_way():
+    """A car three cells ahead comes closer: switch. Without one, stay."""
+    none, gain = flags(), Gain(0.0, 0.0, 0.0)
+    for ahead, expected in ((3, "switch lanes: front car in the left lane"), (30, "stay")):
+        now = begun(0, [ahead, 30, -30, -30], [-1, 1, -1, -1]).now
+        one = Decision(CHANNELS.message(none), none, gain, DOMAIN, now, None, 0, DOMAIN)
+        assert one.advice.startswith(expected)
+
+
 def test_a_decision_without_a_choice():
     """Where nothing could be told, there is silence and nothing more."""
     now = begun(0, [30, 30, -30, -30], [1, 1, -1, -1]).now
     none = Gain(0.0, 0.0, 0.0)
-    one = Decision(CHANNELS.message(flags()), flags(), none, DOMAIN, now, None, 0)
+    one = Decision(CHANNELS.message(flags()), flags(), none, DOMAIN, now, None, 0, DOMAIN)
     assert one.plan == (one.message,)
     assert one.cost == 0
     assert one.matters == {}

@@ -45,12 +45,13 @@ def decision(chosen=1, actions=ACTIONS):
         begun(0, [3, 9, -4, -9], [-1, 1, 1, -1]).now,
         found,
         chosen,
+        DOMAIN,
     )
 
 
 def nothing_to_choose():
     one = decision()
-    return Decision(Message({}), one.flags, one.gain, DOMAIN, one.observation, None, 0)
+    return Decision(Message({}), one.flags, one.gain, DOMAIN, one.observation, None, 0, DOMAIN)
 
 
 def labels(axis):

@@ -31,6 +31,8 @@ INTERVAL = 1.645
 """Standard errors on either side of a mean that hold it with a probability of 90%."""
 LITTLE = 0.05
 """Changes of a probability below this explain nothing."""
+ADVICE_DISCOUNT = 0.95
+"""Of what advice brings, per step."""
 TIE = 1e-6
 """Gains up to this, in units of reward, count as none."""
 
@@ -72,6 +74,7 @@ class Decision:
         observation: what there was to observe, ``[E]`` and ``[K, F]``.
         found: the candidates that were compared; ``None`` where there was nothing to choose.
         chosen: which of them this is.
+        world: the world as the robot knows it, by which it advises.
         over: whether the round is.
     """
 
@@ -82,6 +85,7 @@ class Decision:
     observation: Observation
     found: Found | None
     chosen: int
+    world: Domain
     over: bool = False
 
     @property
@@ -197,6 +201,25 @@ class Decision:
         chances = f"with probability {without:.2f}; told, {told:.2f}"
         return f"{text}: they would {deed}{when} {chances} {worth}"
 
+    @property
+    def advice(self) -> str:
+        """What the robot would have them do now, and what that hangs on.
+
+        By all that there is to observe, and by what the robot learned of the world, as in which
+        rules hold. The supplement's robot advises a button in bomb defusal.
+        """
+        if self.over:
+            return "the round is over"
+        world, now = self.world, self.observation
+        values = world.reference_values(world.state_behind(now), ADVICE_DISCOUNT)
+        notion = next(iter(world.relevance(now).values()))
+        flags = Channels(world).join(notion)
+        about = self._about(
+            pair for pair, flag in zip(Channels(world).pairs, flags.tolist(), strict=True) if flag
+        )
+        deed = world.deed(now, None, int(values.argmax()))
+        return f"{deed}: {about}" if about else deed
+
     def _why_not(self) -> str:
         if self.over:
             return "the round is over"
@@ -269,14 +292,21 @@ class Communicator:
         found, chosen = slimmed(value, found, chosen, self.sure)
         flags = found.candidates[chosen, 0]
         gain = gain_over_silence(found.valued, chosen)
-        return Decision(channels.message(flags), flags, gain, domain, now, found, chosen)
+        message = channels.message(flags)
+        return Decision(message, flags, gain, domain, now, found, chosen, self._world)
 
     def _silence(self, now: Observation, allowed: Tensor, over: bool = False) -> Decision:
         """Where there is nothing to choose."""
         none = torch.zeros_like(allowed)
         domain = self.person.human.domain
         message = Channels(domain).message(none)
-        return Decision(message, none, Gain(0.0, 0.0, 0.0), domain, now, None, 0, over)
+        gain = Gain(0.0, 0.0, 0.0)
+        return Decision(message, none, gain, domain, now, None, 0, self._world, over)
+
+    @cached_property
+    def _world(self) -> Domain:
+        """The world as the robot knows it after what it learned."""
+        return self.person.human.known_world(self.person.draws)
 
 
 def choose(valued: Valued, sure: float) -> int:

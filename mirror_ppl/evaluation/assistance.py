@@ -315,6 +315,7 @@ def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
         "gain": decision.gain.mean,
         "gain_interval": [low, high],
         "why": decision.why(),
+        "advice": decision.advice,
         "plan": [str(message) for message in decision.plan],
         "matters": [[*pair, value] for pair, value in decision.matters.items()],
         "turning_point": None
