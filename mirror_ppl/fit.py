@@ -28,14 +28,14 @@ class Options:
     demos: Path | None = None
     """Recordings in the format of docs/demonstrations.md."""
     domain: str = "driving"
-    """The world of the shipped recordings: driving or search_rescue (none ship of bomb_defusal
-    yet)."""
+    """The world of the shipped recordings: driving, search_rescue or bomb_defusal."""
     setting: str | None = None
     """The setting of the shipped recordings: clear or fog in driving, clear or smoke in
-    search_rescue. Default: the one in which people see less."""
+    search_rescue, labelled or unlabelled in bomb_defusal. Default: the one in which people see
+    less."""
     population: str = "paper"
-    """The people of the shipped recordings: paper (sight limited by the setting alone) or diverse
-    (each their own sight)."""
+    """The people of the shipped recordings: paper (sight limited by the setting alone; in
+    bomb_defusal as quick at every terminal) or diverse (each their own sight)."""
     out: Path = Path("runs/fit")
     """Folder for the results; made if it is not there."""
     train_rounds: int | None = None

@@ -50,6 +50,7 @@ SAME = 0.5
 WAITS, MOST_WAITS, BLIND = 2.0, 8.0, 4.0
 """In nats, what it takes to explain a wait although it was found, several of them at most, and a
 press although it was not."""
+EVEN_ODDS = 0.5
 REWARD_SCALE = 1.0
 """Standard deviation of recorded rewards, in units of reward."""
 
@@ -210,8 +211,11 @@ class Searcher(HumanModel):
         return super().act(implants, belief, torch.cat([wait, exchanged], -1))
 
     def believed_kind(self, belief: Tensor) -> Tensor:
-        """How probably the bomb is of the second type to somebody with a belief ``[..., Z]``."""
-        return self.self_model.decoders["verbal"](belief).mean[..., 0, 0].clamp(0, 1)
+        """1 where somebody with a belief ``[..., Z]`` takes the bomb for the second type, else 0.
+
+        They always take it for one of them: what is not known is guessed.
+        """
+        return (self.self_model.decoders["verbal"](belief).mean[..., 0, 0] > EVEN_ODDS).to(belief)
 
     def _exchanged(self, presses: Tensor, rule: Tensor) -> Tensor:
         """Values ``[..., P, V, T, 4]`` of buttons under a rule ``[..., P, 1, 1]``."""
