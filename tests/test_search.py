@@ -13,6 +13,7 @@ from mirror_ppl.communication import (
     search,
 )
 from mirror_ppl.communication.communicator import choose
+from mirror_ppl.communication.messages import count_messages
 from mirror_ppl.communication.search import CHUNK, in_chunks, joined
 from mirror_ppl.cross_entropy import CrossEntropyOptions
 
@@ -89,6 +90,26 @@ def test_exhaustive_values_every_message_once(generator, places):
     assert torch.equal(found.candidates[:, 0], every_message(allowed))
     assert value.asked == [2 ** len(places)]
     check(found, value, allowed)
+
+
+@pytest.mark.parametrize("most", [1, 2, 3, 9])
+def test_messages_can_be_of_few_items_only(generator, most):
+    """They are those of all messages that are as small, in another order."""
+    allowed = only(0, 2, 3, 6)
+    few, every = every_message(allowed, most), every_message(allowed)
+    assert not few[0].any()
+    small = every[every.sum(-1) <= most]
+    assert {tuple(row) for row in few.tolist()} == {tuple(row) for row in small.tolist()}
+    assert len(few) == len(small) == count_messages(allowed, most)
+    assert count_messages(allowed) == 16
+    value = HandSet(table(generator))
+    found = Automatic(steps=2, items=most)(value, allowed, 0)
+    assert found.candidates.sum(-1).max() <= most
+    assert value.asked[0] == len(small)
+    # So few that they need not be searched.
+    big = torch.ones(NUMBER, dtype=torch.bool)
+    found = Automatic(steps=1, most=1 + NUMBER, items=1)(HandSet(table(generator)), big, 0)
+    assert len(found.candidates) == 1 + NUMBER
 
 
 @pytest.mark.parametrize("best", [{3}, {0, 7}, {1, 2, 4, 5}, set(range(NUMBER))])

@@ -7,8 +7,10 @@ letters mean stands in `mirror_ppl.domains.base`; beside them N is the number of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -107,9 +109,22 @@ class Channels:
         return flags
 
 
-def every_message(allowed: Tensor) -> Tensor:
-    """All messages ``[C, N]`` of the allowed items ``[N]``, silence first."""
+def count_messages(allowed: Tensor, most: int | None = None) -> int:
+    """How many messages :func:`every_message` makes."""
+    number = int(allowed.sum())
+    return sum(math.comb(number, size) for size in range(1 + min(number, most or number)))
+
+
+def every_message(allowed: Tensor, most: int | None = None) -> Tensor:
+    """All messages ``[C, N]`` of so many of the allowed items ``[N]`` at most, silence first."""
     places = allowed.nonzero().squeeze(-1)
+    if most is not None and most < len(places):
+        sizes = range(1 + most)
+        chosen = [few for size in sizes for few in combinations(places.tolist(), size)]
+        messages = allowed.new_zeros(len(chosen), len(allowed))
+        for message, few in zip(messages, chosen, strict=True):
+            message[list(few)] = True
+        return messages
     numbers = torch.arange(2 ** len(places), device=allowed.device)
     bits = (numbers[:, None] >> torch.arange(len(places), device=allowed.device)) & 1
     messages = allowed.new_zeros(len(numbers), len(allowed))

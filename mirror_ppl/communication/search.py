@@ -11,7 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from mirror_ppl.communication.messages import every_message
+from mirror_ppl.communication.messages import count_messages, every_message
 from mirror_ppl.communication.objectives import Value, Valued
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.distinct import distinct_rows
@@ -40,11 +40,17 @@ class Search(Protocol):
 
 @dataclass(frozen=True)
 class Exhaustive:
-    """Every message for now, and silence afterwards."""
+    """Every message for now, and silence afterwards.
+
+    Attributes:
+        items: most items of a message; any number unless given.
+    """
+
+    items: int | None = None
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """See :class:`Search`; the seed is not used."""
-        candidates = every_message(allowed)[:, None]
+        candidates = every_message(allowed, self.items)[:, None]
         return Found(candidates, in_chunks(value, candidates))
 
 
@@ -60,10 +66,12 @@ class Patient:
     Attributes:
         steps: length L of the plans.
         best: how many messages are looked at in this way.
+        items: most items of a message; any number unless given.
     """
 
     steps: int = 3
     best: int = 6
+    items: int | None = None
 
     def __post_init__(self) -> None:
         if self.steps < 1:
@@ -71,7 +79,7 @@ class Patient:
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """See :class:`Search`; the seed is not used."""
-        first = Exhaustive()(value, allowed, seed)
+        first = Exhaustive(self.items)(value, allowed, seed)
         mean = first.valued.utility.mean(-1)
         better = (mean > mean[0]).nonzero().squeeze(-1)
         if self.steps == 1 or not len(better):
@@ -147,15 +155,17 @@ class Automatic:
     Attributes:
         steps: length L of the plans.
         most: the largest number of messages that are valued one by one.
+        items: most items of a message where they are; any number unless given.
     """
 
     steps: int = 3
     most: int = MOST_CANDIDATES
+    items: int | None = None
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """See :class:`Search`."""
-        if 2 ** int(allowed.sum()) <= self.most:
-            return Patient(self.steps)(value, allowed, seed)
+        if count_messages(allowed, self.items) <= self.most:
+            return Patient(self.steps, items=self.items)(value, allowed, seed)
         return CrossEntropy(self.steps)(value, allowed, seed)
 
 

@@ -7,7 +7,7 @@ them are differences in what they said.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from time import perf_counter
 from typing import Any, Self
 
@@ -56,6 +56,7 @@ class PlannerOptions:
         discount: per step.
         branch: see :class:`ExpectedUtility`.
         patience: length of the plans that are compared, see :class:`Automatic`.
+        items: most items of a message, see :class:`Automatic`.
         sure: standard errors that a gain must exceed, see :class:`Communicator`.
         beyond: see :class:`ExpectedUtility`.
         kl_weight: units of reward that mirror-kl gives for a nat.
@@ -66,6 +67,7 @@ class PlannerOptions:
     discount: float = 1.0
     branch: float = 0.1
     patience: int = 3
+    items: int | None = None
     sure: float = 2.0
     kl_weight: float = 1.0
     kl_measure: str = "kl"
@@ -80,7 +82,8 @@ class PlannerOptions:
 
 BY_DOMAIN: dict[str, dict[str, Any]] = {
     "search_rescue": {"horizon": 16, "beyond": True, "branch": 0.4},
-    "bomb_defusal": {"horizon": 12, "beyond": True, "branch": 0.4},
+    # Costs grow so fast that no third item is worth its own; the oracle looks at two, too.
+    "bomb_defusal": {"horizon": 12, "beyond": True, "branch": 0.4, "items": 2},
 }
 """Settings of planners that differ by domain."""
 
@@ -213,16 +216,17 @@ def _oracle(listener: Listener) -> Say:
 
 def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
     """The planner of that name: mirror, mirror-self-model or mirror-kl."""
+    search = Automatic(options.patience, items=options.items)
     if name == "mirror-kl":
         objective = Divergence(options.kl_weight, options.kl_measure)
-        return Communicator(person, objective, Automatic(1), options.sure, seed)
+        return Communicator(person, objective, replace(search, steps=1), options.sure, seed)
     world = SimulatorWorld(person.human.known_world(person.draws))
     if name == "mirror-self-model":
         world = SelfModelWorld(person.human.self_model)
     objective = ExpectedUtility(
         world, options.horizon, options.discount, options.branch, options.beyond
     )
-    return Communicator(person, objective, Automatic(options.patience), options.sure, seed)
+    return Communicator(person, objective, search, options.sure, seed)
 
 
 @torch.no_grad()
