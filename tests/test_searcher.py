@@ -9,6 +9,7 @@ import torch
 from pyro import poutine
 
 from mirror_ppl.communication import Person, RoundSoFar
+from mirror_ppl.communication.minds import Looks, StepwiseBeliefs
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES, read_panel
@@ -250,6 +251,43 @@ def test_who_is_in_a_round_has_not_found_what_they_wait_for(searcher):
     person = Person(searcher, draws).in_round(rounds)
     found = person.eyes["found_0"][person.eye]
     assert len(found) == 40 and found.unique().numel() > 1
+
+
+def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(searcher):
+    """Two courses reach the same belief, one of them a step later: there is one of it."""
+    some = implants(searcher)
+    draws = {name: value.expand(2, *value.shape).clone() for name, value in some.items()}
+    person = Person(searcher, draws)
+    observation, _ = course([WAIT] * 3)
+    now = {name: value[0, :1] for name, value in observation.items()}
+    eyes = {f"found_{stage}": torch.tensor([0, 1]) for stage in range(3)}
+    eyes |= {"guess": torch.tensor([1, 1]), "reads_type": torch.tensor([0, 0])}
+    person.eyes, person.eye, person.eye_count = eyes, torch.arange(2), 2
+    rounds = RoundSoFar.begin(WORLD, {name: value[0, 0] for name, value in observation.items()})
+    beliefs, own = StepwiseBeliefs.before(person, rounds)
+    quiet = {"visual": torch.zeros(2, 6).bool(), "verbal": torch.zeros(2, 1).bool()}
+    numbers = []
+    for step in range(3):
+        last = 5 if step == 0 else WAIT
+        now = {name: value[0, step : step + 1] for name, value in observation.items()}
+        looks = Looks(own, torch.arange(2), torch.full((2,), last), own * 0, now, quiet)
+        beliefs, own = beliefs.after(looks)
+        numbers.append((len(beliefs.courses), own.tolist()))
+    # One found it at once, the other after a step: as that says other things, they never agree.
+    assert [number for number, _ in numbers] == [2, 2, 2]
+    # Had both been told, they would have formed it at the same time, and it stays one.
+    both = {"visual": torch.ones(2, 6).bool(), "verbal": torch.ones(2, 1).bool()}
+    beliefs, own = StepwiseBeliefs.before(person, rounds)
+    for step in range(3):
+        last = 5 if step == 0 else WAIT
+        now = {name: value[0, step : step + 1] for name, value in observation.items()}
+        # Later the second course is in another future, in which all is as in the first.
+        two = {name: value.repeat(2, *(1,) * (value.dim() - 1)) for name, value in now.items()}
+        rows, heard = (torch.arange(2), quiet) if step else (own * 0, both)
+        looks = Looks(own, torch.arange(2), torch.full((2,), last), rows, two, heard)
+        beliefs, own = beliefs.after(looks)
+        assert len(beliefs.courses) == 1
+        assert own.tolist() == [0, 0]
 
 
 def test_a_person_s_probabilities_come_out_of_their_rounds():

@@ -362,8 +362,15 @@ class StepwiseBeliefs:
             looks.action[first],
             None if view.still is None else view.still[first],
         )
-        after = StepwiseBeliefs(self.person, state, _rows(knowledge, first), self.step + 1)
-        return after, index
+        knowledge = _rows(knowledge, first)
+        if view.still is not None:
+            # Beliefs that stay as they are, are the same ones however long ago they were formed.
+            alike, which = distinct_rows(
+                torch.cat([as_whole_numbers(state.mean), *_whole_numbers(knowledge)], -1)
+            )
+            state = Gaussian(state.mean[alike], state.scale[alike])
+            knowledge, index = _rows(knowledge, alike), which[index]
+        return StepwiseBeliefs(self.person, state, knowledge, self.step + 1), index
 
 
 @dataclass(frozen=True)
