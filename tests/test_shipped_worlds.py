@@ -1,4 +1,4 @@
-"""What ships of search and rescue and of bomb defusal: how good it is, and that it is used."""
+"""What ships: how good it is, and that it is used."""
 
 import pytest
 import torch
@@ -7,8 +7,12 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import WAIT
 from mirror_ppl.domains.bomb_panel import OLD_RULES, STAGES, read_panel, right_button
+from mirror_ppl.errors import AssetError
 from mirror_ppl.evaluation.self_model import self_model_quality
+from mirror_ppl.inference.amortized import AmortizedGuide
+from mirror_ppl.inference.guide_file import network_for
 from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import PEOPLE
 
@@ -66,3 +70,12 @@ def test_who_defuses_bombs_waits_however_long_and_then_presses():
                     assert chances.take_along_dim(right[:, None], -1).mean() > 0.8
                     last = right
                 state, step = world.transition(state, last), step + 1
+
+
+def test_guides_ship_of_two_human_models_of_driving():
+    model, _ = load_self_model(shipped_weights("driving"))
+    for name in ("mirror", "per-item"):
+        human = VARIANTS[name](model)
+        assert isinstance(network_for("amortized", None, human), AmortizedGuide)
+    with pytest.raises(AssetError, match="no guide ships for OneRadius in driving: train one"):
+        network_for("amortized", None, VARIANTS["one-radius"](model))

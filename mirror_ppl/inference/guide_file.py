@@ -15,18 +15,25 @@ from mirror_ppl.errors import AssetError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, reference_places
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import fingerprint, read_tensors
 
 FORMAT = "mirror_ppl guide 1"
+FIRST = next(iter(VARIANTS))
 
 
-def shipped_guide(domain: str) -> Path:
-    """Path of the guide of the package's own human model that ships for a domain.
+def shipped_guide(domain: str, human_model: str = FIRST) -> Path:
+    """Path of the guide that ships for a domain and one of the package's human models.
+
+    Args:
+        domain: its name.
+        human_model: a name in `mirror_ppl.models.variants.VARIANTS`.
 
     Raises:
         AssetError: none ships.
     """
-    return asset_path(f"{domain}_guide.safetensors")
+    which = "" if human_model == FIRST else f"_{human_model.replace('-', '_')}"
+    return asset_path(f"{domain}_guide{which}.safetensors")
 
 
 def save_guide(
@@ -93,11 +100,12 @@ def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGu
     if guide != "amortized":
         return None
     if path is None:
+        own = [name for name, kind in VARIANTS.items() if kind is type(human)]
         try:
-            path = shipped_guide(human.domain.name)
+            path = shipped_guide(human.domain.name, own[0] if own else FIRST)
         except AssetError as error:
             raise AssetError(
-                f"no guide ships for {human.domain.name}: train one with python -m "
+                f"no guide ships for {type(human).__name__} in {human.domain.name}: train one with python -m "
                 "mirror_ppl.train --what guide and name it with --guide-file, or use --guide exact"
             ) from error
     return load_guide(path, human)[0]
