@@ -105,7 +105,8 @@ def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGu
             path = shipped_guide(human.domain.name, own[0] if own else FIRST)
         except AssetError as error:
             raise AssetError(
-                f"no guide ships for {type(human).__name__} in {human.domain.name}: train one with python -m "
-                "mirror_ppl.train --what guide and name it with --guide-file, or use --guide exact"
+                f"no guide ships for {type(human).__name__} in {human.domain.name}: train one with "
+                "python -m mirror_ppl.train --what guide and name it with --guide-file, or use "
+                "--guide exact"
             ) from error
     return load_guide(path, human)[0]
