@@ -79,6 +79,23 @@ def test_what_is_looked_for_is_known_of_the_stages_that_were_reached(searcher):
     assert torch.equal(facts["sought_2"], states[0].live[:, 1])
 
 
+def test_terminals_share_a_mean_as_far_as_they_are_alike(searcher):
+    """Beta densities of mean ``quickness`` that are worth ``evenness`` searches."""
+    given = {"quickness": torch.tensor([[0.04]]), "evenness": torch.tensor([[50.0]])}
+    with (
+        torch.random.fork_rng(),
+        poutine.trace() as trace,
+        poutine.condition(data=given),
+        pyro.plate("person", 1, dim=-2),
+    ):
+        searcher.prior()
+    for terminal in range(1, 7):
+        prior = trace.trace.nodes[f"notices_terminal {terminal}"]["fn"]
+        assert float(prior.concentration1) == pytest.approx(2.0)
+        assert float(prior.concentration0) == pytest.approx(48.0)
+    assert float(trace.trace.nodes["quickness"]["fn"].mean) == pytest.approx(0.1)
+
+
 def test_finding_is_geometric_with_the_probability_of_what_is_looked_for(searcher):
     """By the facts of the round: 0.1 of terminal 1, 0.5 of terminal 2."""
     some = implants(searcher, **{"notices_terminal 1": 0.1, "notices_terminal 2": 0.5})
