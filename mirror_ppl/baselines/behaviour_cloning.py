@@ -26,22 +26,17 @@ Departures from the supplement:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import torch
-from torch import Tensor, nn
-from torch.nn.functional import one_hot
+from torch import Tensor
 
+from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, Sight, initial_weights
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains import Domain, Observation, Visibility, get_domain, require_known
+from mirror_ppl.domains import get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.people.populations import derived_generator
-
-Sight = Literal["setting", "everything"]
-"""Which items a clone reads: those that the setting shows or that were told, or all visual ones."""
-SIGHTS: tuple[Sight, ...] = get_args(Sight)
 
 
 @dataclass(frozen=True)
@@ -98,147 +93,11 @@ class BehaviourCloneOptions:
             )
 
 
-def network_inputs(
-    domain: Domain, observation: Observation, visible: Visibility, previous: Tensor
-) -> Tensor:
-    """What a recurrent network reads at each step, ``[..., I]``; zero for all that is not visible.
+class BehaviourClone(RecurrentNetworks):
+    """``p(a_t | x_{1:t}, v_{1:t}, a_{1:t-1})``: outputs are logits.
 
-    Args:
-        domain: the world.
-        observation: everything that there was to observe, ego ``[..., E]`` and modalities
-            ``[..., K, F]`` in the domain's units.
-        visible: seen or told, ``[..., K]`` for each modality.
-        previous: indices ``[...]`` of the actions before, A where there was none.
+    Made by `fit_behaviour_clone`.
     """
-    symbols = domain.symbols(observation)
-    dtype = symbols["ego"].dtype
-    parts = [symbols["ego"]]
-    for modality in domain.modalities:
-        mask = visible[modality.name].to(dtype)
-        parts += [(symbols[modality.name] * mask[..., None]).flatten(-2), mask]
-    parts.append(one_hot(previous, len(domain.actions) + 1).to(dtype))
-    return torch.cat(parts, -1)
-
-
-def input_size(domain: Domain) -> int:
-    """I, the number of inputs that `network_inputs` makes."""
-    items = sum(len(m.items) * (domain.symbol_sizes[m.name] + 1) for m in domain.modalities)
-    return domain.symbol_sizes["ego"] + items + len(domain.actions) + 1
-
-
-class BehaviourClone(nn.Module):
-    """``p(a_t | x_{1:t}, v_{1:t}, a_{1:t-1})`` of each of P people, their networks side by side.
-
-    Made by `fit_behaviour_clone`. No network shares anything with another.
-
-    Args:
-        domain: the world.
-        people: P ids.
-        sight: which items the networks read.
-        weights: by name, as `_initial_weights` makes them, ``[P, ...]``.
-    """
-
-    def __init__(
-        self, domain: Domain, people: Sequence[str], sight: Sight, weights: Mapping[str, Tensor]
-    ) -> None:
-        super().__init__()
-        self.domain = domain
-        self.people = tuple(people)
-        self.sight: Sight = sight
-        self.weights = nn.ParameterDict(
-            {name: nn.Parameter(value.clone()) for name, value in weights.items()}
-        )
-
-    @property
-    def hidden(self) -> int:
-        """H, the number of the GRU's units."""
-        return self.weights["recurrent"].shape[1]
-
-    def inputs(self, demonstrations: Demonstrations) -> Tensor:
-        """What the networks read at each step of recorded rounds, ``[P, B, T, I]``."""
-        observation = demonstrations.observation()
-        steps = demonstrations.shape[2]
-        visible = self.domain.visibility(demonstrations.setting, observation)
-        if self.sight == "everything":
-            visible = visible | {"visual": torch.ones_like(visible["visual"])}
-        visible = {
-            name: mask[:, :, :steps] | demonstrations.told[name] for name, mask in visible.items()
-        }
-        observation = {name: value[:, :, :steps] for name, value in observation.items()}
-        actions = demonstrations.actions
-        none = torch.full_like(actions[:, :, :1], len(self.domain.actions))
-        # Padding has the action -1, which is nobody's business but has to have a symbol.
-        previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
-        return network_inputs(self.domain, observation, visible, previous)
-
-    def start(self, rounds: int) -> Tensor:
-        """The hidden state before the first step of B rounds, ``[P, B, H]`` of zeros."""
-        return self.weights["recurrent"].new_zeros(len(self.people), rounds, self.hidden)
-
-    def step(self, hidden: Tensor, inputs: Tensor) -> Tensor:
-        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` ``[P, B, H]`` and ``inputs`` ``[P, B, I]``."""
-        return self._update(hidden, self._project(inputs))
-
-    def act(self, hidden: Tensor) -> Tensor:
-        """Log-probabilities of the actions ``[P, B, A]`` in hidden states ``[P, B, H]``."""
-        own = self.weights
-        layer = torch.relu(torch.baddbmm(own["layer_bias"], hidden, own["layer"]))
-        return torch.baddbmm(own["output_bias"], layer, own["output"]).log_softmax(-1)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Log-probabilities of the actions ``[P, B, T, A]`` of ``inputs`` ``[P, B, T, I]``."""
-        _, rounds, steps, _ = inputs.shape
-        gates = self._project(inputs.flatten(1, 2)).unflatten(1, (rounds, steps))
-        hidden, states = self.start(rounds), []
-        for gate in gates.unbind(2):
-            hidden = self._update(hidden, gate)
-            states.append(hidden)
-        return self.act(torch.stack(states, 2).flatten(1, 2)).unflatten(1, (rounds, steps))
-
-    @torch.no_grad()
-    def log_probabilities(self, demonstrations: Demonstrations) -> Tensor:
-        """Log-probabilities in nats of all actions at every step, ``[P, B, T, A]``.
-
-        Each is of what came before the action alone. In padding they mean nothing.
-
-        Args:
-            demonstrations: rounds of some of the people, in any order; P is their number.
-
-        Raises:
-            DemonstrationsError: they are of another domain.
-            UnknownNameError: there is somebody whose clone this is not.
-        """
-        return self._of(demonstrations)(self.inputs(demonstrations))
-
-    def _of(self, demonstrations: Demonstrations) -> BehaviourClone:
-        """The clones of these people, in their order."""
-        if demonstrations.domain != self.domain.name:
-            raise DemonstrationsError(
-                f"demonstrations of {demonstrations.domain}, expected {self.domain.name}"
-            )
-        if demonstrations.people == self.people:
-            return self
-        index = [
-            self.people.index(require_known(person, "person", self.people))
-            for person in demonstrations.people
-        ]
-        weights = {name: value[index] for name, value in self.weights.items()}
-        return BehaviourClone(self.domain, demonstrations.people, self.sight, weights)
-
-    def _project(self, inputs: Tensor) -> Tensor:
-        """The inputs' part ``[P, N, 3 H]`` of the gates, of ``inputs`` ``[P, N, I]``."""
-        # Most symbols never occur in a batch, and columns of zeros add nothing.
-        used = inputs.flatten(0, -2).any(0)
-        weight = self.weights["input"][:, used]
-        return torch.baddbmm(self.weights["input_bias"], inputs[..., used], weight)
-
-    def _update(self, hidden: Tensor, gates: Tensor) -> Tensor:
-        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` and the inputs' part of the gates."""
-        own = torch.baddbmm(self.weights["recurrent_bias"], hidden, self.weights["recurrent"])
-        size = 2 * self.hidden
-        reset, keep = torch.sigmoid(gates[..., :size] + own[..., :size]).chunk(2, -1)
-        new = torch.tanh(gates[..., size:] + reset * own[..., size:])
-        return new + keep * (hidden - new)
 
 
 def fit_behaviour_clone(
@@ -284,7 +143,7 @@ def fit_behaviour_clone(
     return clone.requires_grad_(False)
 
 
-def held_out_nll(clone: BehaviourClone, demonstrations: Demonstrations) -> Tensor:
+def held_out_nll(clone: RecurrentNetworks, demonstrations: Demonstrations) -> Tensor:
     """Mean negative log-likelihood of a person's actions, in nats per action, ``[P]``.
 
     It is NaN for people who have no rounds.
@@ -312,21 +171,8 @@ def _initial_weights(
 ) -> dict[str, Tensor]:
     """Weights ``[P, inputs, outputs]`` and biases ``[P, 1, outputs]`` of each layer by name."""
     domain = get_domain(train.domain)
-    hidden, layer, actions = options.hidden, options.layer, len(domain.actions)
-    # The usual initial values of torch but for inputs and output; see the module's description.
-    shapes = {
-        "recurrent": (hidden, 3 * hidden, hidden),
-        "recurrent_bias": (1, 3 * hidden, hidden),
-        "input_bias": (1, 3 * hidden, hidden),
-        "layer": (hidden, layer, hidden),
-        "layer_bias": (1, layer, hidden),
-        "output": (layer, actions, layer),
-    }
-    weights = {}
-    for name, (before, after, fan_in) in shapes.items():
-        drawn = torch.stack([torch.rand(before, after, generator=own) for own in generators])
-        weights[name] = (2 * drawn - 1) * fan_in**-0.5
-    weights["input"] = torch.zeros(len(train.people), input_size(domain), 3 * hidden)
+    actions = len(domain.actions)
+    weights = initial_weights(domain, options.hidden, (options.layer,), generators)
     chosen = torch.stack([(train.actions == action).sum((1, 2)) for action in range(actions)], -1)
     # One more of each, lest an action that was never taken counts as impossible.
     weights["output_bias"] = ((chosen + 1) / (chosen + 1).sum(-1, True)).log()[:, None].cpu()
@@ -354,7 +200,7 @@ def _train(
         last = step == options.epochs
         if last or step % options.check_every == 0:
             with torch.no_grad():
-                nll = _mean_nll(clone(unseen_inputs), unseen_actions)
+                nll = _mean_nll(clone(unseen_inputs).log_softmax(-1), unseen_actions)
                 better = (nll < best) & (looks_since < options.patience)
                 best = torch.where(better, nll, best)
                 for name, value in clone.weights.items():
@@ -368,7 +214,7 @@ def _train(
         batch = _batch(inputs, actions, counts.tolist(), options.batch, generators)
         optimizer.zero_grad()
         # A sum: people share no weight, so each network follows its own person's mean alone.
-        _mean_nll(clone(batch[0]), batch[1]).sum().backward()
+        _mean_nll(clone(batch[0]).log_softmax(-1), batch[1]).sum().backward()
         with torch.no_grad():
             for name, value in clone.weights.items():
                 if not name.endswith("bias"):

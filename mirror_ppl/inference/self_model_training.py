@@ -134,6 +134,7 @@ BY_DOMAIN: dict[str, dict[str, Any]] = {
         "speech_weight": 30.0,
         "length": 10,
         "stride": 2,
+        "difference_weight": 4.0,
         "exact": True,
     },
 }

@@ -1,0 +1,222 @@
+"""Recurrent networks of people, a network of its own for each, side by side.
+
+What the supplement's baselines have in common (section D)::
+
+    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])
+    y_t = output(relu(layer_L(... relu(layer_1(h_t)))))          a number for each action
+
+``x_t`` are the domain's symbols of all items of all modalities and ``v_t`` masks: which items the
+setting lets an unaided person see, or were told. P stands for people, H for the GRU's units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, Self, get_args
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains import Domain, Observation, Visibility, require_known
+from mirror_ppl.errors import DemonstrationsError
+
+Sight = Literal["setting", "everything"]
+"""Which items a network reads: those that the setting shows or that were told, or all visual ones.
+"""
+SIGHTS: tuple[Sight, ...] = get_args(Sight)
+LAYER = "layer_"
+
+
+def network_inputs(
+    domain: Domain, observation: Observation, visible: Visibility, previous: Tensor
+) -> Tensor:
+    """What a recurrent network reads at each step, ``[..., I]``; zero for all that is not visible.
+
+    Args:
+        domain: the world.
+        observation: everything that there was to observe, ego ``[..., E]`` and modalities
+            ``[..., K, F]`` in the domain's units.
+        visible: seen or told, ``[..., K]`` for each modality.
+        previous: indices ``[...]`` of the actions before, A where there was none.
+    """
+    symbols = domain.symbols(observation)
+    dtype = symbols["ego"].dtype
+    parts = [symbols["ego"]]
+    for modality in domain.modalities:
+        mask = visible[modality.name].to(dtype)
+        parts += [(symbols[modality.name] * mask[..., None]).flatten(-2), mask]
+    parts.append(one_hot(previous, len(domain.actions) + 1).to(dtype))
+    return torch.cat(parts, -1)
+
+
+def input_size(domain: Domain) -> int:
+    """I, the number of inputs that `network_inputs` makes."""
+    items = sum(len(m.items) * (domain.symbol_sizes[m.name] + 1) for m in domain.modalities)
+    return domain.symbol_sizes["ego"] + items + len(domain.actions) + 1
+
+
+class RecurrentNetworks(nn.Module):
+    """A number ``y_t`` for each action, of what came before it, for each of P people.
+
+    No network shares anything with another.
+
+    Args:
+        domain: the world.
+        people: P ids.
+        sight: which items the networks read.
+        weights: by name, as `initial_weights` makes them, ``[P, ...]``.
+    """
+
+    def __init__(
+        self, domain: Domain, people: Sequence[str], sight: Sight, weights: Mapping[str, Tensor]
+    ) -> None:
+        super().__init__()
+        self.domain = domain
+        self.people = tuple(people)
+        self.sight: Sight = sight
+        self.weights = nn.ParameterDict(
+            {name: nn.Parameter(value.clone()) for name, value in weights.items()}
+        )
+        self.layers = tuple(name for name in weights if name.removeprefix(LAYER).isdecimal())
+
+    @property
+    def hidden(self) -> int:
+        """H, the number of the GRU's units."""
+        return self.weights["recurrent"].shape[1]
+
+    def visible(self, setting: str, observation: Observation) -> Visibility:
+        """Which items a setting lets the networks read, ``[..., K]`` for each modality."""
+        visible = self.domain.visibility(setting, observation)
+        if self.sight == "everything":
+            visible = visible | {"visual": torch.ones_like(visible["visual"])}
+        return visible
+
+    def inputs(self, demonstrations: Demonstrations) -> Tensor:
+        """What the networks read at each step of recorded rounds, ``[P, B, T, I]``."""
+        observation = demonstrations.observation()
+        steps = demonstrations.shape[2]
+        visible = {
+            name: mask[:, :, :steps] | demonstrations.told[name]
+            for name, mask in self.visible(demonstrations.setting, observation).items()
+        }
+        observation = {name: value[:, :, :steps] for name, value in observation.items()}
+        actions = demonstrations.actions
+        none = torch.full_like(actions[:, :, :1], len(self.domain.actions))
+        # Padding has the action -1, which is nobody's business but has to have a symbol.
+        previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
+        return network_inputs(self.domain, observation, visible, previous)
+
+    def start(self, rounds: int) -> Tensor:
+        """The hidden state before the first step of B rounds, ``[P, B, H]`` of zeros."""
+        return self.weights["recurrent"].new_zeros(len(self.people), rounds, self.hidden)
+
+    def step(self, hidden: Tensor, inputs: Tensor) -> Tensor:
+        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` ``[P, B, H]`` and ``inputs`` ``[P, B, I]``."""
+        return self._update(hidden, self._project(inputs))
+
+    def outputs(self, hidden: Tensor) -> Tensor:
+        """``y_t`` ``[P, B, A]`` of hidden states ``[P, B, H]``."""
+        own, values = self.weights, hidden
+        for name in self.layers:
+            values = torch.relu(torch.baddbmm(own[f"{name}_bias"], values, own[name]))
+        return torch.baddbmm(own["output_bias"], values, own["output"])
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """``y_t`` at every step ``[P, B, T, A]`` of ``inputs`` ``[P, B, T, I]``."""
+        _, rounds, steps, _ = inputs.shape
+        gates = self._project(inputs.flatten(1, 2)).unflatten(1, (rounds, steps))
+        hidden, states = self.start(rounds), []
+        for gate in gates.unbind(2):
+            hidden = self._update(hidden, gate)
+            states.append(hidden)
+        return self.outputs(torch.stack(states, 2).flatten(1, 2)).unflatten(1, (rounds, steps))
+
+    def act(self, hidden: Tensor) -> Tensor:
+        """Log-probabilities of the actions ``[P, B, A]`` in hidden states ``[P, B, H]``."""
+        return self.outputs(hidden).log_softmax(-1)
+
+    @torch.no_grad()
+    def log_probabilities(self, demonstrations: Demonstrations) -> Tensor:
+        """Log-probabilities in nats of all actions at every step, ``[P, B, T, A]``.
+
+        Each is of what came before the action alone. In padding they mean nothing.
+
+        Args:
+            demonstrations: rounds of some of the people, in any order; P is their number.
+
+        Raises:
+            DemonstrationsError: they are of another domain.
+            UnknownNameError: there is somebody whose network this is not.
+        """
+        own = self.of(demonstrations)
+        return own(own.inputs(demonstrations)).log_softmax(-1)
+
+    def of(self, demonstrations: Demonstrations) -> Self:
+        """The networks of these people, in their order; errors as above."""
+        if demonstrations.domain != self.domain.name:
+            raise DemonstrationsError(
+                f"demonstrations of {demonstrations.domain}, expected {self.domain.name}"
+            )
+        if demonstrations.people == self.people:
+            return self
+        index = [
+            self.people.index(require_known(person, "person", self.people))
+            for person in demonstrations.people
+        ]
+        weights = {name: value[index] for name, value in self.weights.items()}
+        return type(self)(self.domain, demonstrations.people, self.sight, weights)
+
+    def _project(self, inputs: Tensor) -> Tensor:
+        """The inputs' part ``[P, N, 3 H]`` of the gates, of ``inputs`` ``[P, N, I]``."""
+        # Most symbols never occur in a batch, and columns of zeros add nothing.
+        used = inputs.flatten(0, -2).any(0)
+        weight = self.weights["input"][:, used]
+        return torch.baddbmm(self.weights["input_bias"], inputs[..., used], weight)
+
+    def _update(self, hidden: Tensor, gates: Tensor) -> Tensor:
+        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` and the inputs' part of the gates."""
+        own = torch.baddbmm(self.weights["recurrent_bias"], hidden, self.weights["recurrent"])
+        size = 2 * self.hidden
+        reset, keep = torch.sigmoid(gates[..., :size] + own[..., :size]).chunk(2, -1)
+        new = torch.tanh(gates[..., size:] + reset * own[..., size:])
+        return new + keep * (hidden - new)
+
+
+def initial_weights(
+    domain: Domain,
+    hidden: int,
+    layers: Sequence[int],
+    generators: Sequence[torch.Generator],
+) -> dict[str, Tensor]:
+    """Weights ``[P, inputs, outputs]`` and biases ``[P, 1, outputs]`` of each layer by name.
+
+    Those of the GRU and the layers are the usual ones of torch; those on inputs are zero, so that
+    a symbol that recordings lack adds nothing; so is the output's bias.
+
+    Args:
+        domain: the world.
+        hidden: units of the GRU.
+        layers: units of each layer after it.
+        generators: one for each of P people.
+    """
+    actions = len(domain.actions)
+    shapes = {
+        "recurrent": (hidden, 3 * hidden, hidden),
+        "recurrent_bias": (1, 3 * hidden, hidden),
+        "input_bias": (1, 3 * hidden, hidden),
+    }
+    before = hidden
+    for place, size in enumerate(layers, 1):
+        name = f"{LAYER}{place}"
+        shapes |= {name: (before, size, before), f"{name}_bias": (1, size, before)}
+        before = size
+    shapes["output"] = (before, actions, before)
+    weights = {}
+    for name, (rows, columns, fan_in) in shapes.items():
+        drawn = torch.stack([torch.rand(rows, columns, generator=own) for own in generators])
+        weights[name] = (2 * drawn - 1) * fan_in**-0.5
+    weights["input"] = torch.zeros(len(generators), input_size(domain), 3 * hidden)
+    weights["output_bias"] = torch.zeros(len(generators), 1, actions)
+    return weights
