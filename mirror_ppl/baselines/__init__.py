@@ -4,16 +4,20 @@ from mirror_ppl.baselines.behaviour_cloning import (
     BehaviourClone,
     BehaviourCloneOptions,
     fit_behaviour_clone,
-    held_out_nll,
 )
 from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, input_size, network_inputs
+from mirror_ppl.baselines.sqil import SoftQ, SoftQOptions, fit_soft_q
+from mirror_ppl.baselines.training import held_out_nll
 
 __all__ = [
     "SIGHTS",
     "BehaviourClone",
     "BehaviourCloneOptions",
     "RecurrentNetworks",
+    "SoftQ",
+    "SoftQOptions",
     "fit_behaviour_clone",
+    "fit_soft_q",
     "held_out_nll",
     "input_size",
     "network_inputs",

@@ -33,9 +33,15 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, Sight, initial_weights
+from mirror_ppl.baselines.training import (
+    BestWeights,
+    check_parts,
+    draw_batch,
+    mean_nll,
+    shrink,
+)
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain, require_known
-from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.people.populations import derived_generator
 
 
@@ -125,15 +131,7 @@ def fit_behaviour_clone(
         DemonstrationsError: somebody has no round to learn from or none to validate with; or the
             validation rounds are of another domain or other people.
     """
-    if validation.domain != train.domain or validation.people != train.people:
-        raise DemonstrationsError(
-            f"validation rounds are of {validation.domain}, {', '.join(validation.people)}; "
-            f"expected those of training: {train.domain}, {', '.join(train.people)}"
-        )
-    for purpose, part in (("training", train), ("validation", validation)):
-        for person, count in zip(part.people, part.round_counts.tolist(), strict=True):
-            if count == 0:
-                raise DemonstrationsError(f"person {person!r} has no {purpose} round")
+    check_parts(train, validation)
     # By name and not by place: a person's network is the same whoever else is fitted.
     generators = [derived_generator(seed, "behaviour clone", name) for name in train.people]
     weights = _initial_weights(train, options, generators)
@@ -141,29 +139,6 @@ def fit_behaviour_clone(
     clone.to(train.actions.device)
     _train(clone, (train, validation), options, generators, report)
     return clone.requires_grad_(False)
-
-
-def held_out_nll(clone: RecurrentNetworks, demonstrations: Demonstrations) -> Tensor:
-    """Mean negative log-likelihood of a person's actions, in nats per action, ``[P]``.
-
-    It is NaN for people who have no rounds.
-
-    Args:
-        clone: of these people and perhaps others.
-        demonstrations: rounds that the clone has not learned from.
-
-    Raises:
-        DemonstrationsError: they are of another domain.
-        UnknownNameError: there is somebody whose clone this is not.
-    """
-    return _mean_nll(clone.log_probabilities(demonstrations), demonstrations.actions)
-
-
-def _mean_nll(log_probabilities: Tensor, actions: Tensor) -> Tensor:
-    """Mean over real actions ``[P, B, T]`` of their negative log-likelihood, ``[P]``."""
-    real = actions >= 0
-    own = log_probabilities.gather(-1, actions.clamp(min=0)[..., None]).squeeze(-1)
-    return -torch.where(real, own, 0.0).sum((1, 2)) / real.sum((1, 2))
 
 
 def _initial_weights(
@@ -187,58 +162,22 @@ def _train(
     report: Callable[[int, str], None],
 ) -> None:
     """Train until nobody gains; leaves each person's weights of their best look at validation."""
-    inputs, unseen_inputs = (clone.inputs(part) for part in parts)
-    actions, unseen_actions = (part.actions for part in parts)
-    counts = parts[0].round_counts
+    train, validation = parts
+    inputs, actions, counts = clone.inputs(train), train.actions, train.round_counts
     decay = options.weight_decay / (counts / options.full_decay_rounds).clamp(min=1)
-    shrinkage = (1 - options.learning_rate * decay)[:, None, None]
     optimizer = torch.optim.Adam(clone.parameters(), options.learning_rate)
-    kept = {name: value.detach().clone() for name, value in clone.weights.items()}
-    best = inputs.new_full((len(clone.people),), torch.inf)
-    looks_since = torch.zeros_like(best)
+    stopping = BestWeights(clone, validation, options.patience)
     for step in range(options.epochs + 1):
         last = step == options.epochs
         if last or step % options.check_every == 0:
-            with torch.no_grad():
-                nll = _mean_nll(clone(unseen_inputs).log_softmax(-1), unseen_actions)
-                better = (nll < best) & (looks_since < options.patience)
-                best = torch.where(better, nll, best)
-                for name, value in clone.weights.items():
-                    kept[name][better] = value[better]
-            looks_since = torch.where(better, 0, looks_since + 1)
-            last = last or bool((looks_since >= options.patience).all())
-            done = options.epochs if last else step
-            report(done, f"validation {best.mean().item():.3f} nats an action")
+            last = stopping.look() or last
+            report(options.epochs if last else step, stopping.message)
         if last:
             break
-        batch = _batch(inputs, actions, counts.tolist(), options.batch, generators)
+        batch = draw_batch(inputs, actions, counts.tolist(), options.batch, generators)
         optimizer.zero_grad()
         # A sum: people share no weight, so each network follows its own person's mean alone.
-        _mean_nll(clone(batch[0]).log_softmax(-1), batch[1]).sum().backward()
-        with torch.no_grad():
-            for name, value in clone.weights.items():
-                if not name.endswith("bias"):
-                    value.mul_(shrinkage)
+        mean_nll(clone(batch[0]).log_softmax(-1), batch[1]).sum().backward()
+        shrink(clone, options.learning_rate * decay)
         optimizer.step()
-    clone.weights.load_state_dict(kept)
-
-
-def _batch(
-    inputs: Tensor,
-    actions: Tensor,
-    counts: Sequence[int],
-    size: int,
-    generators: Sequence[torch.Generator],
-) -> tuple[Tensor, Tensor]:
-    """Inputs and actions of ``size`` rounds of each person, of all if they have no more."""
-    if inputs.shape[1] <= size:
-        return inputs, actions
-    index = torch.zeros(len(counts), size, dtype=torch.long)
-    padding = torch.ones(len(counts), size, dtype=torch.bool)
-    for person, (count, generator) in enumerate(zip(counts, generators, strict=True)):
-        own = torch.randperm(count, generator=generator)[:size]
-        index[person, : len(own)] = own
-        padding[person, : len(own)] = False
-    index, padding = index.to(actions.device), padding.to(actions.device)
-    person = torch.arange(len(counts), device=actions.device)[:, None]
-    return inputs[person, index], actions[person, index].masked_fill(padding[..., None], -1)
+    stopping.restore()

@@ -1,0 +1,226 @@
+"""SQIL: soft Q imitation learning, by recurrent networks.
+
+Implements the baseline SQIL of MIRROR (Chen, Fong and Soh, RSS 2022; supplement, section D) after
+Reddy, Dragan and Levine, *SQIL: Imitation Learning via Reinforcement Learning with Sparse Rewards*
+(ICLR 2020)::
+
+    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])                    48 units
+    Q(h_t, .) = output(relu(layer_3(relu(layer_2(relu(layer_1(h_t)))))))    three layers of 32
+    a_t ~ Categorical(softmax(Q(h_t, .)))
+
+    delta^2(D, r) = mean over D of (Q(h_t, a_t) - r - discount * log sum_a exp Q(h_{t+1}, a))^2
+    loss          = delta^2(recorded, 1) + sampled_weight * delta^2(sampled, 0)
+
+Sampled rounds are those that the network itself plays in the domain, of which it learns that they
+are worth nothing, so that it keeps to what the person does. Each person has a network of their own.
+
+Departures from the supplement are those of `mirror_ppl.baselines.behaviour_cloning`: the GRU reads
+``a_{t-1}``, masks are inputs, weights on inputs begin at zero, early stopping. After the last step
+of a round nothing follows.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.baselines.recurrent import (
+    SIGHTS,
+    RecurrentNetworks,
+    Sight,
+    initial_weights,
+    network_inputs,
+)
+from mirror_ppl.baselines.training import BestWeights, check_parts, draw_batch, shrink
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains import get_domain, require_known
+from mirror_ppl.domains.base import map_state
+from mirror_ppl.people.populations import derived_generator
+
+RECORDED, SAMPLED = 1.0, 0.0
+"""Rewards of what a person did, and of what the network does."""
+KEPT = 5
+"""Sets of sampled rounds that are learned from."""
+
+
+@dataclass(frozen=True)
+class SoftQOptions:
+    """Settings of SQIL.
+
+    Attributes:
+        sight: a name in ``SIGHTS``: which items the network reads.
+        hidden: units of the GRU (supplement: 48).
+        layers: units of the layers after it (supplement: 32 each).
+        learning_rate: of Adam.
+        weight_decay: decoupled weight decay on all weights but biases, as in AdamW.
+        discount: per step.
+        target_rate: rate at which the network follows whose values are looked ahead to, per step.
+        sampled_weight: of the error in sampled rounds.
+        sampled: rounds that are played at a time.
+        sample_every: gradient steps after which as many are played anew.
+        epochs: most gradient steps.
+        batch: most recorded rounds of a person in a gradient step, drawn without replacement.
+        check_every: gradient steps between looks at the validation rounds.
+        patience: looks without a better one after which a person's training ends.
+    """
+
+    sight: Sight = "setting"
+    hidden: int = 48
+    layers: tuple[int, ...] = (32, 32, 32)
+    learning_rate: float = 0.005
+    weight_decay: float = 1.0
+    discount: float = 0.9
+    target_rate: float = 0.05
+    sampled_weight: float = 1.0
+    sampled: int = 20
+    sample_every: int = 10
+    epochs: int = 600
+    batch: int = 20
+    check_every: int = 5
+    patience: int = 30
+
+    def __post_init__(self) -> None:
+        require_known(self.sight, "sight", SIGHTS)
+        counts = ("hidden", "sampled", "sample_every", "epochs", "batch", "check_every", "patience")
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
+        if not 0 <= self.discount < 1:
+            raise ValueError(f"discount must be at least 0 and below 1, not {self.discount}")
+        if not 0 <= self.weight_decay * self.learning_rate < 1:
+            raise ValueError(
+                "weight_decay must not be negative, and below 1 / learning_rate, "
+                f"not {self.weight_decay}"
+            )
+
+
+class SoftQ(RecurrentNetworks):
+    """``Q(h_t, a_t)``: outputs are soft action values, and logits of what people do.
+
+    Made by `fit_soft_q`.
+    """
+
+    @torch.no_grad()
+    def play(
+        self, setting: str, rounds: int, generators: Sequence[torch.Generator]
+    ) -> tuple[Tensor, Tensor]:
+        """Rounds as the networks themselves play them.
+
+        Args:
+            setting: what they see is as in this one.
+            rounds: B, of each of P people.
+            generators: one for each of them.
+
+        Returns:
+            Inputs ``[P, B, T, I]``, and actions ``[P, B, T]``, -1 after the end.
+        """
+        domain, people = self.domain, len(self.people)
+        begin = [domain.initial(rounds, generator) for generator in generators]
+        state = map_state(lambda *parts: torch.stack(parts), *begin)
+        hidden = self.start(rounds)
+        last = torch.full((people, rounds), len(domain.actions), device=hidden.device)
+        inputs, actions = [], []
+        for _ in range(domain.horizon):
+            observation = domain.observe(state)
+            seen = self.visible(setting, observation)
+            inputs.append(network_inputs(domain, observation, seen, last))
+            hidden = self.step(hidden, inputs[-1])
+            chances = self.act(hidden).exp()
+            last = torch.stack(
+                [
+                    torch.multinomial(own, 1, generator=generator).squeeze(-1)
+                    for own, generator in zip(chances, generators, strict=True)
+                ]
+            )
+            actions.append(torch.where(domain.over(state), -1, last))
+            state = domain.transition(state, last)
+        return torch.stack(inputs, 2), torch.stack(actions, 2)
+
+
+def squared_errors(
+    networks: SoftQ, target: SoftQ, inputs: Tensor, actions: Tensor, reward: float, discount: float
+) -> Tensor:
+    """``delta^2`` of rounds of each person, ``[P]``.
+
+    Args:
+        networks: what is trained.
+        target: whose values are looked ahead to.
+        inputs: of rounds ``[P, B, T, I]``.
+        actions: ``[P, B, T]``, -1 in padding.
+        reward: of every step.
+        discount: per step.
+    """
+    real = actions >= 0
+    with torch.no_grad():
+        ahead = torch.where(real, target(inputs).logsumexp(-1), 0.0)
+        ahead = torch.nn.functional.pad(ahead[..., 1:], [0, 1])
+    own = networks(inputs).gather(-1, actions.clamp(min=0)[..., None]).squeeze(-1)
+    error = torch.where(real, own - reward - discount * ahead, 0.0)
+    return error.square().sum((1, 2)) / real.sum((1, 2)).clamp(min=1)
+
+
+def fit_soft_q(
+    train: Demonstrations,
+    validation: Demonstrations,
+    options: SoftQOptions,
+    seed: int,
+    report: Callable[[int, str], None] = lambda done, message: None,
+) -> SoftQ:
+    """Imitate P people, each by a network of their own.
+
+    Args:
+        train: rounds to learn from, of any lengths and numbers.
+        validation: rounds of the same people in the same order, by which training is stopped.
+        options: settings.
+        seed: seed of everything random here; with a person's id and rounds it determines their
+            network.
+        report: called at each look at the validation rounds with the number of gradient steps
+            done, in the end ``options.epochs`` even if training stopped early, and a message.
+
+    Returns:
+        The networks, on the device of the training rounds.
+
+    Raises:
+        DemonstrationsError: somebody has no round to learn from or none to validate with; or the
+            validation rounds are of another domain or other people.
+    """
+    check_parts(train, validation)
+    domain = get_domain(train.domain)
+    generators = [derived_generator(seed, "soft q", name) for name in train.people]
+    weights = initial_weights(domain, options.hidden, options.layers, generators)
+    networks = SoftQ(domain, train.people, options.sight, weights).to(train.actions.device)
+    target = copy.deepcopy(networks).requires_grad_(False)
+    optimizer = torch.optim.Adam(networks.parameters(), options.learning_rate)
+    inputs, actions = networks.inputs(train), train.actions
+    stopping = BestWeights(networks, validation, options.patience)
+    sampled: list[tuple[Tensor, Tensor]] = []
+    for step in range(options.epochs + 1):
+        last = step == options.epochs
+        if last or step % options.check_every == 0:
+            last = stopping.look() or last
+            report(options.epochs if last else step, stopping.message)
+        if last:
+            break
+        if step % options.sample_every == 0:
+            played = networks.play(train.setting, options.sampled, generators)
+            sampled = [*sampled, played][-KEPT:]
+        some = sampled[step % len(sampled)]
+        batch = draw_batch(inputs, actions, train.round_counts.tolist(), options.batch, generators)
+        optimizer.zero_grad()
+        loss = squared_errors(networks, target, *batch, RECORDED, options.discount)
+        own = squared_errors(networks, target, *some, SAMPLED, options.discount)
+        # A sum: people share no weight.
+        (loss + options.sampled_weight * own).sum().backward()
+        shrink(networks, options.learning_rate * options.weight_decay)
+        optimizer.step()
+        with torch.no_grad():
+            for slow, fast in zip(target.parameters(), networks.parameters(), strict=True):
+                slow.lerp_(fast, options.target_rate)
+    stopping.restore()
+    return networks.requires_grad_(False)

@@ -1,0 +1,125 @@
+"""What training of recurrent baselines has in common: batches, weight decay, early stopping."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.baselines.recurrent import RecurrentNetworks
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.errors import DemonstrationsError
+
+
+def check_parts(train: Demonstrations, validation: Demonstrations) -> None:
+    """Make sure that everybody has rounds to learn from, and others to stop by.
+
+    Raises:
+        DemonstrationsError: somebody has none of either; or the validation rounds are of another
+            domain or other people.
+    """
+    if validation.domain != train.domain or validation.people != train.people:
+        raise DemonstrationsError(
+            f"validation rounds are of {validation.domain}, {', '.join(validation.people)}; "
+            f"expected those of training: {train.domain}, {', '.join(train.people)}"
+        )
+    for purpose, part in (("training", train), ("validation", validation)):
+        for person, count in zip(part.people, part.round_counts.tolist(), strict=True):
+            if count == 0:
+                raise DemonstrationsError(f"person {person!r} has no {purpose} round")
+
+
+def held_out_nll(networks: RecurrentNetworks, demonstrations: Demonstrations) -> Tensor:
+    """Mean negative log-likelihood of a person's actions, in nats per action, ``[P]``.
+
+    It is NaN for people who have no rounds.
+
+    Args:
+        networks: of these people and perhaps others.
+        demonstrations: rounds that the networks have not learned from.
+
+    Raises:
+        DemonstrationsError: they are of another domain.
+        UnknownNameError: there is somebody whose network this is not.
+    """
+    return mean_nll(networks.log_probabilities(demonstrations), demonstrations.actions)
+
+
+def mean_nll(log_probabilities: Tensor, actions: Tensor) -> Tensor:
+    """Mean over real actions ``[P, B, T]`` of their negative log-likelihood, ``[P]``."""
+    real = actions >= 0
+    own = log_probabilities.gather(-1, actions.clamp(min=0)[..., None]).squeeze(-1)
+    return -torch.where(real, own, 0.0).sum((1, 2)) / real.sum((1, 2))
+
+
+class BestWeights:
+    """Each person's weights at their best look at validation rounds.
+
+    Args:
+        networks: what is trained.
+        validation: rounds that it does not learn from.
+        patience: looks without a better one after which a person's training has ended.
+    """
+
+    def __init__(
+        self, networks: RecurrentNetworks, validation: Demonstrations, patience: int
+    ) -> None:
+        self.networks = networks
+        self.inputs, self.actions = networks.inputs(validation), validation.actions
+        self.patience = patience
+        self._kept = {name: value.detach().clone() for name, value in networks.weights.items()}
+        self._best = self.inputs.new_full((len(networks.people),), torch.inf)
+        self._looks_since = torch.zeros_like(self._best)
+
+    @torch.no_grad()
+    def look(self) -> bool:
+        """Keep the weights of those who got better; whether nobody is to be trained any more."""
+        nll = mean_nll(self.networks(self.inputs).log_softmax(-1), self.actions)
+        better = (nll < self._best) & (self._looks_since < self.patience)
+        self._best = torch.where(better, nll, self._best)
+        for name, value in self.networks.weights.items():
+            self._kept[name][better] = value[better]
+        self._looks_since = torch.where(better, 0, self._looks_since + 1)
+        return bool((self._looks_since >= self.patience).all())
+
+    @property
+    def message(self) -> str:
+        """How good the best are."""
+        return f"validation {self._best.mean().item():.3f} nats an action"
+
+    def restore(self) -> None:
+        """Give everybody their best weights."""
+        self.networks.weights.load_state_dict(self._kept)
+
+
+@torch.no_grad()
+def shrink(networks: RecurrentNetworks, rates: Tensor | float) -> None:
+    """Decoupled weight decay of one step, by rates ``[P]``, of all weights but biases."""
+    factor = 1 - rates
+    if isinstance(factor, Tensor):
+        factor = factor[:, None, None]
+    for name, value in networks.weights.items():
+        if not name.endswith("bias"):
+            value.mul_(factor)
+
+
+def draw_batch(
+    inputs: Tensor,
+    actions: Tensor,
+    counts: Sequence[int],
+    size: int,
+    generators: Sequence[torch.Generator],
+) -> tuple[Tensor, Tensor]:
+    """Inputs and actions of ``size`` rounds of each person, of all if they have no more."""
+    if inputs.shape[1] <= size:
+        return inputs, actions
+    index = torch.zeros(len(counts), size, dtype=torch.long)
+    padding = torch.ones(len(counts), size, dtype=torch.bool)
+    for person, (count, generator) in enumerate(zip(counts, generators, strict=True)):
+        own = torch.randperm(count, generator=generator)[:size]
+        index[person, : len(own)] = own
+        padding[person, : len(own)] = False
+    index, padding = index.to(actions.device), padding.to(actions.device)
+    person = torch.arange(len(counts), device=actions.device)[:, None]
+    return inputs[person, index], actions[person, index].masked_fill(padding[..., None], -1)
