@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from example_rounds import alternate, anything, avoid, ragged, rounds_of
 
 from mirror_ppl.baselines import (
     BehaviourCloneOptions,
@@ -9,61 +10,11 @@ from mirror_ppl.baselines import (
     held_out_nll,
     input_size,
 )
-from mirror_ppl.data import Demonstrations, concatenate
-from mirror_ppl.domains.driving import FOG_REACH, ROAD_END, STAY, SWITCH, Driving
+from mirror_ppl.data import concatenate
+from mirror_ppl.domains.driving import FOG_REACH, ROAD_END, SWITCH, Driving
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
 
 BRIEF = BehaviourCloneOptions(epochs=6)
-
-
-def avoid(observation, previous):
-    """Switch if and only if a car of the own lane is at most two cells ahead."""
-    ahead, offset = observation["visual"].unbind(-1)
-    near = (ahead >= 0) & (ahead <= FOG_REACH) & (offset == 0)
-    return torch.where(near.any(-1), SWITCH, STAY)
-
-
-def alternate(observation, previous):
-    """Switch after staying, stay after switching, begin with a switch; whatever there is to see."""
-    return torch.where(previous == SWITCH, STAY, SWITCH)
-
-
-def rounds_of(rule, generator, rounds=30, name="a", lengths=None):
-    """Rounds of one person who follows a rule, in fog; of full length unless lengths are given."""
-    domain = Driving()
-    state = domain.initial(rounds, generator)
-    observations, actions = [domain.observe(state)], []
-    previous = torch.full((rounds,), -1)
-    for _ in range(domain.horizon):
-        previous = rule(observations[-1], previous)
-        actions.append(previous)
-        state = domain.transition(state, previous)
-        observations.append(domain.observe(state))
-    seen = {
-        name: torch.stack([part[name] for part in observations], 1)[None]
-        for name in observations[0]
-    }
-    return Demonstrations(
-        domain="driving",
-        setting="fog",
-        people=(name,),
-        ego=seen.pop("ego"),
-        observations=seen,
-        actions=torch.stack(actions, 1)[None],
-        round_counts=torch.tensor([rounds]),
-        lengths=torch.full((1, rounds), domain.horizon) if lengths is None else lengths[None],
-    )
-
-
-def anything(observation, previous):
-    """Act at random (from torch's global generator, which every test seeds)."""
-    return torch.randint(2, previous.shape)
-
-
-def ragged(generator, name, rounds):
-    lengths = torch.randint(1, 16, (rounds,), generator=generator)
-    padded = rounds_of(anything, generator, rounds, name, lengths)
-    return padded.select_rounds(slice(None))  # without padding that no round needs
 
 
 @pytest.fixture

@@ -9,14 +9,15 @@ Reddy, Dragan and Levine, *SQIL: Imitation Learning via Reinforcement Learning w
     a_t ~ Categorical(softmax(Q(h_t, .)))
 
     delta^2(D, r) = mean over D of (Q(h_t, a_t) - r - discount * log sum_a exp Q(h_{t+1}, a))^2
-    loss          = delta^2(recorded, 1) + sampled_weight * delta^2(sampled, 0)
+    loss          = delta^2(recorded, reward) + sampled_weight * delta^2(sampled, 0)
 
 Sampled rounds are those that the network itself plays in the domain, of which it learns that they
 are worth nothing, so that it keeps to what the person does. Each person has a network of their own.
 
 Departures from the supplement are those of `mirror_ppl.baselines.behaviour_cloning`: the GRU reads
 ``a_{t-1}``, masks are inputs, weights on inputs begin at zero, early stopping. After the last step
-of a round nothing follows.
+of a round nothing follows. Rewards are larger than 1, which is the same as a temperature below 1:
+people are more consistent than somebody to whom an imitated action is worth 1.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ from mirror_ppl.domains import get_domain, require_known
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.people.populations import derived_generator
 
-RECORDED, SAMPLED = 1.0, 0.0
-"""Rewards of what a person did, and of what the network does."""
+SAMPLED = 0.0
+"""Reward of what the network does by itself."""
 KEPT = 5
 """Sets of sampled rounds that are learned from."""
 
@@ -51,12 +52,18 @@ KEPT = 5
 class SoftQOptions:
     """Settings of SQIL.
 
+    With the defaults the tasks that tests set are solved. Validation is no better than knowing how
+    often each action is taken for up to 300 steps, until values have come about, so patience has to
+    be long; without weight decay, or at a discount of .9, rules are learned less well. They were
+    not searched on people.
+
     Attributes:
         sight: a name in ``SIGHTS``: which items the network reads.
         hidden: units of the GRU (supplement: 48).
         layers: units of the layers after it (supplement: 32 each).
         learning_rate: of Adam.
         weight_decay: decoupled weight decay on all weights but biases, as in AdamW.
+        reward: of what the person did.
         discount: per step.
         target_rate: rate at which the network follows whose values are looked ahead to, per step.
         sampled_weight: of the error in sampled rounds.
@@ -71,17 +78,18 @@ class SoftQOptions:
     sight: Sight = "setting"
     hidden: int = 48
     layers: tuple[int, ...] = (32, 32, 32)
-    learning_rate: float = 0.005
-    weight_decay: float = 1.0
-    discount: float = 0.9
-    target_rate: float = 0.05
+    learning_rate: float = 0.01
+    weight_decay: float = 0.3
+    reward: float = 5.0
+    discount: float = 0.5
+    target_rate: float = 0.2
     sampled_weight: float = 1.0
     sampled: int = 20
     sample_every: int = 10
     epochs: int = 600
     batch: int = 20
     check_every: int = 5
-    patience: int = 30
+    patience: int = 80
 
     def __post_init__(self) -> None:
         require_known(self.sight, "sight", SIGHTS)
@@ -89,8 +97,9 @@ class SoftQOptions:
         for name in counts:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
+        for name in ("learning_rate", "reward"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
         if not 0 <= self.discount < 1:
             raise ValueError(f"discount must be at least 0 and below 1, not {self.discount}")
         if not 0 <= self.weight_decay * self.learning_rate < 1:
@@ -213,7 +222,7 @@ def fit_soft_q(
         some = sampled[step % len(sampled)]
         batch = draw_batch(inputs, actions, train.round_counts.tolist(), options.batch, generators)
         optimizer.zero_grad()
-        loss = squared_errors(networks, target, *batch, RECORDED, options.discount)
+        loss = squared_errors(networks, target, *batch, options.reward, options.discount)
         own = squared_errors(networks, target, *some, SAMPLED, options.discount)
         # A sum: people share no weight.
         (loss + options.sampled_weight * own).sum().backward()
