@@ -52,7 +52,7 @@ class Options:
     sure: float = 2.0
     """How many standard errors of its gain a message has to gain to be sent; 0 is enough for the
     best on average."""
-    patience: int = 3
+    patience: int | None = None
     """Steps over which a message is compared with saying it later; 1 compares with silence only."""
     branch: float | None = None
     """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one

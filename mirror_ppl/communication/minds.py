@@ -31,7 +31,7 @@ from mirror_ppl.models.sites import latent_sites
 
 COUNTED = 3
 """Up to how many items of a message have to be cheaper than others that tell the same."""
-ATTENTION_VALUES = 64
+ATTENTION_VALUES = 512
 """Values that stand for all that somebody may attend to in a round, of which each draw gets one."""
 
 
@@ -131,16 +131,21 @@ class Person:
         eyes = {name: value.repeat_interleave(number) for name, value in self.eyes.items()}
         eyes |= {name: value.repeat(self.eye_count) for name, value in attention.items()}
         count = self.eye_count * number
-        observation, told, actions = _history(past, count)
+        observation, told, _ = _history(past, count)
         view = self.human.perceive(eyes, observation, told)
         view = view.map(lambda part: part.expand(count, *part.shape[1:]))
-        belief = self.human.believe(view, observation, actions)
+        # Most values differ in what comes later: there are few things that were seen so far.
+        first, seen = distinct_rows(view.numbers())
+        observation, _, actions = _history(past, len(first))
+        belief = self.human.believe(view.map(lambda part: part[first]), observation, actions)
         values = self.human.self_model.action_values(belief)
-        which = self.eye[:, None] * number + torch.arange(number, device=self.device)
         with self._conditioned():
-            found = self.human.act(self.implants, belief[which][:, None], values[which][:, None])
+            found = self.human.act(self.implants, belief[None], values[None])
         found = found.expand(self.number, *found.shape[1:])[:, 0]
-        return found.gather(-1, past.actions.expand(*found.shape[:-1])[..., None]).sum((-1, -2))
+        done = past.actions.expand(*found.shape[:-1])[..., None]
+        found = found.gather(-1, done).sum((-1, -2))  # [S, distinct]
+        which = self.eye[:, None] * number + torch.arange(number, device=self.device)
+        return found.gather(-1, seen[which])
 
     def _conditioned(self) -> ExitStack:
         stack = ExitStack()
