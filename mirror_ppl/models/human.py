@@ -243,7 +243,10 @@ class HumanModel(nn.Module):
     ) -> Tensor:
         """``log p(m_b | psi_p)`` of G values that stand for all in a round, ``[..., P, B, G]``.
 
-        Runs inside the person plate. Probabilities add up to 1 over the values.
+        Runs inside the person plate. Each is multiplied by that for how many it stands, so that
+        sums over the G values estimate sums over all of them without bias. They are therefore
+        not divided by their own sum, which is 1 on average only: values are proposed by what was
+        done, so that where few of them are probable of a person the actions would seem probable.
 
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
@@ -269,7 +272,7 @@ class HumanModel(nn.Module):
         total = torch.as_tensor(total).movedim(0, -1)
         while total.dim() > SPARED and total.shape[0] == 1:
             total = total.squeeze(0)
-        return torch.log_softmax(total + log_weights, -1)
+        return total + log_weights
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """What a person sees by themselves at one step, masks ``[..., K]``: ``n_t``.
