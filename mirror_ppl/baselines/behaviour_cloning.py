@@ -26,27 +26,28 @@ Departures from the supplement:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, Sight, initial_weights
+from mirror_ppl.baselines.recurrent import RecurrentNetworks, initial_weights
 from mirror_ppl.baselines.training import (
-    BestWeights,
+    Report,
+    TrainingOptions,
     check_parts,
-    draw_batch,
     mean_nll,
-    shrink,
+    no_report,
+    train_each,
 )
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains import get_domain, require_known
+from mirror_ppl.domains import get_domain
 from mirror_ppl.people.populations import derived_generator
 
 
 @dataclass(frozen=True)
-class BehaviourCloneOptions:
+class BehaviourCloneOptions(TrainingOptions):
     """Settings of behaviour cloning.
 
     The defaults are good at 20 training rounds. They were searched, one or two settings at a time,
@@ -59,44 +60,19 @@ class BehaviourCloneOptions:
     numbers in place of symbols.
 
     Attributes:
-        sight: a name in ``SIGHTS``: which items the clone reads.
-        hidden: units of the GRU (supplement: 48).
-        layer: units of the layer after it (supplement: 32).
-        learning_rate: of Adam.
-        weight_decay: decoupled weight decay on all weights but biases, as in AdamW.
+        layer: units of the layer after the GRU (supplement: 32).
         full_decay_rounds: a person with more training rounds gets less weight decay, in inverse
             proportion, as a prior does that stays the same. At 60 and 200 rounds (paper population)
             this was better on validation than the full decay.
-        epochs: most gradient steps; a step uses all training rounds, or ``batch`` of them.
-        batch: most rounds of a person in a gradient step, drawn without replacement.
-        check_every: gradient steps between looks at the validation rounds.
-        patience: looks without a better one after which a person's training ends.
     """
 
-    sight: Sight = "setting"
-    hidden: int = 48
-    layer: int = 32
     learning_rate: float = 0.03
     weight_decay: float = 6.0
-    full_decay_rounds: int = 20
-    epochs: int = 400
-    batch: int = 20
     check_every: int = 3
-    patience: int = 10
+    layer: int = 32
+    full_decay_rounds: int = 20
 
-    def __post_init__(self) -> None:
-        require_known(self.sight, "sight", SIGHTS)
-        counts = ("hidden", "layer", "full_decay_rounds", "epochs", "batch", "check_every")
-        for name in (*counts, "patience"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
-        if not 0 <= self.weight_decay * self.learning_rate < 1:
-            raise ValueError(
-                "weight_decay must not be negative, and below 1 / learning_rate, "
-                f"not {self.weight_decay}"
-            )
+    COUNTS = (*TrainingOptions.COUNTS, "layer", "full_decay_rounds")
 
 
 class BehaviourClone(RecurrentNetworks):
@@ -111,7 +87,7 @@ def fit_behaviour_clone(
     validation: Demonstrations,
     options: BehaviourCloneOptions,
     seed: int,
-    report: Callable[[int, str], None] = lambda done, message: None,
+    report: Report = no_report,
 ) -> BehaviourClone:
     """Clone P people, each from their own rounds and by a network of their own.
 
@@ -137,7 +113,13 @@ def fit_behaviour_clone(
     weights = _initial_weights(train, options, generators)
     clone = BehaviourClone(get_domain(train.domain), train.people, options.sight, weights)
     clone.to(train.actions.device)
-    _train(clone, (train, validation), options, generators, report)
+    decay = options.weight_decay / (train.round_counts / options.full_decay_rounds).clamp(min=1)
+
+    def loss(step: int, inputs: Tensor, actions: Tensor) -> Tensor:
+        del step
+        return mean_nll(clone(inputs).log_softmax(-1), actions)
+
+    train_each(clone, (train, validation), loss, options, generators, report, decay)
     return clone.requires_grad_(False)
 
 
@@ -152,32 +134,3 @@ def _initial_weights(
     # One more of each, lest an action that was never taken counts as impossible.
     weights["output_bias"] = ((chosen + 1) / (chosen + 1).sum(-1, True)).log()[:, None].cpu()
     return weights
-
-
-def _train(
-    clone: BehaviourClone,
-    parts: tuple[Demonstrations, Demonstrations],
-    options: BehaviourCloneOptions,
-    generators: Sequence[torch.Generator],
-    report: Callable[[int, str], None],
-) -> None:
-    """Train until nobody gains; leaves each person's weights of their best look at validation."""
-    train, validation = parts
-    inputs, actions, counts = clone.inputs(train), train.actions, train.round_counts
-    decay = options.weight_decay / (counts / options.full_decay_rounds).clamp(min=1)
-    optimizer = torch.optim.Adam(clone.parameters(), options.learning_rate)
-    stopping = BestWeights(clone, validation, options.patience)
-    for step in range(options.epochs + 1):
-        last = step == options.epochs
-        if last or step % options.check_every == 0:
-            last = stopping.look() or last
-            report(options.epochs if last else step, stopping.message)
-        if last:
-            break
-        batch = draw_batch(inputs, actions, counts.tolist(), options.batch, generators)
-        optimizer.zero_grad()
-        # A sum: people share no weight, so each network follows its own person's mean alone.
-        mean_nll(clone(batch[0]).log_softmax(-1), batch[1]).sum().backward()
-        shrink(clone, options.learning_rate * decay)
-        optimizer.step()
-    stopping.restore()

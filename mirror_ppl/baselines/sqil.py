@@ -23,22 +23,22 @@ people are more consistent than somebody to whom an imitated action is worth 1.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.baselines.recurrent import (
-    SIGHTS,
-    RecurrentNetworks,
-    Sight,
-    initial_weights,
-    network_inputs,
+from mirror_ppl.baselines.recurrent import RecurrentNetworks, initial_weights, network_inputs
+from mirror_ppl.baselines.training import (
+    Report,
+    TrainingOptions,
+    check_parts,
+    no_report,
+    train_each,
 )
-from mirror_ppl.baselines.training import BestWeights, check_parts, draw_batch, shrink
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains import get_domain, require_known
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.people.populations import derived_generator
 
@@ -49,7 +49,7 @@ KEPT = 5
 
 
 @dataclass(frozen=True)
-class SoftQOptions:
+class SoftQOptions(TrainingOptions):
     """Settings of SQIL.
 
     With the defaults the tasks that tests set are solved. Validation is no better than knowing how
@@ -58,55 +58,34 @@ class SoftQOptions:
     not searched on people.
 
     Attributes:
-        sight: a name in ``SIGHTS``: which items the network reads.
-        hidden: units of the GRU (supplement: 48).
-        layers: units of the layers after it (supplement: 32 each).
-        learning_rate: of Adam.
-        weight_decay: decoupled weight decay on all weights but biases, as in AdamW.
+        layers: units of the layers after the GRU (supplement: 32 each).
         reward: of what the person did.
         discount: per step.
         target_rate: rate at which the network follows whose values are looked ahead to, per step.
         sampled_weight: of the error in sampled rounds.
         sampled: rounds that are played at a time.
         sample_every: gradient steps after which as many are played anew.
-        epochs: most gradient steps.
-        batch: most recorded rounds of a person in a gradient step, drawn without replacement.
-        check_every: gradient steps between looks at the validation rounds.
-        patience: looks without a better one after which a person's training ends.
     """
 
-    sight: Sight = "setting"
-    hidden: int = 48
-    layers: tuple[int, ...] = (32, 32, 32)
-    learning_rate: float = 0.01
     weight_decay: float = 0.3
+    epochs: int = 600
+    patience: int = 80
+    layers: tuple[int, ...] = (32, 32, 32)
     reward: float = 5.0
     discount: float = 0.5
     target_rate: float = 0.2
     sampled_weight: float = 1.0
     sampled: int = 20
     sample_every: int = 10
-    epochs: int = 600
-    batch: int = 20
-    check_every: int = 5
-    patience: int = 80
+
+    COUNTS = (*TrainingOptions.COUNTS, "sampled", "sample_every")
 
     def __post_init__(self) -> None:
-        require_known(self.sight, "sight", SIGHTS)
-        counts = ("hidden", "sampled", "sample_every", "epochs", "batch", "check_every", "patience")
-        for name in counts:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("learning_rate", "reward"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        super().__post_init__()
+        if not self.reward > 0:
+            raise ValueError(f"reward must be positive, not {self.reward}")
         if not 0 <= self.discount < 1:
             raise ValueError(f"discount must be at least 0 and below 1, not {self.discount}")
-        if not 0 <= self.weight_decay * self.learning_rate < 1:
-            raise ValueError(
-                "weight_decay must not be negative, and below 1 / learning_rate, "
-                f"not {self.weight_decay}"
-            )
 
 
 class SoftQ(RecurrentNetworks):
@@ -179,7 +158,7 @@ def fit_soft_q(
     validation: Demonstrations,
     options: SoftQOptions,
     seed: int,
-    report: Callable[[int, str], None] = lambda done, message: None,
+    report: Report = no_report,
 ) -> SoftQ:
     """Imitate P people, each by a network of their own.
 
@@ -205,31 +184,21 @@ def fit_soft_q(
     weights = initial_weights(domain, options.hidden, options.layers, generators)
     networks = SoftQ(domain, train.people, options.sight, weights).to(train.actions.device)
     target = copy.deepcopy(networks).requires_grad_(False)
-    optimizer = torch.optim.Adam(networks.parameters(), options.learning_rate)
-    inputs, actions = networks.inputs(train), train.actions
-    stopping = BestWeights(networks, validation, options.patience)
     sampled: list[tuple[Tensor, Tensor]] = []
-    for step in range(options.epochs + 1):
-        last = step == options.epochs
-        if last or step % options.check_every == 0:
-            last = stopping.look() or last
-            report(options.epochs if last else step, stopping.message)
-        if last:
-            break
+
+    def loss(step: int, inputs: Tensor, actions: Tensor) -> Tensor:
+        if step:
+            with torch.no_grad():
+                for slow, fast in zip(target.parameters(), networks.parameters(), strict=True):
+                    slow.lerp_(fast, options.target_rate)
         if step % options.sample_every == 0:
-            played = networks.play(train.setting, options.sampled, generators)
-            sampled = [*sampled, played][-KEPT:]
-        some = sampled[step % len(sampled)]
-        batch = draw_batch(inputs, actions, train.round_counts.tolist(), options.batch, generators)
-        optimizer.zero_grad()
-        loss = squared_errors(networks, target, *batch, options.reward, options.discount)
-        own = squared_errors(networks, target, *some, SAMPLED, options.discount)
-        # A sum: people share no weight.
-        (loss + options.sampled_weight * own).sum().backward()
-        shrink(networks, options.learning_rate * options.weight_decay)
-        optimizer.step()
-        with torch.no_grad():
-            for slow, fast in zip(target.parameters(), networks.parameters(), strict=True):
-                slow.lerp_(fast, options.target_rate)
-    stopping.restore()
+            sampled.append(networks.play(train.setting, options.sampled, generators))
+            del sampled[:-KEPT]
+        error = squared_errors(networks, target, inputs, actions, options.reward, options.discount)
+        own = squared_errors(
+            networks, target, *sampled[step % len(sampled)], SAMPLED, options.discount
+        )
+        return error + options.sampled_weight * own
+
+    train_each(networks, (train, validation), loss, options, generators, report)
     return networks.requires_grad_(False)

@@ -1,15 +1,68 @@
-"""What training of recurrent baselines has in common: batches, weight decay, early stopping."""
+"""What training of recurrent baselines has in common: settings, batches, weight decay, stopping."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.baselines.recurrent import RecurrentNetworks
+from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, Sight
 from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains import require_known
 from mirror_ppl.errors import DemonstrationsError
+
+Report = Callable[[int, str], None]
+"""Told of each look at the validation rounds: gradient steps done, and a message."""
+Loss = Callable[[int, Tensor, Tensor], Tensor]
+"""Of each person ``[P]``: of the number of the gradient step, inputs ``[P, B, T, I]`` and actions
+``[P, B, T]``."""
+
+
+def no_report(done: int, message: str) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Settings that recurrent baselines share.
+
+    Attributes:
+        sight: a name in ``SIGHTS``: which items the networks read.
+        hidden: units of the GRU (supplement: 48).
+        learning_rate: of Adam.
+        weight_decay: decoupled weight decay on all weights but biases, as in AdamW.
+        epochs: most gradient steps; a step uses all training rounds, or ``batch`` of them.
+        batch: most rounds of a person in a gradient step, drawn without replacement.
+        check_every: gradient steps between looks at the validation rounds.
+        patience: looks without a better one after which a person's training ends.
+    """
+
+    sight: Sight = "setting"
+    hidden: int = 48
+    learning_rate: float = 0.01
+    weight_decay: float = 1.0
+    epochs: int = 400
+    batch: int = 20
+    check_every: int = 5
+    patience: int = 10
+
+    COUNTS = ("hidden", "epochs", "batch", "check_every", "patience")
+    """Settings that have to be at least 1."""
+
+    def __post_init__(self) -> None:
+        require_known(self.sight, "sight", SIGHTS)
+        for name in self.COUNTS:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
+        if not 0 <= self.weight_decay * self.learning_rate < 1:
+            raise ValueError(
+                "weight_decay must not be negative, and below 1 / learning_rate, "
+                f"not {self.weight_decay}"
+            )
 
 
 def check_parts(train: Demonstrations, validation: Demonstrations) -> None:
@@ -28,6 +81,48 @@ def check_parts(train: Demonstrations, validation: Demonstrations) -> None:
         for person, count in zip(part.people, part.round_counts.tolist(), strict=True):
             if count == 0:
                 raise DemonstrationsError(f"person {person!r} has no {purpose} round")
+
+
+def train_each(
+    networks: RecurrentNetworks,
+    parts: tuple[Demonstrations, Demonstrations],
+    loss: Loss,
+    options: TrainingOptions,
+    generators: Sequence[torch.Generator],
+    report: Report = no_report,
+    decay: Tensor | None = None,
+) -> None:
+    """Train everybody's network until nobody gains; leaves the weights of their best look.
+
+    Args:
+        networks: of P people; changed in place.
+        parts: their rounds to learn from, and those by which training is stopped.
+        loss: what is made small.
+        options: settings.
+        generators: one for each of them.
+        report: called at each look with the number of gradient steps done, in the end
+            ``options.epochs`` even if training stopped early, and a message.
+        decay: weight decay of each of them ``[P]``, unless that of the options.
+    """
+    train, validation = parts
+    inputs, actions, counts = networks.inputs(train), train.actions, train.round_counts.tolist()
+    rates = options.learning_rate * (options.weight_decay if decay is None else decay)
+    optimizer = torch.optim.Adam(networks.parameters(), options.learning_rate)
+    stopping = BestWeights(networks, validation, options.patience)
+    for step in range(options.epochs + 1):
+        last = step == options.epochs
+        if last or step % options.check_every == 0:
+            last = stopping.look() or last
+            report(options.epochs if last else step, stopping.message)
+        if last:
+            break
+        batch = draw_batch(inputs, actions, counts, options.batch, generators)
+        optimizer.zero_grad()
+        # A sum: people share no weight, so each network follows its own person's loss alone.
+        loss(step, *batch).sum().backward()
+        shrink(networks, rates)
+        optimizer.step()
+    stopping.restore()
 
 
 def held_out_nll(networks: RecurrentNetworks, demonstrations: Demonstrations) -> Tensor:
