@@ -2,6 +2,8 @@
 
 import torch
 
+from mirror_ppl.baselines import SoftQ
+from mirror_ppl.baselines.recurrent import initial_weights
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.driving import FOG_REACH, STAY, SWITCH, Driving
 
@@ -54,3 +56,12 @@ def ragged(generator, name, rounds):
     lengths = torch.randint(1, 16, (rounds,), generator=generator)
     padded = rounds_of(anything, generator, rounds, name, lengths)
     return padded.select_rounds(slice(None))  # without padding that no round needs
+
+
+def untrained(domain, people=("a",), seed=0):
+    """Networks of SQIL that nobody trained: of any outputs, blind to their inputs."""
+    generators = [torch.Generator().manual_seed(seed + place) for place in range(len(people))]
+    weights = initial_weights(domain, 48, (32, 32, 32), generators)
+    for own, generator in zip(weights["output_bias"], generators, strict=True):
+        own.copy_(torch.randn(own.shape, generator=generator))
+    return SoftQ(domain, people, "setting", weights)

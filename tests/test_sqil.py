@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from example_rounds import alternate, anything, avoid, ragged, rounds_of
+from example_rounds import alternate, anything, avoid, ragged, rounds_of, untrained
 
-from mirror_ppl.baselines import SoftQ, SoftQOptions, fit_soft_q, held_out_nll, input_size
-from mirror_ppl.baselines.recurrent import initial_weights
+from mirror_ppl.baselines import SoftQOptions, fit_soft_q, held_out_nll, input_size
 from mirror_ppl.baselines.sqil import squared_errors
 from mirror_ppl.data import concatenate
 from mirror_ppl.domains import get_domain
@@ -15,14 +14,6 @@ from mirror_ppl.domains.driving import SWITCH
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
 
 BRIEF = SoftQOptions(epochs=6, sampled=3)
-
-
-def fresh(domain, people=("a",), seed=0):
-    generators = [torch.Generator().manual_seed(seed + place) for place in range(len(people))]
-    weights = initial_weights(domain, 48, (32, 32, 32), generators)
-    for own, generator in zip(weights["output_bias"], generators, strict=True):
-        own.copy_(torch.randn(own.shape, generator=generator))
-    return SoftQ(domain, people, "setting", weights)
 
 
 class HandSet:
@@ -63,7 +54,7 @@ def test_solves_a_task_that_it_must(rule, generator):
 @pytest.mark.parametrize("name", ["driving", "search_rescue", "bomb_defusal"])
 def test_played_rounds_are_of_the_domain_and_of_the_networks(name):
     domain = get_domain(name)
-    networks = fresh(domain, ("a", "b"))
+    networks = untrained(domain, ("a", "b"))
     generators = [torch.Generator().manual_seed(5), torch.Generator().manual_seed(6)]
     inputs, actions = networks.play(domain.settings[-1], 3, generators)
     assert inputs.shape == (2, 3, domain.horizon, input_size(domain))

@@ -5,6 +5,7 @@ from mirror_ppl.baselines.behaviour_cloning import (
     BehaviourCloneOptions,
     fit_behaviour_clone,
 )
+from mirror_ppl.baselines.person import NetworkPerson
 from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, input_size, network_inputs
 from mirror_ppl.baselines.sqil import SoftQ, SoftQOptions, fit_soft_q
 from mirror_ppl.baselines.training import held_out_nll
@@ -13,6 +14,7 @@ __all__ = [
     "SIGHTS",
     "BehaviourClone",
     "BehaviourCloneOptions",
+    "NetworkPerson",
     "RecurrentNetworks",
     "SoftQ",
     "SoftQOptions",

@@ -138,7 +138,7 @@ class Person:
         first, seen = distinct_rows(view.numbers())
         observation, _, actions = _history(past, len(first))
         belief = self.human.believe(view.map(lambda part: part[first]), observation, actions)
-        values = self.human.self_model.action_values(belief)
+        values = self.human.action_values(belief)
         with self._conditioned():
             found = self.human.act(self.implants, belief[None], values[None])
         found = found.expand(self.number, *found.shape[1:])[:, 0]
@@ -328,7 +328,7 @@ class StepwiseBeliefs:
         human, eyes = person.human, torch.arange(person.eye_count, device=person.eye.device)
         knowledge = human.domain.nothing_known(1, device=eyes.device)
         if past.time == 0:
-            zero = next(human.parameters()).new_zeros(1, human.self_model.latent)
+            zero = next(human.parameters()).new_zeros(1, human.belief_size)
             beliefs = cls(person, Gaussian(zero, torch.ones_like(zero)), knowledge, 0)
             return beliefs, torch.zeros_like(eyes)
         views = []

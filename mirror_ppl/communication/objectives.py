@@ -201,7 +201,7 @@ class _Tree:
         self.beliefs, index = self.beliefs.after(looks)
         self.belief = index[look]
         courses = self.beliefs.courses
-        values = self.person.human.self_model.action_values(courses)
+        values = self.person.human.action_values(courses)
         # Courses of a draw share its policy implants: one row a draw, padded to the longest.
         counts = torch.bincount(self.draw, minlength=self.person.number)
         begin = counts.cumsum(0) - counts

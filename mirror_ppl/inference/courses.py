@@ -42,7 +42,7 @@ def beliefs_and_values(
             part = view.map(lambda value: value[some])  # noqa: B023 - used at once
             parts.append(human.believe(part, observation, actions))
         belief = torch.cat(parts)[of, step]
-    values = [human.self_model.action_values(part) for part in belief.split(CHUNK)]
+    values = [human.action_values(part) for part in belief.split(CHUNK)]
     return belief, torch.cat(values), node
 
 
@@ -67,7 +67,7 @@ def _step_by_step(
     )[which]
     none = actions.new_full((1,), len(human.domain.actions))
     before = torch.cat([none, actions[0]])
-    belief = evidence.new_zeros(len(of), human.self_model.latent)
+    belief = evidence.new_zeros(len(of), human.belief_size)
     for time in range(node.shape[1]):
         (now,) = (step == time).nonzero(as_tuple=True)
         for some in now.split(CHUNK):

@@ -43,8 +43,8 @@ def sample_sites(
         stack.enter_context(pyro.plate("person", people, dim=-2))
         implants = human.prior()
         # One made-up belief is enough for the sites that act() may add.
-        belief = next(human.parameters()).new_zeros(people, 1, 1, human.self_model.latent)
-        human.act(implants, belief, human.self_model.action_values(belief))
+        belief = next(human.parameters()).new_zeros(people, 1, 1, human.belief_size)
+        human.act(implants, belief, human.action_values(belief))
     nodes = trace.trace.nodes
     latent = latent_sites(trace.trace)
     return {name: nodes[name] for name in nodes if name in latent or name in given}

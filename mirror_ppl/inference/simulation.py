@@ -125,7 +125,7 @@ class _Stepwise:
         people, rounds, _ = actions.shape
         self.knowledge = human.domain.nothing_known(people, rounds, device=actions.device)
         like = next(human.parameters())
-        self.belief = like.new_zeros(people, rounds, human.self_model.latent)
+        self.belief = like.new_zeros(people, rounds, human.belief_size)
         self.last = torch.full_like(actions[..., 0], len(human.domain.actions))
 
     def act(self, implants: Implants, observed: list[Observation], step: int) -> Tensor:
@@ -137,7 +137,7 @@ class _Stepwise:
         evidence = human.evidence(view, now)
         self.belief = human.advance(self.belief, evidence, last, view.still).mean
         belief = self.belief[..., None, :]
-        return human.act(implants, belief, human.self_model.action_values(belief))[..., 0, :]
+        return human.act(implants, belief, human.action_values(belief))[..., 0, :]
 
 
 class _Courses:
@@ -154,5 +154,5 @@ class _Courses:
         observation = {name: torch.stack([one[name] for one in shown], 2) for name in shown[0]}
         view = human.perceive(implants, observation, self.told)
         belief = human.believe(view, observation, self.actions)
-        values = human.self_model.action_values(belief)
+        values = human.action_values(belief)
         return human.act(implants, belief, values)[..., step, :]

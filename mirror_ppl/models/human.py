@@ -153,6 +153,15 @@ class HumanModel(nn.Module):
         """The domain that people act in."""
         return self.self_model.domain
 
+    @property
+    def belief_size(self) -> int:
+        """Z, the size of beliefs."""
+        return self.self_model.latent
+
+    def action_values(self, belief: Tensor) -> Tensor:
+        """Action values ``[..., A]`` at beliefs ``[..., Z]``, which :meth:`act` gets to read."""
+        return self.self_model.action_values(belief)
+
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person; runs inside ``pyro.plate("person", P, dim=-2)``.
 

@@ -127,7 +127,7 @@ def check_contract(human: HumanModel) -> None:
             method = "believe"
             belief = human.believe(view, observation, done)[:, None]
             method = "act"
-            values = human.self_model.action_values(belief)
+            values = human.action_values(belief)
             log_probabilities = human.act(implants, belief, values)
             expected = (people, 1, steps, actions)
             if tuple(log_probabilities.shape[-4:]) != expected:

@@ -1,0 +1,145 @@
+"""A recurrent baseline in the place of the human model, for the same communicator.
+
+What the network remembers is the person's belief, and what it says of actions their values::
+
+    zH_t = h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])
+    v_t  = what the setting lets an unaided person see, or what they are told
+    a_t ~ Categorical(softmax(y(h_t)))
+
+There is nothing to infer any more: training made a point estimate of the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from mirror_ppl.baselines.recurrent import RecurrentNetworks, network_inputs
+from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.human import HumanModel, Implants, View
+from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.models.self_model import SelfModel
+
+NETWORK = "network"
+"""Name of the only site: which network it is, of one."""
+
+
+class NetworkPerson(HumanModel):
+    """A person as a trained network has them.
+
+    Args:
+        self_model: the robot's; it has no part in what the person does.
+        networks: of one person, P = 1.
+        setting: which lets them see what they see by themselves.
+        world: as the robot knows it and plans in; that of the self-model unless given.
+
+    Raises:
+        HumanModelError: the networks are of several people, or of another domain.
+    """
+
+    stepwise = True
+
+    def __init__(
+        self,
+        self_model: SelfModel,
+        networks: RecurrentNetworks,
+        setting: str,
+        world: Domain | None = None,
+    ) -> None:
+        super().__init__(self_model)
+        if len(networks.people) != 1:
+            raise HumanModelError(
+                f"networks of {len(networks.people)} people, expected those of one"
+            )
+        if networks.domain.name != self_model.domain.name:
+            raise HumanModelError(
+                f"networks of {networks.domain.name}, expected {self_model.domain.name}"
+            )
+        self.networks = networks
+        self.setting = setting
+        self.world = world
+
+    @property
+    def belief_size(self) -> int:
+        """H, the number of the GRU's units."""
+        return self.networks.hidden
+
+    def prior(self) -> dict[str, Tensor]:
+        """Which network it is: there is but one."""
+        like = next(self.self_model.parameters())
+        return {NETWORK: pyro.sample(NETWORK, dist.Categorical(like.new_ones(1)))}
+
+    def draws(self, number: int) -> dict[str, Tensor]:
+        """As many draws of the posterior, ``[S, 1, 1]``, which are all the same."""
+        return {NETWORK: torch.zeros(number, 1, 1, dtype=torch.long)}
+
+    def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
+        """The world that was given, or that of the self-model."""
+        del draws
+        return self.domain if self.world is None else self.world
+
+    def look(
+        self,
+        implants: Implants,
+        knowledge: Any,
+        observation: Observation,
+        told: Visibility,
+        step: int,
+    ) -> tuple[View, Any]:
+        """What the setting shows and what is told; whatever follows is left to the network."""
+        del implants, step
+        seen = self.networks.visible(self.setting, observation)
+        return View({name: mask | told[name] for name, mask in seen.items()}), knowledge
+
+    def evidence(self, view: View, observation: Observation) -> Tensor:
+        """What networks read at each step, ``[..., I]``, without the action before."""
+        none = torch.full(observation["ego"].shape[:-1], self._none, dtype=torch.long)
+        none = none.to(observation["ego"].device)
+        inputs = network_inputs(self.domain, observation, view.visible, none)
+        return inputs[..., : -(self._none + 1)]
+
+    def advance(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
+    ) -> Gaussian:
+        """One step of the GRU; its state has no spread."""
+        del still
+        shape = belief.shape
+        inputs = torch.cat([evidence, one_hot(action, self._none + 1).to(evidence)], -1)
+        inputs = inputs.expand(*shape[:-1], -1)
+        after = self.networks.step(belief.reshape(1, -1, shape[-1]), inputs.flatten(0, -2)[None])
+        mean = after.view(shape)
+        return Gaussian(mean, torch.zeros_like(mean))
+
+    def believe(self, view: View, observation: Observation, actions: Tensor) -> Tensor:
+        """States of the GRU ``[..., T, H]`` along views of rounds."""
+        evidence = self.evidence(view, observation)
+        previous = torch.nn.functional.pad(actions[..., :-1], [1, 0], value=self._none)
+        previous = previous.expand(evidence.shape[:-1])
+        belief = evidence.new_zeros(*evidence.shape[:-2], self.belief_size)
+        states = []
+        for now, done in zip(evidence.unbind(-2), previous.unbind(-1), strict=True):
+            belief = self.advance(belief, now, done).mean
+            states.append(belief)
+        return torch.stack(states, -2)
+
+    def action_values(self, belief: Tensor) -> Tensor:
+        """What the network says of actions, ``[..., A]``."""
+        found = self.networks.outputs(belief.reshape(1, -1, belief.shape[-1]))
+        return found.view(*belief.shape[:-1], -1)
+
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """Log-probabilities of actions ``[..., T, A]``."""
+        del implants, belief
+        return values.log_softmax(-1)
+
+    @property
+    def _none(self) -> int:
+        """A, which stands for no action."""
+        return len(self.domain.actions)
