@@ -51,6 +51,32 @@ def network_inputs(
     return torch.cat(parts, -1)
 
 
+def visible_items(
+    domain: Domain, sight: Sight, setting: str, observation: Observation
+) -> Visibility:
+    """Which items a setting lets a baseline read, ``[..., K]`` for each modality."""
+    visible = domain.visibility(setting, observation)
+    if sight == "everything":
+        visible = visible | {"visual": torch.ones_like(visible["visual"])}
+    return visible
+
+
+def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations) -> Tensor:
+    """What a baseline reads at each step of recorded rounds, ``[P, B, T, I]``."""
+    observation = demonstrations.observation()
+    steps = demonstrations.shape[2]
+    visible = {
+        name: mask[:, :, :steps] | demonstrations.told[name]
+        for name, mask in visible_items(domain, sight, demonstrations.setting, observation).items()
+    }
+    observation = {name: value[:, :, :steps] for name, value in observation.items()}
+    actions = demonstrations.actions
+    none = torch.full_like(actions[:, :, :1], len(domain.actions))
+    # Padding has the action -1, which is nobody's business but has to have a symbol.
+    previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
+    return network_inputs(domain, observation, visible, previous)
+
+
 def input_size(domain: Domain) -> int:
     """I, the number of inputs that `network_inputs` makes."""
     items = sum(len(m.items) * (domain.symbol_sizes[m.name] + 1) for m in domain.modalities)
@@ -88,25 +114,11 @@ class RecurrentNetworks(nn.Module):
 
     def visible(self, setting: str, observation: Observation) -> Visibility:
         """Which items a setting lets the networks read, ``[..., K]`` for each modality."""
-        visible = self.domain.visibility(setting, observation)
-        if self.sight == "everything":
-            visible = visible | {"visual": torch.ones_like(visible["visual"])}
-        return visible
+        return visible_items(self.domain, self.sight, setting, observation)
 
     def inputs(self, demonstrations: Demonstrations) -> Tensor:
         """What the networks read at each step of recorded rounds, ``[P, B, T, I]``."""
-        observation = demonstrations.observation()
-        steps = demonstrations.shape[2]
-        visible = {
-            name: mask[:, :, :steps] | demonstrations.told[name]
-            for name, mask in self.visible(demonstrations.setting, observation).items()
-        }
-        observation = {name: value[:, :, :steps] for name, value in observation.items()}
-        actions = demonstrations.actions
-        none = torch.full_like(actions[:, :, :1], len(self.domain.actions))
-        # Padding has the action -1, which is nobody's business but has to have a symbol.
-        previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
-        return network_inputs(self.domain, observation, visible, previous)
+        return recorded_inputs(self.domain, self.sight, demonstrations)
 
     def start(self, rounds: int) -> Tensor:
         """The hidden state before the first step of B rounds, ``[P, B, H]`` of zeros."""
