@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
@@ -19,7 +20,7 @@ from mirror_ppl.inference.amortized import AmortizedGuide
 from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.pooling import Pooling, Population
-from mirror_ppl.inference.prior import Draws, draw_prior
+from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.svi import Report, predict_actions, silent
 from mirror_ppl.inference.views import build_view_table
@@ -105,6 +106,27 @@ def check_world(demonstrations: Demonstrations) -> None:
             )
 
 
+def predict_rounds(
+    human: HumanModel, rounds: Demonstrations, draws: Mapping[str, Tensor]
+) -> Tensor:
+    """Log-probabilities ``[S, P, B, T, A]`` of actions, each given what was done before it.
+
+    Args:
+        human: the model of people.
+        rounds: of P people.
+        draws: of their implants ``[S, P, 1, ...]``.
+    """
+    sizes = {site: len(support) for site, support in perceived_sites(human).items()}
+    # Only what some draw sees is looked at: exact views, without screening or merging.
+    candidates = [
+        combination_number({site: draws[site][:, person, 0] for site in sizes}, sizes).unique()
+        for person in range(rounds.num_people)
+    ]
+    own = dict(draws)
+    table = build_view_table(human, rounds, candidates, likely=own, values=PREDICTED_VALUES)
+    return predict_actions(human, table, own)
+
+
 def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     human: HumanModel,
     demonstrations: Demonstrations,
@@ -145,24 +167,13 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         )
     posterior = infer(human, train, options, seed, network, report, run, population)
     prior = draw_prior(human, people, PRIOR_DRAWS, seed)
-    sizes = {site: len(support) for site, support in perceived_sites(human).items()}
-
-    def predicted(rounds: Demonstrations, draws: Draws) -> Tensor:
-        # Only what some draw sees is looked at: exact views, without screening or merging.
-        candidates = [
-            combination_number({site: draws[site][:, person, 0] for site in sizes}, sizes).unique()
-            for person in range(people)
-        ]
-        table = build_view_table(human, rounds, candidates, likely=draws, values=PREDICTED_VALUES)
-        return predict_actions(human, table, draws).cpu()
-
     report("predict", 0, 3, "")
-    log_probabilities = {"posterior": predicted(train, dict(posterior.draws))}
+    log_probabilities = {"posterior": predict_rounds(human, train, posterior.draws).cpu()}
     report("predict", 1, 3, "")
-    log_probabilities["prior"] = predicted(train, prior)
+    log_probabilities["prior"] = predict_rounds(human, train, prior).cpu()
     report("predict", 2, 3, "")
     if test is not None:
-        log_probabilities["test"] = predicted(test, dict(posterior.draws))
+        log_probabilities["test"] = predict_rounds(human, test, posterior.draws).cpu()
     report("predict", 3, 3, "")
 
     # Results live where everybody can read them.

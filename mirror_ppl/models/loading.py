@@ -16,14 +16,21 @@ from torch import Tensor
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.searcher import Searcher
+from mirror_ppl.models.searcher_variants import KnowingSearcher, PerceptualSearcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.variants import VARIANTS
 
 MIRROR = "mirror"
 """The package's own model; which it is depends on the domain."""
-OWN: Mapping[str, type[HumanModel]] = {"bomb_defusal": Searcher}
-"""The package's own model of domains that need another than `HumanModel`."""
+OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
+    "bomb_defusal": {
+        MIRROR: Searcher,
+        "perceptual-only": PerceptualSearcher,
+        "policy-only": KnowingSearcher,
+    }
+}
+"""What names in ``VARIANTS`` stand for in domains that need another model than `HumanModel`."""
 
 
 def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
@@ -37,10 +44,9 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
     Raises:
         HumanModelError: the file or class is missing, does not import, or is not a human model.
     """
-    if specification in (None, MIRROR):
-        return OWN.get(self_model.domain.name, HumanModel)(self_model)
-    if specification in VARIANTS:
-        return VARIANTS[specification](self_model)
+    named = {**VARIANTS, **OWN.get(self_model.domain.name, {})}
+    if specification is None or specification in named:
+        return named[specification or MIRROR](self_model)
     path_text, colon, name = specification.rpartition(":")
     if not colon or not name.isidentifier():
         raise HumanModelError(

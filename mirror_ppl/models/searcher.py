@@ -98,8 +98,16 @@ class Searcher(HumanModel):
 
     def prior(self) -> dict[str, Tensor]:
         """Sample how quick they are, whether they read the type, their rules and choices."""
-        domain, like = self.domain, next(self.self_model.parameters())
-        half = like.new_full((2,), 0.5)
+        like = next(self.self_model.parameters())
+        return (
+            self.perceptual_implants()
+            | self.rules()
+            | implant_priors.policy_implants(self.domain, self.self_model.latent, like)
+        )
+
+    def perceptual_implants(self) -> dict[str, Tensor]:
+        """Sample how quick they are at each terminal, and whether they read the type."""
+        like = next(self.self_model.parameters())
         success, failure = like.new_tensor(SEARCHING)
         quickness = pyro.sample(QUICKNESS, dist.Beta(success, failure))
         median, spread = like.new_tensor(EVEN)
@@ -107,14 +115,16 @@ class Searcher(HumanModel):
         alike = (evenness * quickness, evenness * (1 - quickness))
         return (
             {QUICKNESS: quickness, EVENNESS: evenness}
-            | implant_priors.notice_implants(domain, like, *alike)
-            | {READS: pyro.sample(READS, dist.Categorical(half))}
-            | {
-                RULE + kind: pyro.sample(RULE + kind, dist.Categorical(logits=logits))
-                for kind, logits in zip(self.kinds, self.rule_logits, strict=True)
-            }
-            | implant_priors.policy_implants(domain, self.self_model.latent, like)
+            | implant_priors.notice_implants(self.domain, like, *alike)
+            | {READS: pyro.sample(READS, dist.Categorical(like.new_full((2,), 0.5)))}
         )
+
+    def rules(self) -> dict[str, Tensor]:
+        """Sample which button they press for that of the robot, by type."""
+        return {
+            RULE + kind: pyro.sample(RULE + kind, dist.Categorical(logits=logits))
+            for kind, logits in zip(self.kinds, self.rule_logits, strict=True)
+        }
 
     def attend(self, implants: Implants) -> dict[str, Tensor]:
         """Sample the guess, and when they find what they look for at each stage."""
@@ -259,8 +269,12 @@ class Searcher(HumanModel):
     def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
         """The bomb by the rules that are likeliest to hold."""
         rules = []
-        for kind, row in zip(self.kinds, self.domain.as_believed.rules, strict=True):
-            likeliest = int(draws[RULE + kind].flatten().long().mode().values)
+        for kind, logits, row in zip(
+            self.kinds, self.rule_logits, self.domain.as_believed.rules, strict=True
+        ):
+            site = RULE + kind
+            own = draws[site].flatten().long().mode().values if site in draws else logits.argmax()
+            likeliest = int(own)
             pressed = self.exchanges[likeliest].argmax(0)  # by the button that the robot would
             rules.append(tuple(int(pressed[button]) for button in row))
         return BombDefusal(tuple(rules))

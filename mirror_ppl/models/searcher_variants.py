@@ -1,0 +1,54 @@
+"""Variants of the model of bomb defusal, with parts left out to compare with."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.human import HumanModel, Implants, View
+from mirror_ppl.models.searcher import Searcher
+
+
+class PerceptualSearcher(Searcher):
+    """Searches and guesses, but decides as the robot does: by its rules, without a residual."""
+
+    stepwise = True
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample how quick they are, whether they read the type, and how strictly they choose."""
+        like = next(self.self_model.parameters())
+        return self.perceptual_implants() | implant_priors.choice_implants(like)
+
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """Choose as the robot would."""
+        return HumanModel.act(self, implants, belief, values)
+
+
+class KnowingSearcher(Searcher):
+    """Knows the rules, and sees all that there is at once: nothing is left to be searched."""
+
+    stepwise = True
+    attend = HumanModel.attend
+    facts = HumanModel.facts
+    explanations = HumanModel.explanations
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample their rules, and how they decide."""
+        like = next(self.self_model.parameters())
+        return self.rules() | implant_priors.policy_implants(
+            self.domain, self.self_model.latent, like
+        )
+
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
+        """Everything."""
+        del implants, step
+        return {
+            m.name: torch.ones(observation[m.name].shape[:-1], dtype=torch.bool)
+            for m in self.domain.modalities
+        }
+
+    def look(self, implants, knowledge, observation, told, step) -> tuple[View, object]:
+        """As everywhere; there is nothing to guess."""
+        return HumanModel.look(self, implants, knowledge, observation, told, step)
