@@ -5,6 +5,7 @@ from mirror_ppl.baselines.behaviour_cloning import (
     BehaviourCloneOptions,
     fit_behaviour_clone,
 )
+from mirror_ppl.baselines.logistic import LogisticOptions, PooledLogistic, fit_pooled_logistic
 from mirror_ppl.baselines.person import NetworkPerson
 from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, input_size, network_inputs
 from mirror_ppl.baselines.sqil import SoftQ, SoftQOptions, fit_soft_q
@@ -14,11 +15,14 @@ __all__ = [
     "SIGHTS",
     "BehaviourClone",
     "BehaviourCloneOptions",
+    "LogisticOptions",
     "NetworkPerson",
+    "PooledLogistic",
     "RecurrentNetworks",
     "SoftQ",
     "SoftQOptions",
     "fit_behaviour_clone",
+    "fit_pooled_logistic",
     "fit_soft_q",
     "held_out_nll",
     "input_size",

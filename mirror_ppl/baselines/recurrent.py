@@ -173,12 +173,18 @@ class RecurrentNetworks(nn.Module):
             )
         if demonstrations.people == self.people:
             return self
-        index = [
-            self.people.index(require_known(person, "person", self.people))
-            for person in demonstrations.people
-        ]
-        weights = {name: value[index] for name, value in self.weights.items()}
-        return type(self)(self.domain, demonstrations.people, self.sight, weights)
+        return self.only(
+            *(
+                self.people.index(require_known(person, "person", self.people))
+                for person in demonstrations.people
+            )
+        )
+
+    def only(self, *numbers: int) -> Self:
+        """The networks of the people of these numbers."""
+        weights = {name: value[list(numbers)] for name, value in self.weights.items()}
+        people = [self.people[number] for number in numbers]
+        return type(self)(self.domain, people, self.sight, weights)
 
     def _project(self, inputs: Tensor) -> Tensor:
         """The inputs' part ``[P, N, 3 H]`` of the gates, of ``inputs`` ``[P, N, I]``."""

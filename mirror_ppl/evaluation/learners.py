@@ -1,0 +1,238 @@
+"""Models of people that are compared: one interface for MIRROR, its parts, and its rivals.
+
+A learner gets rounds of people and their robot's self-model. What it learned predicts other rounds
+of the same people and, if it can be planned with, stands for a person in a communicator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.baselines import (
+    BehaviourCloneOptions,
+    NetworkPerson,
+    PooledLogistic,
+    RecurrentNetworks,
+    SoftQOptions,
+    fit_behaviour_clone,
+    fit_pooled_logistic,
+    fit_soft_q,
+)
+from mirror_ppl.communication.minds import Person
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains.base import Domain
+from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.inference.fitting import predict_rounds
+from mirror_ppl.inference.guide_file import network_for
+from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.pooling import Population
+from mirror_ppl.inference.summary import predictive
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.people import simulate
+
+TRAINING = 20
+"""Rounds that there are to learn from, the first ones."""
+VALIDATION, TEST = slice(20, 30), slice(30, 36)
+"""Rounds by which baselines stop their training, and held-out ones, as in the supplement."""
+RECORDED = 36
+OTHERS = 100_000
+"""Added to the seed of people to make others, from whom a population is learned."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Simulated people in whom learners are tried.
+
+    Attributes:
+        domain: the world.
+        setting: its setting.
+        population: of whom there are more.
+        people: how many, P.
+        seed: of the people and their rounds.
+    """
+
+    domain: str
+    setting: str
+    population: str
+    people: int
+    seed: int
+
+    def recordings(self, rounds: int = RECORDED, others: bool = False) -> Demonstrations:
+        """Rounds of these people, or of as many others of the population."""
+        seed = self.seed + OTHERS * others
+        return simulate(
+            self.domain, self.setting, self.population, self.people, rounds=rounds, seed=seed
+        )
+
+    @property
+    def self_model(self) -> SelfModel:
+        """The robot's, as it ships."""
+        return load_self_model(shipped_weights(self.domain), self.domain)[0]
+
+
+class Learned(Protocol):
+    """What was learned of P people."""
+
+    def log_predictive(self, rounds: Demonstrations) -> Tensor:
+        """Log-probabilities of actions in rounds of theirs, ``[P, B, T, A]``."""
+        ...
+
+
+class Plannable(Learned, Protocol):
+    """What was learned, with which messages can be planned."""
+
+    def person(self, number: int, draws: int) -> Person:
+        """One of the people, with so many draws."""
+        ...
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """A human model with posterior draws ``[S, P, 1, ...]`` of implants."""
+
+    human: HumanModel
+    draws: Mapping[str, Tensor]
+
+    def log_predictive(self, rounds: Demonstrations) -> Tensor:
+        """Of the mean over draws."""
+        return predictive(predict_rounds(self.human, rounds, self.draws))
+
+    def person(self, number: int, draws: int) -> Person:
+        """Draws from all over the posterior."""
+        first = next(iter(self.draws.values()))
+        some = torch.linspace(0, len(first) - 1, min(draws, len(first))).long()
+        own = {name: value[some, number : number + 1] for name, value in self.draws.items()}
+        return Person(self.human, own)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Networks of P people.
+
+    Attributes:
+        networks: theirs.
+        self_model: the robot's, for what it knows of the world.
+        setting: which lets people see what they see by themselves.
+        world: in which the robot plans, with what it learned of rewards.
+    """
+
+    networks: RecurrentNetworks
+    self_model: SelfModel
+    setting: str
+    world: Domain
+
+    def log_predictive(self, rounds: Demonstrations) -> Tensor:
+        """Of each person's network."""
+        return self.networks.log_probabilities(rounds)
+
+    def person(self, number: int, draws: int) -> Person:
+        """One of the networks; all draws are the same."""
+        own = self.networks.only(number)
+        human = NetworkPerson(self.self_model, own, self.setting, self.world)
+        return Person(human, human.draws(draws))
+
+
+@dataclass(frozen=True)
+class Regressed:
+    """Pooled logistic regression of P people."""
+
+    model: PooledLogistic
+
+    def log_predictive(self, rounds: Demonstrations) -> Tensor:
+        """Of each person's weights."""
+        return self.model.log_probabilities(rounds)
+
+
+Learn = Callable[[Group, int, int], Learned]
+"""Learns of a group from their first rounds, at least 1; and with a seed of everything random."""
+
+
+def _mirror(variant: str | None = None, guide: str = "exact", from_others: bool = False) -> Learn:
+    def learn(group: Group, rounds: int, seed: int) -> Posterior:
+        human = load_human_model(variant, group.self_model)
+        train = group.recordings().select_rounds(slice(rounds))
+        human.learn_world(train)
+        network = network_for(guide, None, human)
+        population = _population(group) if from_others else None
+        options = InferenceOptions(guide)
+        found = infer(human, train, options, seed, network, population=population)
+        return Posterior(human, found.draws)
+
+    return learn
+
+
+@cache
+def _population(group: Group) -> Population:
+    """Learned from others, of all their rounds."""
+    human = load_human_model(None, group.self_model)
+    rounds = group.recordings(TRAINING, others=True)
+    human.learn_world(rounds)
+    found = infer(human, rounds, InferenceOptions(pooling="partial"), group.seed)
+    assert found.population is not None
+    return found.population
+
+
+def _parts(group: Group, rounds: int) -> tuple[Demonstrations, Demonstrations]:
+    recordings = group.recordings()
+    return recordings.select_rounds(slice(rounds)), recordings.select_rounds(VALIDATION)
+
+
+def _trained(group: Group, train: Demonstrations, networks: RecurrentNetworks) -> Trained:
+    # What rewards tell of the world is nothing about people, so rivals get to know it, too.
+    human = load_human_model(None, group.self_model)
+    human.learn_world(train)
+    return Trained(networks, human.self_model, group.setting, human.known_world({}))
+
+
+def _behaviour_cloning(group: Group, rounds: int, seed: int) -> Trained:
+    parts = _parts(group, rounds)
+    return _trained(group, parts[0], fit_behaviour_clone(*parts, BehaviourCloneOptions(), seed))
+
+
+def _sqil(group: Group, rounds: int, seed: int) -> Trained:
+    parts = _parts(group, rounds)
+    return _trained(group, parts[0], fit_soft_q(*parts, SoftQOptions(), seed))
+
+
+def _logistic(group: Group, rounds: int, seed: int) -> Regressed:
+    del seed
+    return Regressed(fit_pooled_logistic(*_parts(group, rounds)))
+
+
+LEARNERS: dict[str, Learn] = {
+    "mirror": _mirror(),
+    "mirror-amortized": _mirror(guide="amortized"),
+    "mirror-svi": _mirror(guide="svi"),
+    "mirror-population": _mirror(from_others=True),
+    "perceptual-only": _mirror("perceptual-only"),
+    "policy-only": _mirror("policy-only"),
+    "no-implants": _mirror("no-implants"),
+    "bc": _behaviour_cloning,
+    "sqil": _sqil,
+    "logistic": _logistic,
+}
+"""Everything that can be compared, in the order in which it is shown. Guides are `exact` but for
+``mirror-amortized`` and ``mirror-svi``; ``mirror-population`` has a prior learned from others."""
+PLANNABLE = ("mirror", "bc", "sqil")
+"""Of these what drives a communicator in the comparison of assistance."""
+
+
+def learn(name: str, group: Group, rounds: int, seed: int) -> Learned:
+    """What a learner makes of the first rounds of a group.
+
+    Raises:
+        UnknownNameError: there is no such learner.
+        AssetError: no trained guide ships for that domain.
+    """
+    if name not in LEARNERS:
+        raise UnknownNameError.of("model", name, tuple(LEARNERS))
+    return LEARNERS[name](group, rounds, seed)

@@ -1,0 +1,235 @@
+"""What a study shows: means, paired differences with intervals, and how often one is better.
+
+People are the sample: differences are taken person by person, intervals are of the bootstrap over
+people (of all seeds), and the probability of improvement is the share of people in whom the first
+of two does better, ties counting half (Agarwal et al., *Deep reinforcement learning at the edge of
+the statistical precipice*, 2021, with people in the place of runs).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from mirror_ppl.evaluation.sweep import Rows
+
+RESAMPLES = 2000
+LEVELS = (0.05, 0.95)
+FIRST = "mirror"
+RIVALS = ("bc", "sqil")
+"""With whom the paper compares MIRROR."""
+
+
+class Place(NamedTuple):
+    """Where people are compared."""
+
+    domain: str
+    setting: str
+    population: str
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over people, with its 90% interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Paired:
+    """How much better one does than another in the same people.
+
+    Attributes:
+        ahead: by how much; above 0 the first is better.
+        improvement: share of people in whom it is better.
+        people: how many.
+    """
+
+    ahead: Interval
+    improvement: Interval
+    people: int
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A model that learned from some rounds.
+
+    Attributes:
+        place: where.
+        model: its name.
+        rounds: how many; 0 if it learns nothing.
+        measured: the mean over people.
+        people: how many.
+        mirror: how far MIRROR with the same rounds is ahead; ``None`` where there is none.
+    """
+
+    place: Place
+    model: str
+    rounds: int
+    measured: Interval
+    people: int
+    mirror: Paired | None
+
+
+@dataclass(frozen=True)
+class Claim:
+    """MIRROR with the fewest rounds against a rival with the most."""
+
+    place: Place
+    rounds: int
+    rival: str
+    rival_rounds: int
+    paired: Paired
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of what a communicator told was relevant.
+
+    Attributes:
+        place: where.
+        model: what it planned with.
+        rounds: that this learned from.
+        modality: of what was told; ``all`` together.
+        items: how many were told.
+        share: of them that was relevant; ``None`` if nothing was told.
+    """
+
+    place: Place
+    model: str
+    rounds: int
+    modality: str
+    items: int
+    share: Interval | None
+
+
+def interval(values: np.ndarray) -> Interval:
+    """Of the mean of ``[n]`` people."""
+    low, high = np.quantile(values[_drawn(len(values))].mean(1), LEVELS)
+    return Interval(float(values.mean()), float(low), float(high))
+
+
+def paired(first: np.ndarray, second: np.ndarray) -> Paired:
+    """Compare gains ``[n]`` of the same people; more is better."""
+    difference = first - second
+    better = (difference > 0) + 0.5 * (difference == 0)
+    return Paired(interval(difference), interval(better), len(difference))
+
+
+def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[Standing]:
+    """How each model does at each number of rounds, and how far MIRROR is ahead of it.
+
+    Args:
+        rows: of a study.
+        measure: column that is compared.
+        sign: 1 if more is better, -1 if less is.
+    """
+    found = []
+    for (place, model, rounds), people in (values := _by_model(rows, measure)).items():
+        mirror = values.get((place, FIRST, rounds), {}) if model != FIRST else {}
+        own = np.array(list(people.values()))
+        ahead = _both(mirror, people, sign)
+        found.append(Standing(place, model, rounds, interval(own), len(own), ahead))
+    return found
+
+
+def few_against_many(
+    rows: Rows, measure: str, sign: int = 1, rivals: Iterable[str] = RIVALS
+) -> list[Claim]:
+    """MIRROR with the fewest rounds against its rivals with the most, where there are both."""
+    values = _by_model(rows, measure)
+    found = []
+    for place in dict.fromkeys(place for place, _, _ in values):
+        numbers = {
+            name: [rounds for where, model, rounds in values if (where, model) == (place, name)]
+            for name in (FIRST, *rivals)
+        }
+        for rival in rivals:
+            if not (numbers[FIRST] and numbers[rival]):
+                continue
+            few, many = min(numbers[FIRST]), max(numbers[rival])
+            ahead = _both(values[place, FIRST, few], values[place, rival, many], sign)
+            if ahead is not None:
+                found.append(Claim(place, few, rival, many, ahead))
+    return found
+
+
+def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]:
+    """Share of what was told that was relevant; the bootstrap draws people.
+
+    Args:
+        rows: of a study of assistance, of one domain.
+        notion: of relevance; columns are ``<notion>_<modality>`` and ``items_<modality>``.
+        modalities: by name.
+    """
+    found = []
+    for name in ("all", *modalities):
+        some = modalities if name == "all" else [name]
+        told, right = (
+            _by_model(
+                [row | {"sum": sum(row[f"{kind}_{one}"] for one in some)} for row in rows], "sum"
+            )
+            for kind in ("items", notion)
+        )
+        for (place, model, rounds), people in told.items():
+            items = np.array(list(people.values()))
+            good = np.array(list(right[place, model, rounds].values()))
+            share = None
+            if items.sum():
+                drawn = _drawn(len(items))
+                totals = items[drawn].sum(1)
+                shares = good[drawn].sum(1)[totals > 0] / totals[totals > 0]
+                low, high = np.quantile(shares, LEVELS)
+                share = Interval(float(good.sum() / items.sum()), float(low), float(high))
+            found.append(Share(place, model, rounds, name, int(items.sum()), share))
+    return found
+
+
+def floors(rows: Rows) -> dict[Place, float]:
+    """Mean entropy of people's own choices, where it is known of everybody."""
+    found = {}
+    for place in dict.fromkeys(_place(row) for row in rows):
+        own = {_who(row): row["floor"] for row in rows if _place(row) == place}
+        if None not in own.values():
+            found[place] = float(np.mean(list(own.values())))
+    return found
+
+
+def _by_model(
+    rows: Rows, measure: str
+) -> dict[tuple[Place, str, int], dict[tuple[int, str], float]]:
+    """Values of each person."""
+    found: dict[tuple[Place, str, int], dict[tuple[int, str], float]] = {}
+    for row in rows:
+        key = (_place(row), row["model"], row["rounds"])
+        found.setdefault(key, {})[_who(row)] = row[measure]
+    return found
+
+
+def _place(row: dict) -> Place:
+    return Place(row["domain"], row["setting"], row["population"])
+
+
+def _who(row: dict) -> tuple[int, str]:
+    return row["seed"], row["person"]
+
+
+def _both(
+    first: dict[tuple[int, str], float], second: dict[tuple[int, str], float], sign: int
+) -> Paired | None:
+    who = [one for one in first if one in second]
+    if not who:
+        return None
+    return paired(
+        sign * np.array([first[one] for one in who]), sign * np.array([second[one] for one in who])
+    )
+
+
+def _drawn(number: int) -> np.ndarray:
+    """Whom each resample is of, ``[RESAMPLES, n]``; always the same."""
+    return np.random.default_rng(0).integers(number, size=(RESAMPLES, number))

@@ -1,0 +1,167 @@
+"""Cells of work that run beside each other; a sweep that is stopped goes on where it was.
+
+A cell is a frozen dataclass of plain values, and its result a list of rows. The rows of each are a
+file of their own, named by what the cell is and what the work depends on. A cell that fails is
+reported, and tried again by the next run; the others are not lost.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Protocol, cast
+
+import torch
+
+from mirror_ppl.errors import OptionError
+from mirror_ppl.files import write_whole
+
+Rows = list[dict[str, Any]]
+"""A table of plain values."""
+
+
+class Cell(Protocol):
+    """A frozen dataclass of plain values."""
+
+    @property
+    def label(self) -> str:
+        """What it is, for people who wait."""
+        ...
+
+
+Report = Callable[[int, str], None]
+"""Told how many cells are done, and which was the last."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a cell.
+
+    Attributes:
+        cell: which it is.
+        rows: its result; none if it failed.
+        seconds: that it took, by the process that did it.
+        error: why it failed, and where.
+    """
+
+    cell: Cell
+    rows: Rows = field(default_factory=list)
+    seconds: float = 0.0
+    error: str | None = None
+
+
+def run_cells(
+    cells: Sequence[Cell],
+    work: Callable[[Any], Rows],
+    folder: Path,
+    identity: str,
+    jobs: int = -1,
+    scheduler: str | None = None,
+    report: Report = lambda done, message: None,
+) -> list[Outcome]:
+    """Do the work of every cell that is not done yet.
+
+    Args:
+        cells: in the order in which they are begun.
+        work: of one cell; a function of a module, which other processes can find.
+        folder: where rows of finished cells are kept; it is there.
+        identity: of everything that the work depends on and that is not in the cells.
+        jobs: processes on this machine; -1 for one a core.
+        scheduler: address of a Dask cluster that does the work instead.
+        report: told of progress.
+
+    Returns:
+        One outcome a cell, in their order.
+
+    Raises:
+        OptionError: the cluster's library is not installed, or it cannot be reached.
+    """
+    from joblib import Parallel, delayed
+
+    outcomes: dict[int, Outcome] = {}
+    names = [_name(cell, identity) for cell in cells]
+    for place, (cell, name) in enumerate(zip(cells, names, strict=True)):
+        kept = _kept(folder / name, cell)
+        if kept is not None:
+            outcomes[place] = kept
+    report(len(outcomes), f"{len(outcomes)} were there" if outcomes else "")
+    todo = [place for place in range(len(cells)) if place not in outcomes]
+    with ExitStack() as stack:
+        if scheduler is not None:
+            stack.enter_context(_cluster(scheduler))
+        # Processes that have used much memory are replaced by new ones; nothing is lost.
+        stack.enter_context(warnings.catch_warnings())
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
+        finished = Parallel(n_jobs=jobs, return_as="generator_unordered")(
+            delayed(_cell)(place, cells[place], work) for place in todo
+        )
+        for place, outcome in cast(Iterator[tuple[int, Outcome]], finished):
+            outcomes[place] = outcome
+            if outcome.error is None:
+                _keep(folder / names[place], outcome)
+            report(len(outcomes), outcome.cell.label + (" failed" if outcome.error else ""))
+    return [outcomes[place] for place in range(len(cells))]
+
+
+def _cell(place: int, cell: Cell, work: Callable[[Any], Rows]) -> tuple[int, Outcome]:
+    # One thread a process: the cores are shared by processes.
+    torch.set_num_threads(1)
+    began = perf_counter()
+    try:
+        rows = work(cell)
+    except Exception as error:  # noqa: BLE001 - whatever it is, the other cells go on
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(last.filename).name}, line {last.lineno}"
+        text = f"{type(error).__name__}: {error} ({where})"
+        return place, Outcome(cell, seconds=perf_counter() - began, error=text)
+    return place, Outcome(cell, rows, perf_counter() - began)
+
+
+def _cluster(address: str) -> ExitStack:
+    """A context in which joblib's work is done by the workers of a Dask scheduler."""
+    from joblib import parallel_config
+
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise OptionError(
+            "--scheduler needs Dask: pip install 'mirror_ppl[cluster]', here and on the workers"
+        ) from error
+    with ExitStack() as stack:
+        try:
+            client = stack.enter_context(Client(address, timeout="10s"))
+        except (OSError, ValueError) as error:
+            raise OptionError(f"--scheduler {address} cannot be reached: {error}") from error
+        stack.enter_context(parallel_config(backend="dask", client=client))
+        return stack.pop_all()
+
+
+def _name(cell: Cell, identity: str) -> str:
+    content = json.dumps([type(cell).__name__, asdict(cast(Any, cell)), identity], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:24] + ".json"
+
+
+def _keep(path: Path, outcome: Outcome) -> None:
+    content = {
+        "cell": asdict(cast(Any, outcome.cell)),
+        "seconds": outcome.seconds,
+        "rows": outcome.rows,
+    }
+    text = json.dumps(content, indent=1) + "\n"
+    write_whole(path, lambda temporary: temporary.write_text(text))
+
+
+def _kept(path: Path, cell: Cell) -> Outcome | None:
+    """What an earlier run left of a cell; what is damaged counts as missing."""
+    try:
+        content = json.loads(path.read_text())
+        return Outcome(cell, content["rows"], content["seconds"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,126 @@
+"""Learning curves, and what was told: the figures of `python -m mirror_ppl.evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mirror_ppl.evaluation.study_summary import Place, Share, Standing
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE
+
+GREEN, VERMILION, SKY = "#009E73", "#D55E00", "#56B4E9"
+STYLES: dict[str, tuple[str, str, str]] = {
+    "mirror": (BLUE, "-", "o"),
+    "mirror-amortized": (SKY, "-", "s"),
+    "mirror-svi": (SKY, "--", "D"),
+    "mirror-population": (BLUE, "--", "P"),
+    "mirror-kl": (SKY, "-", "s"),
+    "perceptual-only": (PURPLE, "-", "v"),
+    "policy-only": (PURPLE, "--", "^"),
+    "no-implants": (PURPLE, ":", "<"),
+    "bc": (ORANGE, "-", "X"),
+    "sqil": (VERMILION, "-", "X"),
+    "logistic": (GREEN, "-", "h"),
+    "none": (GREY, ":", ""),
+    "all": (GREY, "--", ""),
+    "oracle": (BLACK, "--", ""),
+}
+"""Colour, line and mark of each model."""
+OTHER = (GREY, "-", ".")
+WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
+"""Inches: of a panel, and of the legend."""
+
+
+def plot_curves(
+    standings: Sequence[Standing], label: str, floor: Mapping[Place, float] | None = None
+) -> Picture:
+    """Draw a measure against the number of rounds, one panel a place; bands are 90% intervals.
+
+    Args:
+        standings: of `summarize_study`; models that learn from 0 rounds are level lines.
+        label: what is measured.
+        floor: what cannot be surpassed, by place, if it is known.
+    """
+    places = list(dict.fromkeys(one.place for one in standings))
+    figure = Picture(figsize=(WIDTH * len(places) + LEGEND, HEIGHT), layout="constrained")
+    panels = figure.subplots(1, len(places), squeeze=False)[0]
+    for ax, place in zip(panels, places, strict=True):
+        here = [one for one in standings if one.place == place]
+        for model in dict.fromkeys(one.model for one in here):
+            own = [one for one in here if one.model == model]
+            _curve(ax, sorted(own, key=lambda one: one.rounds))
+        if floor is not None and place in floor:
+            ax.axhline(floor[place], color=BLACK, lw=1, ls=":", label="people's own entropy")
+        ticks = sorted({one.rounds for one in here} - {0})
+        ax.set_xscale("log")
+        ax.set_xticks(ticks, [str(number) for number in ticks])
+        ax.minorticks_off()
+        ax.set_xlabel("rounds learned from")
+        _title(ax, place)
+    panels[0].set_ylabel(label)
+    _legend(figure, panels)
+    return figure
+
+
+def _curve(ax: Axes, own: Sequence[Standing]) -> None:
+    model = own[0].model
+    colour, line, mark = STYLES.get(model, OTHER)
+    if own[-1].rounds == 0:
+        ax.axhline(own[0].measured.mean, color=colour, ls=line, lw=1.2, label=model)
+        return
+    rounds = [one.rounds for one in own]
+    mean = [one.measured.mean for one in own]
+    ax.plot(rounds, mean, color=colour, ls=line, marker=mark, ms=5, label=model)
+    low, high = [one.measured.low for one in own], [one.measured.high for one in own]
+    ax.fill_between(rounds, low, high, color=colour, alpha=0.12, lw=0)
+
+
+def plot_relevance(domains: Sequence[Sequence[Share]]) -> Picture:
+    """Draw which share of what was told was relevant, one panel a domain, after all rounds.
+
+    Args:
+        domains: of each what `relevance` found.
+    """
+    figure = Picture(figsize=(WIDTH * len(domains) + LEGEND, HEIGHT), layout="constrained")
+    panels = figure.subplots(1, len(domains), squeeze=False)[0]
+    for ax, shares in zip(panels, domains, strict=True):
+        most = max(one.rounds for one in shares)
+        last = [one for one in shares if one.rounds in (0, most)]
+        models = list(dict.fromkeys(one.model for one in last))
+        names = list(dict.fromkeys(one.modality for one in last))
+        width = 0.8 / len(models)
+        for one in last:
+            x = names.index(one.modality)
+            x += (models.index(one.model) - (len(models) - 1) / 2) * width
+            if one.share is None:
+                ax.text(x, 1, "nothing told", rotation=90, ha="center", va="bottom", fontsize=7)
+                continue
+            colour = STYLES.get(one.model, OTHER)[0]
+            label = one.model if one.modality == names[0] else None
+            ax.bar(x, 100 * one.share.mean, 0.9 * width, color=colour, label=label)
+            ax.plot([x, x], [100 * one.share.low, 100 * one.share.high], color=BLACK, lw=1)
+        ax.set_xticks(range(len(names)), names)
+        ax.set_ylim(0, 105)
+        _title(ax, shares[0].place)
+    panels[0].set_ylabel("relevant, % of the items told")
+    _legend(figure, panels)
+    return figure
+
+
+def _title(ax: Axes, place: Place) -> None:
+    ax.set_title(" ".join(place).replace("_", " "), fontsize=10)
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
+    """One for all panels, each name once."""
+    entries = {}
+    for ax in panels:
+        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(name, handle)
+    figure.legend(
+        list(entries.values()), list(entries), loc="outside right upper", frameon=False, fontsize=9
+    )
