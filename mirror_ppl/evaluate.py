@@ -318,14 +318,7 @@ def _print(title: str, caption: str, heads: Sequence[str], rows: Sequence[Sequen
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(
-        title=title,
-        caption=caption,
-        title_justify="left",
-        caption_justify="left",
-        box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-    )
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for place, head in enumerate(heads):
         table.add_column(head, justify="right" if place else "left")
     for row in rows:
@@ -333,7 +326,10 @@ def _print(title: str, caption: str, heads: Sequence[str], rows: Sequence[Sequen
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)
-    console.print(table)
+    # Not by the table, which would make them as narrow as it is.
+    console.print(title, style="italic", highlight=False)
+    console.print(table, end="")
+    console.print(f"({caption})\n", style="dim", highlight=False)
 
 
 if __name__ == "__main__":

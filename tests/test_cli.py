@@ -16,7 +16,7 @@ import xarray as xr
 from example_recordings import fields
 from running import command
 
-from mirror_ppl import __main__, assist, calibrate, fit, simulate, train
+from mirror_ppl import __main__, assist, calibrate, evaluate, fit, simulate, train
 from mirror_ppl.data import (
     Demonstrations,
     asset_path,
@@ -427,7 +427,7 @@ def test_simulate_writes_recordings_that_can_be_fitted(tmp_path, capsys):
     assert set(content(tmp_path / "out")) == RESULTS
 
 
-@pytest.mark.parametrize("module", [assist, calibrate, fit, train, simulate])
+@pytest.mark.parametrize("module", [assist, calibrate, evaluate, fit, train, simulate])
 def test_help_tells_every_option(module, capsys):
     assert command(module, "--help") == 0
     out = " ".join(capsys.readouterr().out.split())

@@ -15,7 +15,7 @@ import tyro
 from pyro import poutine
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
-from mirror_ppl import assist, console
+from mirror_ppl import assist, console, evaluate
 from mirror_ppl.__main__ import COMMANDS
 from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains import get_domain
@@ -109,6 +109,9 @@ def test_every_command_is_real(where, line):
     assert words[2].removeprefix("mirror_ppl.") in COMMANDS
     options = vars(tyro.cli(module.Options, args=words[3:]))
     # Whom to assist is told by the posterior, unless it is said; so is the setting of others.
+    if module is evaluate:
+        assert evaluate._cells(evaluate.Options(**options))
+        return
     domain = get_domain(options.get("domain") or "driving")
     assert options.get("setting") in (*domain.settings, None)
     unsaid = (None,) if module is assist else ()

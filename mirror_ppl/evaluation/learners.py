@@ -7,7 +7,7 @@ of the same people and, if it can be planned with, stands for a person in a comm
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Protocol
 
@@ -45,7 +45,7 @@ VALIDATION, TEST = slice(20, 30), slice(30, 36)
 """Rounds by which baselines stop their training, and held-out ones, as in the supplement."""
 RECORDED = 36
 OTHERS = 100_000
-"""Added to the seed of people to make others, from whom a population is learned."""
+"""Seed of the others from whom a population is learned."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,9 @@ class Group:
     people: int
     seed: int
 
-    def recordings(self, rounds: int = RECORDED, others: bool = False) -> Demonstrations:
-        """Rounds of these people, or of as many others of the population."""
-        seed = self.seed + OTHERS * others
-        return simulate(
-            self.domain, self.setting, self.population, self.people, rounds=rounds, seed=seed
-        )
+    def recordings(self, rounds: int = RECORDED) -> Demonstrations:
+        """Rounds of these people."""
+        return simulate(self.domain, self.setting, self.population, self.people, rounds, self.seed)
 
     @property
     def self_model(self) -> SelfModel:
@@ -162,7 +159,7 @@ def _mirror(variant: str | None = None, guide: str = "exact", from_others: bool 
         train = group.recordings().select_rounds(slice(rounds))
         human.learn_world(train)
         network = network_for(guide, None, human)
-        population = _population(group) if from_others else None
+        population = population_of(replace(group, seed=OTHERS)) if from_others else None
         options = InferenceOptions(guide)
         found = infer(human, train, options, seed, network, population=population)
         return Posterior(human, found.draws)
@@ -171,10 +168,10 @@ def _mirror(variant: str | None = None, guide: str = "exact", from_others: bool 
 
 
 @cache
-def _population(group: Group) -> Population:
-    """Learned from others, of all their rounds."""
+def population_of(group: Group) -> Population:
+    """The population that a group is from, as far as all their training rounds tell."""
     human = load_human_model(None, group.self_model)
-    rounds = group.recordings(TRAINING, others=True)
+    rounds = group.recordings(TRAINING)
     human.learn_world(rounds)
     found = infer(human, rounds, InferenceOptions(pooling="partial"), group.seed)
     assert found.population is not None

@@ -1,0 +1,289 @@
+"""The paper's comparisons: who learns what, what comes out, and what is refused."""
+
+import csv
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from running import command
+
+from mirror_ppl import evaluate
+from mirror_ppl.baselines import NetworkPerson
+from mirror_ppl.domains import DOMAINS, get_domain
+from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
+from mirror_ppl.evaluation import learners, study
+from mirror_ppl.evaluation.learners import LEARNERS, PLANNABLE, TEST, Group, learn
+from mirror_ppl.evaluation.study import SHARES, Assistance, Prediction, assist, predict, rounds_of
+from mirror_ppl.evaluation.study_summary import Interval, Place, Share, Standing
+from mirror_ppl.inference.fitting import fit_people
+from mirror_ppl.inference.guides import InferenceOptions, Inferred
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.plots.study import STYLES, plot_curves, plot_relevance
+
+FOG = Group("driving", "fog", "paper", 2, 0)
+QUICK = ("no-implants", "logistic", "bc")
+
+
+def worst(domain):
+    return get_domain(domain).settings[-1]
+
+
+# --- learners ---------------------------------------------------------------------------------
+
+
+def test_mirror_predicts_what_a_fit_predicts():
+    """The same draws of the same posterior, by the command's function and by the study's."""
+    human = load_human_model(None, FOG.self_model)
+    fit = fit_people(human, FOG.recordings(), InferenceOptions(), seed=3, train_rounds=2)
+    rows = predict(Prediction("driving", "fog", "paper", 2, 0, "mirror", (2,)))
+    assert [row["person"] for row in rows] == ["person-01", "person-02"]
+    found = learn("mirror", FOG, 2, 3)
+    test = FOG.recordings().select_rounds(TEST)
+    own = found.log_predictive(test).gather(-1, test.actions[..., None]).squeeze(-1)
+    for number, person in enumerate(fit.summary["people"]):
+        assert -own[number].mean().item() == pytest.approx(person["test"]["nll"], abs=1e-5)
+    assert {row["floor"] for row in rows} == {p["test"]["floor"] for p in fit.summary["people"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "domain"),
+    [
+        *(("perceptual-only", domain) for domain in DOMAINS),
+        *(("policy-only", domain) for domain in DOMAINS),
+        *(("no-implants", domain) for domain in DOMAINS),
+        *(("logistic", domain) for domain in DOMAINS),
+        *(("bc", domain) for domain in DOMAINS),
+        # Others take long, and share their code with these.
+        ("mirror-amortized", "driving"),
+        ("mirror-svi", "driving"),
+        ("sqil", "driving"),
+    ],
+)
+def test_everybody_learns_everywhere(name, domain):
+    """One person, one round: probabilities of all actions of held-out rounds."""
+    group = Group(domain, worst(domain), "paper", 1, 0)
+    test = group.recordings().select_rounds(slice(30, 31))
+    chances = learn(name, group, 1, 0).log_predictive(test).exp()
+    assert chances.shape == (*test.shape, len(get_domain(domain).actions))
+    torch.testing.assert_close(chances.sum(-1), torch.ones(test.shape), rtol=0, atol=1e-4)
+
+
+def test_a_population_is_learned_from_others(monkeypatch):
+    """Of the same setting and number, and the same for all seeds; then it is everybody's prior."""
+    asked = []
+
+    def spying(human, rounds, options, seed, network=None, population=None):
+        asked.append((rounds, options.pooling, population))
+        return Inferred({}, population="theirs")  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(learners, "infer", spying)
+    learners.population_of.cache_clear()
+    try:
+        for seed in (4, 5):
+            learn("mirror-population", replace(FOG, seed=seed), 3, 0)
+    finally:
+        learners.population_of.cache_clear()
+    (others, pooling, unknown), *own = asked
+    assert (pooling, unknown) == ("partial", None)
+    assert others.shape[:2] == (2, 20) and others.setting == "fog"
+    for (rounds, pooling, known), seed in zip(own, (4, 5), strict=True):
+        assert (pooling, known) == ("none", "theirs")
+        expected = replace(FOG, seed=seed).recordings().select_rounds(slice(3))
+        assert torch.equal(rounds.actions, expected.actions)
+        assert not torch.equal(others.actions[:, :3], rounds.actions)
+
+
+def test_rivals_know_what_rewards_tell_of_the_world():
+    """Recorded rewards say that the robot's rules are out of date; each planner gets to know it."""
+    group = Group("bomb_defusal", "unlabelled", "paper", 2, 0)
+    person = learn("bc", group, 20, 0).person(1, 3)  # pyright: ignore[reportAttributeAccessIssue]
+    assert isinstance(person.human, NetworkPerson)
+    assert person.human.networks.people == ("person-02",)
+    assert person.number == 3
+    world = person.human.known_world(person.draws)
+    assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
+    assert world.rules != OLD_RULES  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_shares_are_numbers_of_rounds():
+    assert [rounds_of(share) for share in SHARES] == [1, 1, 2, 5, 10, 20]
+
+
+# --- rows -------------------------------------------------------------------------------------
+
+
+def test_messages_are_counted_and_paid_for():
+    cell = Assistance("driving", "fog", "paper", 2, 0, "all", 0, 2, 4)
+    rows = assist(cell)
+    assert [row["person"] for row in rows] == ["person-01", "person-02"]
+    for row in rows:
+        assert row["net"] == pytest.approx(row["task"] - row["cost"])
+        # More than one car in each of 30 steps, shown and said.
+        assert row["items_visual"] > 30 and row["items_verbal"] > 30
+        for notion in ("collision_course", "closing"):
+            assert 0 < row[f"{notion}_visual"] <= row["items_visual"]
+    silent = assist(Assistance("driving", "fog", "paper", 2, 0, "none", 0, 2, 4))
+    assert all(row["cost"] == row["items_visual"] == row["items_verbal"] == 0 for row in silent)
+
+
+def test_mirror_speaks_in_two_ways_and_rivals_in_one(monkeypatch):
+    asked = []
+    real = study.speaker
+
+    def spying(name, listener, *rest):
+        asked.append((name, type(listener.person.human).__name__, listener.person.number))
+        return real("none", listener, *rest)
+
+    monkeypatch.setattr(study, "speaker", spying)
+    for model in ("mirror", "bc"):
+        rows = assist(Assistance("driving", "fog", "paper", 1, 0, model, 1, 1, 5))
+        expected = ["mirror", "mirror-kl"] if model == "mirror" else ["bc"]
+        assert [row["model"] for row in rows] == expected
+        assert {row["rounds"] for row in rows} == {1}
+    assert asked == [
+        ("mirror", "HumanModel", 5),
+        ("mirror-kl", "HumanModel", 5),
+        ("mirror", "NetworkPerson", 5),
+    ]
+
+
+# --- the command ------------------------------------------------------------------------------
+
+
+def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
+    args = ["prediction", "--setting", "fog", "--people", 2, "--seeds", 1, "--rounds", 2, 1]
+    args += ["--models", *QUICK, "--jobs", 1, "--out", tmp_path]
+    assert command(evaluate, *args) == 0
+    out, err = capsys.readouterr()
+    assert "driving, fog, paper: NLL of held-out actions" in out
+    assert "no-implants in driving, fog, seed 0" in err
+    with (tmp_path / "prediction.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(QUICK) * 2 * 2
+    assert {row["rounds"] for row in rows} == {"1", "2"}
+    content = json.loads((tmp_path / "prediction.json").read_text())
+    own = [float(row["nll"]) for row in rows if (row["model"], row["rounds"]) == ("bc", "2")]
+    (entry,) = (one for one in content["nll"] if (one["model"], one["rounds"]) == ("bc", 2))
+    assert entry["measured"]["mean"] == pytest.approx(sum(own) / 2)
+    assert content["failed"] == {}
+    assert set(content["seconds"]) == {f"{name} in driving, fog, seed 0" for name in QUICK}
+    assert (tmp_path / "prediction.png").stat().st_size > 10_000
+    # Again it does nothing, and says so.
+    assert command(evaluate, *args) == 0
+    assert "3 were there" in capsys.readouterr().err
+
+
+def test_what_fails_is_told_and_the_rest_is_shown(tmp_path, capsys, monkeypatch):
+    def broken(group, rounds, seed):
+        raise RuntimeError("this one cannot learn")
+
+    monkeypatch.setitem(LEARNERS, "bc", broken)
+    args = ["prediction", "--setting", "fog", "--people", 1, "--seeds", 1, "--rounds", 1]
+    args += ["--models", "no-implants", "bc", "--jobs", 1, "--out", tmp_path]
+    assert command(evaluate, *args) == 1
+    out = capsys.readouterr().out
+    assert "failed: bc in driving, fog, seed 0: RuntimeError: this one cannot learn" in out
+    content = json.loads((tmp_path / "prediction.json").read_text())
+    assert list(content["failed"]) == ["bc in driving, fog, seed 0"]
+    assert {one["model"] for one in content["nll"]} == {"no-implants"}
+
+
+def test_relevance_uses_what_assistance_played(tmp_path, capsys):
+    args = ["--people", 1, "--seeds", 1, "--rounds", 1, "--played", 1, "--draws", 2]
+    args += ["--models", "none", "all", "bc", "--jobs", 1, "--out", tmp_path]
+    assert command(evaluate, "assistance", *args) == 0
+    assert "net return of a round" in capsys.readouterr().out
+    assert command(evaluate, "relevance", *args) == 0
+    out, err = capsys.readouterr()
+    assert "3 were there" in err
+    assert "told items about collision course" in out
+    assert "nothing told" in out  # by none
+    content = json.loads((tmp_path / "relevance.json").read_text())["relevance"]
+    assert set(content) == {"driving: collision_course", "driving: closing"}
+    files = {path.name for path in tmp_path.iterdir()} - {"parts"}
+    for name in ("assistance", "relevance"):
+        files -= {f"{name}.csv", f"{name}.json", f"{name}.png"}
+    assert not files
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("prediction", "--domain", "drivin"), 'unknown domain "drivin"'),
+        (("prediction", "--models", "sqill"), 'unknown model "sqill"'),
+        (("assistance", "--models", "logistic"), 'unknown model "logistic"'),
+        (("prediction", "--setting", "smoke"), 'unknown setting "smoke"'),
+        (("prediction", "--population", "us"), 'unknown population "us"'),
+        (("prediction", "--rounds", "0", "5"), "--rounds must be from 1 to 20, not 0"),
+        (("prediction", "--rounds", "30"), "--rounds must be from 1 to 20, not 30"),
+        (("prediction", "--people", "0"), "--people must be at least 1, not 0"),
+        (("prediction", "--jobs", "0"), "--jobs must be at least 1, or -1 for all, not 0"),
+        (("prediction", "--scheduler", "nowhere"), "--scheduler nowhere cannot be reached"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(args, message, tmp_path, capsys):
+    assert command(evaluate, *args, "--out", tmp_path / "out") == 2
+    assert message in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
+def test_by_default_everything_is_compared():
+    cells = evaluate._cells(evaluate.Options("prediction", domain=DOMAINS))
+    for domain in DOMAINS:
+        own = [cell for cell in cells if cell.domain == domain]
+        assert {cell.setting for cell in own} == set(get_domain(domain).settings)
+        expected = set(LEARNERS) - (set() if domain == "driving" else {"mirror-amortized"})
+        assert {cell.model for cell in own} == expected
+        assert {cell.seed for cell in own} == set(range(5))
+        assert len(own) == len(set(own))
+    cells = evaluate._cells(evaluate.Options("assistance", domain=DOMAINS))
+    assert {cell.setting for cell in cells} == {worst(domain) for domain in DOMAINS}
+    assert {cell.model for cell in cells} == {*PLANNABLE, "none", "all", "oracle"}
+    # Relevance is of what assistance plays, after the most rounds.
+    told = evaluate._cells(evaluate.Options("relevance", domain=DOMAINS))
+    assert set(told) == {cell for cell in cells if cell.rounds in (0, 20)}
+
+
+# --- pictures ---------------------------------------------------------------------------------
+
+
+def test_every_model_has_a_look_of_its_own():
+    models = {*LEARNERS, "mirror-kl", "none", "all", "oracle"}
+    assert models == set(STYLES)
+    assert len({STYLES[name] for name in LEARNERS}) == len(LEARNERS)
+
+
+def standing(model, rounds, mean, place=Place("driving", "fog", "paper")):  # noqa: B008
+    return Standing(place, model, rounds, Interval(mean, mean - 0.1, mean + 0.1), 3, None)
+
+
+def test_curves_have_a_panel_for_each_place_and_level_lines():
+    clear = Place("driving", "clear", "paper")
+    standings = [standing("mirror", 20, 0.1), standing("mirror", 1, 0.3), standing("none", 0, 0.5)]
+    picture = plot_curves([*standings, standing("bc", 1, 0.4, clear)], "NLL", {clear: 0.05})
+    fog, other = picture.axes
+    curve, level = fog.lines
+    assert list(curve.get_xdata()) == [1, 20] and list(curve.get_ydata()) == [0.3, 0.1]
+    assert set(level.get_ydata()) == {0.5}
+    assert [fog.get_title(), other.get_title()] == ["driving fog paper", "driving clear paper"]
+    assert {line.get_label() for line in other.lines} == {"bc", "people's own entropy"}
+    (legend,) = picture.legends
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "mirror",
+        "none",
+        "bc",
+        "people's own entropy",
+    ]
+
+
+def test_bars_are_of_the_most_rounds_and_silence_is_told():
+    place = Place("driving", "fog", "paper")
+    shares = [
+        Share(place, "mirror", 1, "all", 5, Interval(0.9, 0.8, 1.0)),
+        Share(place, "mirror", 20, "all", 5, Interval(0.6, 0.5, 0.7)),
+        Share(place, "none", 0, "all", 0, None),
+    ]
+    (ax,) = plot_relevance([shares]).axes
+    (bar,) = ax.patches
+    assert bar.get_height() == pytest.approx(60)  # pyright: ignore[reportAttributeAccessIssue]
+    assert [text.get_text() for text in ax.texts] == ["nothing told"]
