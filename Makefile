@@ -19,7 +19,7 @@ STUDIES ?= $(patsubst benchmarks/%.py,%,$(sort $(wildcard benchmarks/[a-z]*.py))
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo check test bench format clean
+.PHONY: help venv demo check test bench results format clean
 .DELETE_ON_ERROR:
 
 help: ## List these commands
@@ -53,6 +53,12 @@ test: $(STAMP) ## The whole test suite
 bench: $(STAMP) ## Every study in benchmarks/, one after the other
 	@set -e; for study in $(STUDIES); do \
 		echo "== $$study"; $(BIN)/python -m benchmarks.$$study; \
+	done
+
+results: $(STAMP) ## The paper's comparisons in all domains; hours; results in runs/results
+	for study in prediction assistance relevance; do \
+		$(BIN)/python -m mirror_ppl.evaluate $$study \
+			--domain driving search_rescue bomb_defusal --out runs/results || exit 1; \
 	done
 
 format: $(STAMP) ## Sort imports, apply safe fixes, format

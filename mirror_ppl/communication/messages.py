@@ -112,7 +112,8 @@ class Channels:
 def count_messages(allowed: Tensor, most: int | None = None) -> int:
     """How many messages :func:`every_message` makes."""
     number = int(allowed.sum())
-    return sum(math.comb(number, size) for size in range(1 + min(number, most or number)))
+    most = number if most is None else min(number, most)
+    return sum(math.comb(number, size) for size in range(1 + most))
 
 
 def every_message(allowed: Tensor, most: int | None = None) -> Tensor:

@@ -24,6 +24,7 @@ from mirror_ppl.baselines import (
     fit_pooled_logistic,
     fit_soft_q,
 )
+from mirror_ppl.baselines.recurrent import Sight
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Domain
@@ -190,14 +191,21 @@ def _trained(group: Group, train: Demonstrations, networks: RecurrentNetworks) -
     return Trained(networks, human.self_model, group.setting, human.known_world({}))
 
 
-def _behaviour_cloning(group: Group, rounds: int, seed: int) -> Trained:
-    parts = _parts(group, rounds)
-    return _trained(group, parts[0], fit_behaviour_clone(*parts, BehaviourCloneOptions(), seed))
+def _behaviour_cloning(sight: Sight) -> Learn:
+    def learn(group: Group, rounds: int, seed: int) -> Trained:
+        parts = _parts(group, rounds)
+        networks = fit_behaviour_clone(*parts, BehaviourCloneOptions(sight=sight), seed)
+        return _trained(group, parts[0], networks)
+
+    return learn
 
 
-def _sqil(group: Group, rounds: int, seed: int) -> Trained:
-    parts = _parts(group, rounds)
-    return _trained(group, parts[0], fit_soft_q(*parts, SoftQOptions(), seed))
+def _sqil(sight: Sight) -> Learn:
+    def learn(group: Group, rounds: int, seed: int) -> Trained:
+        parts = _parts(group, rounds)
+        return _trained(group, parts[0], fit_soft_q(*parts, SoftQOptions(sight=sight), seed))
+
+    return learn
 
 
 def _logistic(group: Group, rounds: int, seed: int) -> Regressed:
@@ -213,12 +221,16 @@ LEARNERS: dict[str, Learn] = {
     "perceptual-only": _mirror("perceptual-only"),
     "policy-only": _mirror("policy-only"),
     "no-implants": _mirror("no-implants"),
-    "bc": _behaviour_cloning,
-    "sqil": _sqil,
+    "bc": _behaviour_cloning("setting"),
+    "bc-everything": _behaviour_cloning("everything"),
+    "sqil": _sqil("setting"),
+    "sqil-everything": _sqil("everything"),
     "logistic": _logistic,
 }
 """Everything that can be compared, in the order in which it is shown. Guides are `exact` but for
-``mirror-amortized`` and ``mirror-svi``; ``mirror-population`` has a prior learned from others."""
+``mirror-amortized`` and ``mirror-svi``; ``mirror-population`` has a prior learned from others.
+Rivals are told what the setting lets people see, which MIRROR has to find out, but for those that
+read ``everything``, as the human model is given it."""
 PLANNABLE = ("mirror", "bc", "sqil")
 """Of these what drives a communicator in the comparison of assistance."""
 

@@ -19,7 +19,7 @@ from mirror_ppl.evaluation.sweep import Rows
 RESAMPLES = 2000
 LEVELS = (0.05, 0.95)
 FIRST = "mirror"
-RIVALS = ("bc", "sqil")
+RIVALS = ("bc", "bc-everything", "sqil", "sqil-everything")
 """With whom the paper compares MIRROR."""
 
 

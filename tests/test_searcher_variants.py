@@ -1,0 +1,99 @@
+"""Parts of the model of bomb defusal: what each leaves out, and what stays the same."""
+
+import pytest
+import torch
+from test_searcher import WORLD, course, implants
+
+from mirror_ppl.domains.bomb_panel import RULES
+from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.searcher import RULE, Searcher
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.people import simulate
+
+SEARCH = {"quickness", "evenness", "reads_type", *(f"notices_terminal {k}" for k in range(1, 7))}
+CHOICE = {"consistency", "lapse"}
+RESIDUAL = {"residual_in", "residual_out"}
+RULES_OF = {"rule_type_a", "rule_type_b"}
+
+
+@pytest.fixture(scope="module")
+def robot():
+    torch.manual_seed(0)
+    return SelfModel(WORLD)
+
+
+def variant(name, robot):
+    return load_human_model(name, robot)
+
+
+@pytest.mark.parametrize(
+    ("name", "sites", "attends"),
+    [
+        ("mirror", SEARCH | CHOICE | RESIDUAL | RULES_OF, True),
+        ("perceptual-only", SEARCH | CHOICE, True),
+        ("policy-only", CHOICE | RESIDUAL | RULES_OF, False),
+        ("no-implants", CHOICE, False),
+    ],
+)
+def test_the_sites_of_each(name, sites, attends, robot):
+    human = variant(name, robot)
+    check_contract(human)
+    assert set(sample_sites(human, 1, 1)) == sites
+    assert human.attends == attends and human.stepwise
+
+
+def test_perception_alone_is_mirror_with_the_robot_s_rules_and_no_residual(robot):
+    mirror, part = variant("mirror", robot), variant("perceptual-only", robot)
+    own = implants(mirror, consistency=4.0, lapse=0.1)
+    own |= {name: torch.zeros_like(own[name]) for name in (*RULES_OF, *RESIDUAL)}
+    sites = own | {f"found_{stage}": torch.tensor([[2 + stage]]) for stage in range(3)}
+    sites |= {"guess": torch.tensor([[1]])}
+    actions = torch.tensor([[0, 0, 0, 2, 0, 1, 3, 0]])
+    observation, _ = course(actions[0, :-1].tolist())
+    told = {"visual": torch.zeros(1, 8, 6).bool(), "verbal": torch.zeros(1, 8, 1).bool()}
+    told["verbal"][0, 5] = True
+    found = []
+    for human in (mirror, part):
+        view = human.perceive({name: sites[name][0] for name in sites}, observation, told)
+        belief = human.believe(view, observation, actions)
+        chosen = {name: own[name] for name in own if human is mirror or name in SEARCH | CHOICE}
+        found.append(human.act(chosen, belief[None], human.action_values(belief)[None]))
+    torch.testing.assert_close(*found)
+
+
+def test_policy_alone_sees_all_at_once_and_presses_by_the_rules(robot):
+    part, plain = variant("policy-only", robot), variant("no-implants", robot)
+    observation, _ = course([0, 1, 2])
+    told = {"visual": torch.zeros(1, 4, 6).bool(), "verbal": torch.zeros(1, 4, 1).bool()}
+    for human in (part, plain):
+        view = human.perceive({}, observation, told)
+        assert view.visible["visual"].all()
+    view = part.perceive({}, observation, told)
+    assert view.visible["verbal"].all() and not view.taken
+    belief = part.believe(view, observation, torch.zeros(1, 4, dtype=torch.long))[None]
+    values = part.action_values(belief)
+    own = {name: torch.zeros(1, 1) for name in RULES_OF}
+    own |= {"consistency": torch.full((1, 1), 3.0), "lapse": torch.full((1, 1), 0.1)}
+    torch.testing.assert_close(part.act(own, belief, values), plain.act(own, belief, values))
+    # Under a rule of both types the same as the whole model.
+    own |= {name: torch.full((1, 1), 7) for name in RULES_OF}
+    whole = variant("mirror", robot)
+    torch.testing.assert_close(part.act(own, belief, values), whole.act(own, belief, values))
+    assert not torch.equal(part.act(own, belief, values), plain.act(own, belief, values))
+
+
+def test_what_rewards_tell_of_the_world_needs_no_implant_of_it(robot):
+    human = variant("perceptual-only", robot)
+    assert isinstance(human, Searcher) and type(human) is not Searcher
+    human.learn_world(simulate("bomb_defusal", "labelled", "paper", 3, rounds=20, seed=0))
+    world = human.known_world({})
+    assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_draws_of_rules_go_before_what_was_learned(robot):
+    """Of the drawn permutation, not of the likeliest one."""
+    human = variant("mirror", robot)
+    other = torch.full((3, 1, 1), 5)
+    drawn = human.known_world({RULE + kind: other for kind in human.kinds})
+    assert drawn.rules != human.known_world({}).rules
