@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -27,6 +27,13 @@ net return of people who are spoken to by communicators that plan with each. rel
 of what those tell is relevant. Writes a table of every person (CSV), a summary (JSON) and a figure.
 A run that is stopped goes on where it was when the same command is given again; the exit status is
 1 if something failed."""
+CODE = (
+    *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
+    *(f"{name}/**/*.py" for name in ("inference", "models", "people")),
+    *(f"evaluation/{name}.py" for name in ("assistance", "learners", "oracle", "study")),
+    "evaluation/reachable_oracle.py",
+)
+"""Files whose change makes earlier results worthless."""
 FAILED = 1
 WIDTH = 100
 
@@ -103,7 +110,7 @@ def main(options: Options) -> int:
             cells,
             work,
             parts,
-            _identity(options.domain),
+            _identities(options.domain),
             options.jobs,
             options.scheduler,
             progress.update,
@@ -179,13 +186,21 @@ def _has_guide(domain: str) -> bool:
     return True
 
 
-def _identity(domains: Sequence[str]) -> str:
-    """Everything that results depend on besides what is asked for."""
-    from mirror_ppl import __version__
+def _identities(domains: Sequence[str]) -> Callable[[Any], str]:
+    """What results of a cell depend on besides what is asked for: the weights, and the code."""
+    import hashlib
+
     from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
 
-    weights = (load_self_model(shipped_weights(name), name)[0] for name in sorted(set(domains)))
-    return " ".join([__version__, *map(fingerprint, weights)])
+    digest, root = hashlib.sha256(), Path(__file__).parent
+    for part in CODE:
+        for path in sorted(root.glob(part)):
+            digest.update(path.read_bytes())
+    code = digest.hexdigest()
+    weights = {
+        name: fingerprint(load_self_model(shipped_weights(name), name)[0]) for name in {*domains}
+    }
+    return lambda cell: f"{code} {weights[cell.domain]}"
 
 
 def _write_table(path: Path, rows: Rows) -> None:

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -169,9 +170,13 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     assert content["failed"] == {}
     assert set(content["seconds"]) == {f"{name} in driving, fog, seed 0" for name in QUICK}
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
-    # Again it does nothing, and says so.
+    # Again it does nothing, and says so; of more models it does the others.
     assert command(evaluate, *args) == 0
-    assert "3 were there" in capsys.readouterr().err
+    assert "3/3 3 were there" in capsys.readouterr().err
+    args[args.index("logistic")] = "policy-only"
+    assert command(evaluate, *args) == 0
+    err = capsys.readouterr().err
+    assert "policy-only in driving" in err and "no-implants in driving" not in err
 
 
 def test_what_fails_is_told_and_the_rest_is_shown(tmp_path, capsys, monkeypatch):
@@ -242,6 +247,16 @@ def test_by_default_everything_is_compared():
     # Relevance is of what assistance plays, after the most rounds.
     told = evaluate._cells(evaluate.Options("relevance", domain=DOMAINS))
     assert set(told) == {cell for cell in cells if cell.rounds in (0, 20)}
+
+
+def test_results_depend_on_the_code_that_made_them():
+    root = Path(evaluate.__file__).parent
+    files = {path for part in evaluate.CODE for path in root.glob(part)}
+    for name in ("models/human.py", "evaluation/study.py", "domains/driving.py", "data/schema.py"):
+        assert root / name in files
+    for part in evaluate.CODE:
+        assert list(root.glob(part)), part
+    assert root / "plots/study.py" not in files
 
 
 # --- pictures ---------------------------------------------------------------------------------

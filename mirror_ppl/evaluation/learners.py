@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Protocol
 
 import torch
@@ -67,6 +67,7 @@ class Group:
     people: int
     seed: int
 
+    @lru_cache(maxsize=4)  # noqa: B019 - groups are values
     def recordings(self, rounds: int = RECORDED) -> Demonstrations:
         """Rounds of these people."""
         return simulate(self.domain, self.setting, self.population, self.people, rounds, self.seed)

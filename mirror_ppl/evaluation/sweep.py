@@ -61,7 +61,7 @@ def run_cells(
     cells: Sequence[Cell],
     work: Callable[[Any], Rows],
     folder: Path,
-    identity: str,
+    identity: Callable[[Any], str],
     jobs: int = -1,
     scheduler: str | None = None,
     report: Report = lambda done, message: None,
@@ -72,7 +72,7 @@ def run_cells(
         cells: in the order in which they are begun.
         work: of one cell; a function of a module, which other processes can find.
         folder: where rows of finished cells are kept; it is there.
-        identity: of everything that the work depends on and that is not in the cells.
+        identity: of everything that the work of a cell depends on and that is not in the cell.
         jobs: processes on this machine; -1 for one a core.
         scheduler: address of a Dask cluster that does the work instead.
         report: told of progress.
@@ -86,7 +86,7 @@ def run_cells(
     from joblib import Parallel, delayed
 
     outcomes: dict[int, Outcome] = {}
-    names = [_name(cell, identity) for cell in cells]
+    names = [_name(cell, identity(cell)) for cell in cells]
     for place, (cell, name) in enumerate(zip(cells, names, strict=True)):
         kept = _kept(folder / name, cell)
         if kept is not None:
