@@ -6,14 +6,15 @@ values. Sums over them, ``sum_m p(m | psi) f(m)``, are estimated from G values, 
 product ``q`` of one distribution for each site, and each is weighted by the inverse of the
 probability ``pi(m)`` with which it is among those drawn::
 
-    sum_m p(m | psi) f(m)  ~=  sum_g w_g f(m_g) / sum_g w_g,    w_g = p(m_g | psi) / pi(m_g)
+    sum_m p(m | psi) f(m)  ~=  sum_g w_g f(m_g),    w_g = p(m_g | psi) / pi(m_g)
 
-which is right in the limit whatever ``q`` is, and exact where there are no more combinations than
-are kept. Probable values are taken for certain and the improbable by systematic resampling
-(Fearnhead and Clifford, *On-line inference for hidden Markov models via particle filters*, 2003),
-site by site. Of the G values, those that could explain what was done are kept in the same way; the
-sum in the denominator, which needs no beliefs, is over all. ``pi`` is the product of the
-probabilities with which a value was kept on the way.
+which is right on average whatever ``q`` is, and exact where there are no more combinations than are
+kept. Divided by ``sum_g w_g`` it would not be: where ``q`` is what explains what was done, a
+``psi`` under which few of these values are probable would be favoured.
+
+Probable values are taken for certain and the improbable by systematic resampling (Fearnhead and
+Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by site. Of the G values, those that could explain what was done are kept in the same way.
+``pi`` is the product of the probabilities with which a value was kept on the way.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ class Attention:
 
         Args:
             likelihoods: of the recorded actions under each view.
-            log_weights: log-probability of each value, ``[..., P, B, G]``.
+            log_weights: of each value, see `HumanModel.log_attention`, ``[..., P, B, G]``.
         """
         shape = self.sights.shape[1:]
         views = self.sights.flatten(1).expand(*likelihoods.shape[:-1], -1)
@@ -96,7 +96,7 @@ class Attention:
         return torch.logsumexp(found + shares.gather(-2, rounds), -1)
 
     def shares(self, log_weights: Tensor) -> Tensor:
-        """Log-probabilities ``[..., P, B, G']`` of what is kept, of those of all values."""
+        """What each value that is kept stands for ``[..., P, B, G']``, of what each of all does."""
         kept = self.kept.expand(*log_weights.shape[:-1], -1)
         return log_weights.gather(-1, kept) - self.log_kept
 
