@@ -37,7 +37,7 @@ def test_mirror_predicts_what_a_fit_predicts():
     """The same draws of the same posterior, by the command's function and by the study's."""
     human = load_human_model(None, FOG.self_model)
     fit = fit_people(human, FOG.recordings(), InferenceOptions(), seed=3, train_rounds=2)
-    rows = predict(Prediction("driving", "fog", "paper", 2, 0, "mirror", (2,)))
+    rows = predict(Prediction(FOG, "mirror", (2,)))
     assert [row["person"] for row in rows] == ["person-01", "person-02"]
     found = learn("mirror", FOG, 2, 3)
     test = FOG.recordings().select_rounds(TEST)
@@ -115,7 +115,7 @@ def test_shares_are_numbers_of_rounds():
 
 
 def test_messages_are_counted_and_paid_for():
-    cell = Assistance("driving", "fog", "paper", 2, 0, "all", 0, 2, 4)
+    cell = Assistance(FOG, "all", 0, 2, 4)
     rows = assist(cell)
     assert [row["person"] for row in rows] == ["person-01", "person-02"]
     for row in rows:
@@ -124,7 +124,7 @@ def test_messages_are_counted_and_paid_for():
         assert row["items_visual"] > 30 and row["items_verbal"] > 30
         for notion in ("collision_course", "closing"):
             assert 0 < row[f"{notion}_visual"] <= row["items_visual"]
-    silent = assist(Assistance("driving", "fog", "paper", 2, 0, "none", 0, 2, 4))
+    silent = assist(Assistance(FOG, "none", 0, 2, 4))
     assert all(row["cost"] == row["items_visual"] == row["items_verbal"] == 0 for row in silent)
 
 
@@ -138,7 +138,7 @@ def test_mirror_speaks_in_two_ways_and_rivals_in_one(monkeypatch):
 
     monkeypatch.setattr(study, "speaker", spying)
     for model in ("mirror", "bc"):
-        rows = assist(Assistance("driving", "fog", "paper", 1, 0, model, 1, 1, 5))
+        rows = assist(Assistance(replace(FOG, people=1), model, 1, 1, 5))
         expected = ["mirror", "mirror-kl"] if model == "mirror" else ["bc"]
         assert [row["model"] for row in rows] == expected
         assert {row["rounds"] for row in rows} == {1}
@@ -235,14 +235,14 @@ def test_what_makes_no_sense_is_refused(args, message, tmp_path, capsys):
 def test_by_default_everything_is_compared():
     cells = evaluate._cells(evaluate.Options("prediction", domain=DOMAINS))
     for domain in DOMAINS:
-        own = [cell for cell in cells if cell.domain == domain]
-        assert {cell.setting for cell in own} == set(get_domain(domain).settings)
+        own = [cell for cell in cells if cell.group.domain == domain]
+        assert {cell.group.setting for cell in own} == set(get_domain(domain).settings)
         expected = set(LEARNERS) - (set() if domain == "driving" else {"mirror-amortized"})
         assert {cell.model for cell in own} == expected
-        assert {cell.seed for cell in own} == set(range(5))
+        assert {cell.group.seed for cell in own} == set(range(5))
         assert len(own) == len(set(own))
     cells = evaluate._cells(evaluate.Options("assistance", domain=DOMAINS))
-    assert {cell.setting for cell in cells} == {worst(domain) for domain in DOMAINS}
+    assert {cell.group.setting for cell in cells} == {worst(domain) for domain in DOMAINS}
     assert {cell.model for cell in cells} == {*PLANNABLE, "none", "all", "oracle"}
     # Relevance is of what assistance plays, after the most rounds.
     told = evaluate._cells(evaluate.Options("relevance", domain=DOMAINS))
@@ -251,10 +251,10 @@ def test_by_default_everything_is_compared():
 
 def test_results_depend_on_the_code_that_made_them():
     root = Path(evaluate.__file__).parent
-    files = {path for part in evaluate.CODE for path in root.glob(part)}
+    files = {path for part in study.CODE for path in root.glob(part)}
     for name in ("models/human.py", "evaluation/study.py", "domains/driving.py", "data/schema.py"):
         assert root / name in files
-    for part in evaluate.CODE:
+    for part in study.CODE:
         assert list(root.glob(part)), part
     assert root / "plots/study.py" not in files
 

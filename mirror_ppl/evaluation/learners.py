@@ -67,6 +67,9 @@ class Group:
     people: int
     seed: int
 
+    def __str__(self) -> str:
+        return f"{self.domain}, {self.setting}, seed {self.seed}"
+
     @lru_cache(maxsize=4)  # noqa: B019 - groups are values
     def recordings(self, rounds: int = RECORDED) -> Demonstrations:
         """Rounds of these people."""

@@ -5,16 +5,37 @@ Rows are tidy: one person, one model, one number of rounds in each.
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, cast
 
 from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
-from mirror_ppl.evaluation.learners import TEST, TRAINING, Group, Plannable, learn
+from mirror_ppl.evaluation.learners import (
+    LEARNERS,
+    PLANNABLE,
+    TEST,
+    TRAINING,
+    Group,
+    Plannable,
+    learn,
+)
 from mirror_ppl.evaluation.sweep import Rows
+from mirror_ppl.inference.guide_file import shipped_guide
 from mirror_ppl.inference.summary import score
+from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
 from mirror_ppl.people import draw_starts, simulated_people
 
+CODE = (
+    *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
+    *(f"{name}/**/*.py" for name in ("inference", "models", "people")),
+    *(f"evaluation/{name}.py" for name in ("assistance", "learners", "oracle", "study")),
+    "evaluation/reachable_oracle.py",
+)
+"""Files whose change makes earlier results worthless."""
 SHARES = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
 """Shares of the training rounds that are learned from; at least one round."""
 REFERENCES = ("none", "all", "oracle")
@@ -33,23 +54,19 @@ class Prediction:
     """A learner in a group, with several numbers of rounds.
 
     Attributes:
-        domain, setting, population, people, seed: the group.
+        group: the people.
         model: the learner.
         rounds: numbers of rounds that it learns from.
     """
 
-    domain: str
-    setting: str
-    population: str
-    people: int
-    seed: int
+    group: Group
     model: str
     rounds: tuple[int, ...]
 
     @property
     def label(self) -> str:
         """What it is, for people who wait."""
-        return f"{self.model} in {self.domain}, {self.setting}, seed {self.seed}"
+        return f"{self.model} in {self.group}"
 
 
 def predict(cell: Prediction) -> Rows:
@@ -58,14 +75,14 @@ def predict(cell: Prediction) -> Rows:
     Columns of their own: ``nll`` in nats an action, ``accuracy``, ``floor`` (the person's own
     entropy).
     """
-    group = _group(cell)
+    group = cell.group
     test = group.recordings().select_rounds(TEST)
     rows = []
     for number in cell.rounds:
-        learned = learn(cell.model, group, number, cell.seed)
+        learned = learn(cell.model, group, number, group.seed)
         found = score(learned.log_predictive(test)[None], test)
         rows += [
-            _row(cell, cell.model, number, person) | measured
+            _row(group, cell.model, number, person) | measured
             for person, measured in zip(test.people, found, strict=True)
             if measured is not None
         ]
@@ -77,18 +94,14 @@ class Assistance:
     """Communicators that plan with what a learner made of some rounds, or that learn nothing.
 
     Attributes:
-        domain, setting, population, people, seed: the group.
+        group: the people.
         model: the learner, or one of ``REFERENCES``.
         rounds: how many it learns from; 0 of references.
         played: rounds of each person in which they are spoken to.
         draws: posterior draws that are planned with.
     """
 
-    domain: str
-    setting: str
-    population: str
-    people: int
-    seed: int
+    group: Group
     model: str
     rounds: int
     played: int
@@ -98,7 +111,7 @@ class Assistance:
     def label(self) -> str:
         """What it is, for people who wait."""
         of = f" of {self.rounds} round{'s' * (self.rounds > 1)}" if self.rounds else ""
-        return f"{self.model}{of} in {self.domain}, {self.setting}, seed {self.seed}"
+        return f"{self.model}{of} in {self.group}"
 
 
 def assist(cell: Assistance) -> Rows:
@@ -108,31 +121,33 @@ def assist(cell: Assistance) -> Rows:
     rounds ``items`` of each modality, and how many were relevant by each notion. The rounds are the
     same for all communicators, and others than those that were learned from.
     """
-    group, domain = _group(cell), get_domain(cell.domain)
-    everybody = simulated_people(cell.domain, cell.setting, cell.population, cell.people, cell.seed)
+    group, domain = cell.group, get_domain(cell.group.domain)
+    everybody = simulated_people(
+        group.domain, group.setting, group.population, group.people, group.seed
+    )
     starts = draw_starts(
-        cell.people,
+        group.people,
         cell.played,
-        cell.seed,
+        group.seed,
         "assist",
-        cell.setting,
+        group.setting,
         domain=domain,
         fates=everybody.fates,
     )
     learned = None
     if cell.model not in REFERENCES:
-        learned = cast(Plannable, learn(cell.model, group, cell.rounds, cell.seed))
-    options, rows = PlannerOptions.of(cell.domain), []
-    for number in range(cell.people):
+        learned = cast(Plannable, learn(cell.model, group, cell.rounds, group.seed))
+    options, rows = PlannerOptions.of(group.domain), []
+    for number in range(group.people):
         start = starts.select(slice(number, number + 1))
-        listener = Listener(domain, cell.setting, everybody.select([number]), start)
+        listener = Listener(domain, group.setting, everybody.select([number]), start)
         if learned is not None:
             listener = replace(listener, person=learned.person(number, cell.draws))
         for objective in OBJECTIVES.get(cell.model, (cell.model,)):
             who = cell.model if objective == "mirror" else objective
-            played = play(listener, speaker(objective, listener, options, cell.seed + number))
+            played = play(listener, speaker(objective, listener, options, group.seed + number))
             rows.append(
-                _row(cell, who, cell.rounds, f"person-{number + 1:02d}")
+                _row(group, who, cell.rounds, f"person-{number + 1:02d}")
                 | {
                     "task": sum(played.task) / cell.played,
                     "cost": sum(played.cost) / cell.played,
@@ -149,16 +164,71 @@ def assist(cell: Assistance) -> Rows:
     return rows
 
 
-def _group(cell: Prediction | Assistance) -> Group:
-    return Group(cell.domain, cell.setting, cell.population, cell.people, cell.seed)
+def prediction_cells(
+    group: Group, models: Sequence[str], rounds: Sequence[int]
+) -> list[Prediction]:
+    """What is to be predicted of a group.
+
+    Args:
+        group: the people.
+        models: learners; all that can learn there unless given.
+        rounds: numbers of rounds that are learned from.
+
+    Raises:
+        UnknownNameError: there is no such learner.
+    """
+    guides = () if _has_guide(group.domain) else ("mirror-amortized",)
+    chosen = _known(models, tuple(LEARNERS)) or [name for name in LEARNERS if name not in guides]
+    return [Prediction(group, name, tuple(sorted({*rounds}))) for name in chosen]
 
 
-def _row(cell: Prediction | Assistance, model: str, rounds: int, person: str) -> dict[str, Any]:
+def assistance_cells(
+    group: Group, models: Sequence[str], rounds: Sequence[int], played: int, draws: int
+) -> list[Assistance]:
+    """Who is to speak to a group; arguments as above and of `Assistance`."""
+    every = (*PLANNABLE, *REFERENCES)
+    return [
+        Assistance(group, name, number, played, draws)
+        for name in _known(models, every) or every
+        for number in ((0,) if name in REFERENCES else sorted({*rounds}))
+    ]
+
+
+def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], str]:
+    """What results of a cell depend on besides the cell: the code, and the self-model's weights."""
+    digest, root = hashlib.sha256(), Path(__file__).parents[1]
+    for part in CODE:
+        for path in sorted(root.glob(part)):
+            digest.update(path.read_bytes())
+    code = digest.hexdigest()
+    weights = {
+        name: fingerprint(load_self_model(shipped_weights(name), name)[0]) for name in {*domains}
+    }
+    return lambda cell: f"{code} {weights[cell.group.domain]}"
+
+
+def _known(models: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Each of the models once, in the order in which they are shown."""
+    for name in models:
+        if name not in known:
+            raise UnknownNameError.of("model", name, known)
+    return [name for name in known if name in models]
+
+
+def _has_guide(domain: str) -> bool:
+    try:
+        shipped_guide(domain)
+    except AssetError:
+        return False
+    return True
+
+
+def _row(group: Group, model: str, rounds: int, person: str) -> dict[str, Any]:
     return {
-        "domain": cell.domain,
-        "setting": cell.setting,
-        "population": cell.population,
-        "seed": cell.seed,
+        "domain": group.domain,
+        "setting": group.setting,
+        "population": group.population,
+        "seed": group.seed,
         "person": person,
         "model": model,
         "rounds": rounds,

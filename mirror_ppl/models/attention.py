@@ -13,8 +13,9 @@ kept. Divided by ``sum_g w_g`` it would not be: where ``q`` is what explains wha
 ``psi`` under which few of these values are probable would be favoured.
 
 Probable values are taken for certain and the improbable by systematic resampling (Fearnhead and
-Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by site. Of the G values, those that could explain what was done are kept in the same way.
-``pi`` is the product of the probabilities with which a value was kept on the way.
+Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by site. Of
+the G values, those that could explain what was done are kept in the same way. ``pi`` is the product
+of the probabilities with which a value was kept on the way.
 """
 
 from __future__ import annotations
