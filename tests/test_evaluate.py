@@ -15,7 +15,7 @@ from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
 from mirror_ppl.evaluation import learners, study
 from mirror_ppl.evaluation.learners import LEARNERS, PLANNABLE, TEST, Group, learn
-from mirror_ppl.evaluation.study import SHARES, Assistance, Prediction, assist, predict, rounds_of
+from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
 from mirror_ppl.evaluation.study_summary import Interval, Place, Share, Standing
 from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.guides import InferenceOptions, Inferred
@@ -105,10 +105,6 @@ def test_rivals_know_what_rewards_tell_of_the_world():
     world = person.human.known_world(person.draws)
     assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
     assert world.rules != OLD_RULES  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_shares_are_numbers_of_rounds():
-    assert [rounds_of(share) for share in SHARES] == [1, 1, 2, 5, 10, 20]
 
 
 # --- rows -------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ from mirror_ppl.evaluation.learners import (
     LEARNERS,
     PLANNABLE,
     TEST,
-    TRAINING,
     Group,
     Plannable,
     learn,
@@ -36,17 +35,10 @@ CODE = (
     "evaluation/reachable_oracle.py",
 )
 """Files whose change makes earlier results worthless."""
-SHARES = (0.0, 0.05, 0.1, 0.25, 0.5, 1.0)
-"""Shares of the training rounds that are learned from; at least one round."""
 REFERENCES = ("none", "all", "oracle")
 """Communicators that learn nothing of people."""
 OBJECTIVES = {"mirror": ("mirror", "mirror-kl"), "bc": ("mirror",), "sqil": ("mirror",)}
 """Planners for each learner: expected utility, and of MIRROR the divergence of beliefs, too."""
-
-
-def rounds_of(share: float) -> int:
-    """How many of the training rounds a share is, at least one."""
-    return max(1, round(share * TRAINING))
 
 
 @dataclass(frozen=True)
