@@ -56,10 +56,10 @@ bench: $(STAMP) ## Every study in benchmarks/, one after the other
 	done
 
 results: $(STAMP) ## The paper's comparisons in all domains; hours; results in runs/results
-	for study in prediction assistance relevance; do \
+	worst=0; for study in prediction assistance relevance; do \
 		$(BIN)/python -m mirror_ppl.evaluate $$study \
-			--domain driving search_rescue bomb_defusal --out runs/results || exit 1; \
-	done
+			--domain driving search_rescue bomb_defusal --out runs/results || worst=$$?; \
+	done; exit $$worst
 
 format: $(STAMP) ## Sort imports, apply safe fixes, format
 	$(BIN)/ruff check --fix-only .

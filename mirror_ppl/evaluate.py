@@ -83,7 +83,7 @@ def main(options: Options) -> int:
         The exit status: 1 if a part failed.
 
     Raises:
-        MirrorError: what was asked for cannot be done; nothing is written then.
+        MirrorError: what was asked for cannot be done; no results are written then.
     """
     from mirror_ppl.evaluation.study import assist, identities, predict
     from mirror_ppl.evaluation.study_report import REPORTS, write_table
@@ -110,8 +110,7 @@ def main(options: Options) -> int:
         path = folder / f"{options.study}.csv"
         write_whole(path, lambda temporary: write_table(temporary, rows))
         summary, picture = REPORTS[options.study](rows)
-        command = {name: value for name, value in asdict(options).items() if name != "jobs"}
-        content = {"command": PROGRAM, "options": command, **summary, **_effort(outcomes)}
+        content = _origin(options) | summary | _effort(outcomes)
         text = json.dumps(content, indent=1, default=_plain) + "\n"
         write_whole(folder / f"{options.study}.json", lambda temporary: temporary.write_text(text))
         picture.save(folder / f"{options.study}.png")
@@ -143,8 +142,11 @@ def _cells(options: Options) -> list[Any]:
         usual = settings if predicting else settings[-1:]
         own = [name for name in options.setting if name in settings] if options.setting else usual
         if not own:
-            raise UnknownNameError.of("setting", options.setting[0], settings)
-        for setting in own:
+            raise OptionError(
+                f"--setting: {domain} has none of {', '.join(options.setting)}; it has "
+                f"{', '.join(settings)}"
+            )
+        for setting in dict.fromkeys(own):
             for seed in range(options.seeds or (5 if predicting else 2)):
                 group = Group(domain, setting, options.population, options.people, seed)
                 cells += (
@@ -159,6 +161,24 @@ def _cells(options: Options) -> list[Any]:
                     )
                 )
     return cells
+
+
+def _origin(options: Options) -> dict[str, Any]:
+    """What was asked for, of which version, and on what machine."""
+    import os
+    import platform
+
+    import torch
+
+    from mirror_ppl import __version__
+
+    return {
+        "command": PROGRAM,
+        "options": {name: value for name, value in asdict(options).items() if name != "jobs"},
+        "version": __version__,
+        "torch": torch.__version__,
+        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
+    }
 
 
 def _effort(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
 from mirror_ppl.evaluation import learners, study
 from mirror_ppl.evaluation.learners import LEARNERS, PLANNABLE, TEST, Group, learn
 from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
+from mirror_ppl.evaluation.study_report import REPORTS
 from mirror_ppl.evaluation.study_summary import Interval, Place, Share, Standing
 from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.guides import InferenceOptions, Inferred
@@ -197,7 +198,7 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
     assert command(evaluate, "relevance", *args) == 0
     out, err = capsys.readouterr()
     assert "3 were there" in err
-    assert "told items about collision course" in out
+    assert "driving, fog, paper: items about collision course" in out
     assert "nothing told" in out  # by none
     content = json.loads((tmp_path / "relevance.json").read_text())["relevance"]
     assert set(content) == {"driving: collision_course", "driving: closing"}
@@ -213,7 +214,15 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
         (("prediction", "--domain", "drivin"), 'unknown domain "drivin"'),
         (("prediction", "--models", "sqill"), 'unknown model "sqill"'),
         (("assistance", "--models", "logistic"), 'unknown model "logistic"'),
-        (("prediction", "--setting", "smoke"), 'unknown setting "smoke"'),
+        (("prediction", "--setting", "smog"), 'unknown setting "smog"'),
+        (
+            ("prediction", "--domain", "driving", "bomb_defusal", "--setting", "fog"),
+            "--setting: bomb_defusal has none of fog; it has labelled, unlabelled",
+        ),
+        (
+            ("prediction", "--domain", "bomb_defusal", "--models", "mirror-amortized"),
+            "mirror-amortized: no trained guide ships for bomb_defusal",
+        ),
         (("prediction", "--population", "us"), 'unknown population "us"'),
         (("prediction", "--rounds", "0", "5"), "--rounds must be from 1 to 20, not 0"),
         (("prediction", "--rounds", "30"), "--rounds must be from 1 to 20, not 30"),
@@ -230,12 +239,14 @@ def test_what_makes_no_sense_is_refused(args, message, tmp_path, capsys):
 def test_by_default_everything_is_compared():
     cells = evaluate._cells(evaluate.Options("prediction", domain=DOMAINS))
     for domain in DOMAINS:
-        own = [cell for cell in cells if cell.group.domain == domain]
-        assert {cell.group.setting for cell in own} == set(get_domain(domain).settings)
-        expected = set(LEARNERS) - (set() if domain == "driving" else {"mirror-amortized"})
-        assert {cell.model for cell in own} == expected
-        assert {cell.group.seed for cell in own} == set(range(5))
-        assert len(own) == len(set(own))
+        for setting in get_domain(domain).settings:
+            own = [c for c in cells if (c.group.domain, c.group.setting) == (domain, setting)]
+            expected = set(LEARNERS) - (set() if domain == "driving" else {"mirror-amortized"})
+            if setting not in ("fog", "smoke"):  # nothing is hidden: they would be the same
+                expected -= {"bc-everything", "sqil-everything"}
+            assert {cell.model for cell in own} == expected
+            assert {cell.group.seed for cell in own} == set(range(5))
+            assert len(own) == len(set(own))
     cells = evaluate._cells(evaluate.Options("assistance", domain=DOMAINS))
     assert {cell.group.setting for cell in cells} == {worst(domain) for domain in DOMAINS}
     assert {cell.model for cell in cells} == {*PLANNABLE, "none", "all", "oracle"}
@@ -252,6 +263,12 @@ def test_results_depend_on_the_code_that_made_them():
     for part in study.CODE:
         assert list(root.glob(part)), part
     assert root / "plots/study.py" not in files
+    cell = Prediction(FOG, "mirror", (1,))
+    before = study.identities(["driving"])(cell)
+    assert before == study.identities(["driving", "bomb_defusal"])(cell)
+    assert before != study.identities(["bomb_defusal"])(
+        Prediction(replace(FOG, domain="bomb_defusal"), "mirror", (1,))
+    )
 
 
 # --- pictures ---------------------------------------------------------------------------------
@@ -265,6 +282,19 @@ def test_every_model_has_a_look_of_its_own():
 
 def standing(model, rounds, mean, place=Place("driving", "fog", "paper")):  # noqa: B008
     return Standing(place, model, rounds, Interval(mean, mean - 0.1, mean + 0.1), 3, None)
+
+
+def test_relevance_has_a_panel_for_each_place(monkeypatch):
+    """Two settings of one domain: two tables, and two panels."""
+    rows = [
+        {"domain": "driving", "setting": setting, "population": "paper", "seed": 0}
+        | {"person": "a", "model": "bc", "rounds": 20, "items_visual": 2, "items_verbal": 0}
+        | {f"{n}_{m}": 1 for n in ("collision_course", "closing") for m in ("visual", "verbal")}
+        for setting in ("clear", "fog")
+    ]
+    _, picture = REPORTS["relevance"](rows)
+    assert [ax.get_title() for ax in picture.axes] == ["driving clear paper", "driving fog paper"]
+    assert [len(ax.patches) for ax in picture.axes] == [2, 2]
 
 
 def test_curves_have_a_panel_for_each_place_and_level_lines():

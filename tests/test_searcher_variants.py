@@ -68,9 +68,7 @@ def test_policy_alone_sees_all_at_once_and_presses_by_the_rules(robot):
     told = {"visual": torch.zeros(1, 4, 6).bool(), "verbal": torch.zeros(1, 4, 1).bool()}
     for human in (part, plain):
         view = human.perceive({}, observation, told)
-        assert view.visible["visual"].all()
-    view = part.perceive({}, observation, told)
-    assert view.visible["verbal"].all() and not view.taken
+        assert view.visible["visual"].all() and view.visible["verbal"].all() and not view.taken
     belief = part.believe(view, observation, torch.zeros(1, 4, dtype=torch.long))[None]
     values = part.action_values(belief)
     own = {name: torch.zeros(1, 1) for name in RULES_OF}

@@ -72,6 +72,13 @@ def test_less_can_be_better_and_people_are_matched_by_seed_and_name():
     assert five.mirror is None  # mirror has not learned from five rounds
 
 
+def test_who_learns_nothing_is_compared_with_the_most_rounds():
+    rows = [row("mirror", 5, net=1.0), row("mirror", 1, net=0.0), row("none", 0, net=-2.0)]
+    none = summarize_study(rows, "net")[-1]
+    assert none.mirror is not None
+    assert none.mirror.ahead.mean == 3.0
+
+
 def test_places_are_apart():
     clear = Place("driving", "clear", "paper")
     rows = [row("mirror", 1, nll=0.1), row("bc", 1, nll=0.3, place=clear)]

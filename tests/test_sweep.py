@@ -1,6 +1,7 @@
 """Sweeps: every cell once, what is done stays done, what fails does not take the others along."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mirror_ppl.errors import OptionError
-from mirror_ppl.evaluation.sweep import run_cells
+from mirror_ppl.evaluation.sweep import KILLED, run_cells
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,19 @@ def test_a_failure_is_told_loses_nothing_and_is_tried_again(tmp_path):
     assert error.startswith("ValueError: one is no number (test_sweep.py, line ")
     assert squares(run_cells(CELLS, square, tmp_path, same, 1)) == [9, 1, 4]
     assert ASKED == [3, 2, 1]
+
+
+def die_of_one(cell):
+    if cell.number == 1:
+        os._exit(3)
+    return square(cell)
+
+
+def test_who_kills_their_process_is_told_and_the_others_are_done(tmp_path):
+    outcomes = run_cells(CELLS, die_of_one, tmp_path, same, 2)
+    assert squares(outcomes) == [9, 4]
+    assert outcomes[1].error == KILLED
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_processes_beside_each_other_find_the_same(tmp_path):

@@ -42,7 +42,7 @@ class TrainingOptions:
     sight: Sight = "setting"
     hidden: int = 48
     learning_rate: float = 0.01
-    weight_decay: float = 1.0
+    weight_decay: float = 0.0
     epochs: int = 400
     batch: int = 20
     check_every: int = 5

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+import torch
+
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
@@ -33,10 +35,15 @@ CODE = (
     *(f"{name}/**/*.py" for name in ("inference", "models", "people")),
     *(f"evaluation/{name}.py" for name in ("assistance", "learners", "oracle", "study")),
     "evaluation/reachable_oracle.py",
+    "cross_entropy.py",
+    "distinct.py",
+    "data/assets/*guide*.safetensors",
 )
 """Files whose change makes earlier results worthless."""
 REFERENCES = ("none", "all", "oracle")
 """Communicators that learn nothing of people."""
+EVERYTHING = "-everything"
+"""How learners end that read all that could be seen."""
 OBJECTIVES = {"mirror": ("mirror", "mirror-kl"), "bc": ("mirror",), "sqil": ("mirror",)}
 """Planners for each learner: expected utility, and of MIRROR the divergence of beliefs, too."""
 
@@ -168,9 +175,18 @@ def prediction_cells(
 
     Raises:
         UnknownNameError: there is no such learner.
+        AssetError: one needs a trained guide, which there is not.
     """
-    guides = () if _has_guide(group.domain) else ("mirror-amortized",)
-    chosen = _known(models, tuple(LEARNERS)) or [name for name in LEARNERS if name not in guides]
+    chosen = _known(models, tuple(LEARNERS))
+    if not _has_guide(group.domain):
+        if "mirror-amortized" in chosen:
+            raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
+        left_out = {"mirror-amortized"}
+    else:
+        left_out = set()
+    if _shows_everything(group):
+        left_out |= {name for name in LEARNERS if name.endswith(EVERYTHING)}  # they are the others
+    chosen = chosen or [name for name in LEARNERS if name not in left_out]
     return [Prediction(group, name, tuple(sorted({*rounds}))) for name in chosen]
 
 
@@ -188,7 +204,7 @@ def assistance_cells(
 
 def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], str]:
     """What results of a cell depend on besides the cell: the code, and the self-model's weights."""
-    digest, root = hashlib.sha256(), Path(__file__).parents[1]
+    digest, root = hashlib.sha256(torch.__version__.encode()), Path(__file__).parents[1]
     for part in CODE:
         for path in sorted(root.glob(part)):
             digest.update(path.read_bytes())
@@ -205,6 +221,13 @@ def _known(models: Sequence[str], known: Sequence[str]) -> list[str]:
         if name not in known:
             raise UnknownNameError.of("model", name, known)
     return [name for name in known if name in models]
+
+
+def _shows_everything(group: Group) -> bool:
+    """Whether the setting hides nothing that could be seen."""
+    rounds = group.recordings()
+    seen = get_domain(group.domain).visibility(group.setting, rounds.observation())
+    return bool(seen["visual"].all())
 
 
 def _has_guide(domain: str) -> bool:

@@ -27,7 +27,7 @@ from mirror_ppl.evaluation.sweep import Rows
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.study import plot_curves, plot_relevance
 
-WIDTH = 100
+WIDTH = 110
 
 
 def write_table(path: Path, rows: Rows) -> None:
@@ -48,7 +48,7 @@ def _prediction(rows: Rows) -> tuple[dict[str, Any], Picture]:
         print(
             f"{claim.place.domain}, {claim.place.setting}: mirror with {_counted(claim.rounds)} "
             f"against {claim.rival} with {_counted(claim.rival_rounds)}: ahead by {_text(ahead)} "
-            f"nats, in {100 * better.mean:.0f}% of people"
+            f"nats an action, in {100 * better.mean:.0f}% of people"
         )
     data = {
         "nll": standings,
@@ -71,9 +71,11 @@ def _relevance(rows: Rows) -> tuple[dict[str, Any], Picture]:
         for place, notion in enumerate(domain.relevance(_first_observation(domain))):
             found = relevance(own, notion, [m.name for m in domain.modalities])
             data[f"{name}: {notion}"] = found
-            if not place:
-                first.append(found)
-            _show_shares(found, f"{name}: told items about {notion.replace('_', ' ')}")
+            for where in dict.fromkeys(one.place for one in found):
+                here = [one for one in found if one.place == where]
+                if not place:
+                    first.append(here)
+                _show_shares(here, f"{', '.join(where)}: items about {notion.replace('_', ' ')}")
     return {"relevance": data}, plot_relevance(first)
 
 
@@ -86,7 +88,10 @@ def _show(standings: Sequence[Standing], title: str, floor: Mapping[Place, float
         here = [one for one in standings if one.place == place]
         numbers = sorted({one.rounds for one in here})
         by = {(one.model, one.rounds): one for one in here}
-        caption = "by rounds learned from; in brackets how far mirror is ahead with the same rounds"
+        caption = (
+            "mean of people, by rounds learned from; in brackets how far mirror is ahead with "
+        )
+        caption += "as many, its 90% interval, and in how many of people"
         if place in floor:
             caption += f"; people's own entropy: {floor[place]:.3f}"
         rows = [
@@ -101,7 +106,12 @@ def _entry(one: Standing | None) -> str:
     if one is None:
         return ""
     text = f"{one.measured.mean:.3f}"
-    return text if one.mirror is None else f"{text}\n({_text(one.mirror.ahead)})"
+    if one.mirror is None:
+        return text
+    ahead, better = one.mirror.ahead, one.mirror.improvement
+    digits = 2 if max(abs(ahead.low), abs(ahead.high)) >= 1 else 3
+    low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
+    return f"{text}\n({ahead.mean:+.{digits}f}\n{low} {high}\n{100 * better.mean:.0f}%)"
 
 
 def _show_shares(shares: Sequence[Share], title: str) -> None:
@@ -130,7 +140,6 @@ def _counted(number: int) -> str:
 
 
 def _print(title: str, caption: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for place, head in enumerate(heads):
         table.add_column(head, justify="right" if place else "left")

@@ -65,7 +65,8 @@ class Standing:
         rounds: how many; 0 if it learns nothing.
         measured: the mean over people.
         people: how many.
-        mirror: how far MIRROR with the same rounds is ahead; ``None`` where there is none.
+        mirror: how far MIRROR with the same rounds is ahead, or with the most where the model
+            learns nothing; ``None`` where there is none.
     """
 
     place: Place
@@ -129,9 +130,10 @@ def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[Standing]:
         measure: column that is compared.
         sign: 1 if more is better, -1 if less is.
     """
-    found = []
-    for (place, model, rounds), people in (values := _by_model(rows, measure)).items():
-        mirror = values.get((place, FIRST, rounds), {}) if model != FIRST else {}
+    found, values = [], _by_model(rows, measure)
+    for (place, model, rounds), people in values.items():
+        most = max((n for where, name, n in values if (where, name) == (place, FIRST)), default=0)
+        mirror = values.get((place, FIRST, rounds or most), {}) if model != FIRST else {}
         own = np.array(list(people.values()))
         ahead = _both(mirror, people, sign)
         found.append(Standing(place, model, rounds, interval(own), len(own), ahead))

@@ -12,6 +12,7 @@ import json
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -38,6 +39,10 @@ class Cell(Protocol):
 
 Report = Callable[[int, str], None]
 """Told how many cells are done, and which was the last."""
+
+
+KILLED = "its process was killed; there may be too little memory for so many --jobs"
+"""What is said of a cell that takes its process along."""
 
 
 @dataclass(frozen=True)
@@ -99,15 +104,39 @@ def run_cells(
         # Processes that have used much memory are replaced by new ones; nothing is lost.
         stack.enter_context(warnings.catch_warnings())
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
-        finished = Parallel(n_jobs=jobs, return_as="generator_unordered")(
-            delayed(_cell)(place, cells[place], work) for place in todo
-        )
-        for place, outcome in cast(Iterator[tuple[int, Outcome]], finished):
+
+        def done(place: int, outcome: Outcome) -> None:
             outcomes[place] = outcome
             if outcome.error is None:
                 _keep(folder / names[place], outcome)
             report(len(outcomes), outcome.cell.label + (" failed" if outcome.error else ""))
+
+        def results(places: Sequence[int]) -> Iterator[tuple[int, Outcome]]:
+            parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
+            tasks = (delayed(_cell)(place, cells[place], work) for place in places)
+            return cast(Iterator[tuple[int, Outcome]], parallel(tasks))
+
+        try:
+            for place, outcome in results(todo):
+                done(place, outcome)
+        except Exception as error:
+            if not _killed(error):
+                raise
+            # One of them takes its process along, and with it the others: now one at a time.
+            for place in [place for place in todo if place not in outcomes]:
+                try:
+                    for _, outcome in results([place]):
+                        done(place, outcome)
+                except Exception as culprit:
+                    if not _killed(culprit):
+                        raise
+                    done(place, Outcome(cells[place], error=KILLED))
     return [outcomes[place] for place in range(len(cells))]
+
+
+def _killed(error: Exception) -> bool:
+    """Whether a process ended without a word, of this machine or of a cluster."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
 
 
 def _cell(place: int, cell: Cell, work: Callable[[Any], Rows]) -> tuple[int, Outcome]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.searcher import Searcher
-from mirror_ppl.models.searcher_variants import KnowingSearcher, PerceptualSearcher
+from mirror_ppl.models.searcher_variants import KnowingRobot, KnowingSearcher, PerceptualSearcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.variants import VARIANTS
@@ -28,6 +28,7 @@ OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
         MIRROR: Searcher,
         "perceptual-only": PerceptualSearcher,
         "policy-only": KnowingSearcher,
+        "no-implants": KnowingRobot,
     }
 }
 """What names in ``VARIANTS`` stand for in domains that need another model than `HumanModel`."""

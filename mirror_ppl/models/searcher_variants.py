@@ -9,6 +9,7 @@ from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants, View
 from mirror_ppl.models.searcher import Searcher
+from mirror_ppl.models.variants import NoImplants
 
 
 class PerceptualSearcher(Searcher):
@@ -42,13 +43,27 @@ class KnowingSearcher(Searcher):
         )
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """Everything."""
+        """Everything, also the type."""
         del implants, step
-        return {
-            m.name: torch.ones(observation[m.name].shape[:-1], dtype=torch.bool)
-            for m in self.domain.modalities
-        }
+        return _everything(observation)
 
     def look(self, implants, knowledge, observation, told, step) -> tuple[View, object]:
         """As everywhere; there is nothing to guess."""
         return HumanModel.look(self, implants, knowledge, observation, told, step)
+
+
+class KnowingRobot(NoImplants):
+    """The robot itself, but for how strictly it chooses: sees everything, also the type."""
+
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
+        """Everything."""
+        del implants, step
+        return _everything(observation)
+
+
+def _everything(observation: Observation) -> Visibility:
+    return {
+        name: torch.ones(value.shape[:-1], dtype=torch.bool, device=value.device)
+        for name, value in observation.items()
+        if name != "ego"
+    }

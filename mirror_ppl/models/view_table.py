@@ -96,7 +96,7 @@ class Attention:
         return torch.logsumexp(found + shares.gather(-2, rounds), -1)
 
     def shares(self, log_weights: Tensor) -> Tensor:
-        """What each value that is kept stands for ``[..., P, B, G']``, of what each of all does."""
+        """Log-weights ``[..., P, B, G']`` of the values that are kept, of those of all."""
         kept = self.kept.expand(*log_weights.shape[:-1], -1)
         return log_weights.gather(-1, kept) - self.log_kept
 

@@ -80,15 +80,15 @@ def _curve(ax: Axes, own: Sequence[Standing]) -> None:
     ax.fill_between(rounds, low, high, color=colour, alpha=0.12, lw=0)
 
 
-def plot_relevance(domains: Sequence[Sequence[Share]]) -> Picture:
-    """Draw which share of what was told was relevant, one panel a domain, after all rounds.
+def plot_relevance(places: Sequence[Sequence[Share]]) -> Picture:
+    """Draw which share of what was told was relevant, one panel a place, after all rounds.
 
     Args:
-        domains: of each what `relevance` found.
+        places: of each what `relevance` found.
     """
-    figure = Picture(figsize=(WIDTH * len(domains) + LEGEND, HEIGHT), layout="constrained")
-    panels = figure.subplots(1, len(domains), squeeze=False)[0]
-    for ax, shares in zip(panels, domains, strict=True):
+    figure = Picture(figsize=(WIDTH * len(places) + LEGEND, HEIGHT), layout="constrained")
+    panels = figure.subplots(1, len(places), squeeze=False)[0]
+    for ax, shares in zip(panels, places, strict=True):
         most = max(one.rounds for one in shares)
         last = [one for one in shares if one.rounds in (0, most)]
         models = list(dict.fromkeys(one.model for one in last))
