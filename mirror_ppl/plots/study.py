@@ -23,7 +23,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
     "no-implants": (PURPLE, ":", "<"),
     "bc": (ORANGE, "-", "X"),
     "bc-everything": (ORANGE, ":", "x"),
-    "sqil": (VERMILION, "-", "X"),
+    "sqil": (VERMILION, "-", "d"),
     "sqil-everything": (VERMILION, ":", "x"),
     "logistic": (GREEN, "-", "h"),
     "none": (GREY, ":", ""),
