@@ -45,9 +45,9 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
     Raises:
         HumanModelError: the file or class is missing, does not import, or is not a human model.
     """
-    named = {**VARIANTS, **OWN.get(self_model.domain.name, {})}
-    if specification is None or specification in named:
-        return named[specification or MIRROR](self_model)
+    if specification is None or specification in VARIANTS:
+        name = specification or MIRROR
+        return OWN.get(self_model.domain.name, {}).get(name, VARIANTS[name])(self_model)
     path_text, colon, name = specification.rpartition(":")
     if not colon or not name.isidentifier():
         raise HumanModelError(
