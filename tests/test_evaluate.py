@@ -173,7 +173,7 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
     # Again it does nothing, and says so; of more models it does the others.
     assert command(evaluate, *args) == 0
-    assert "3/3 3 were there" in capsys.readouterr().err
+    assert "3/3 3 were done before" in capsys.readouterr().err
     args[args.index("logistic")] = "policy-only"
     assert command(evaluate, *args) == 0
     assert len(list((tmp_path / "parts").iterdir())) == len(QUICK) + 1
@@ -201,7 +201,7 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
     assert "net return of a round" in capsys.readouterr().out
     assert command(evaluate, "relevance", *args) == 0
     out, err = capsys.readouterr()
-    assert "3 were there" in err
+    assert "3 were done before" in err
     assert "driving, fog, paper: items about collision course" in out
     assert "nothing told" in out  # by none
     content = json.loads((tmp_path / "relevance.json").read_text())["relevance"]

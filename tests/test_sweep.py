@@ -69,7 +69,7 @@ def test_what_is_done_is_not_done_again(tmp_path):
     outcomes = run_cells(CELLS, square, tmp_path, same, 1, report=lambda *what: told.append(what))
     assert squares(outcomes) == [9, 1, 4]
     assert ASKED == [3, 1, 2]
-    assert told == [(2, "2 were there"), (3, "square of 2")]
+    assert told == [(2, "2 were done before"), (3, "square of 2")]
 
 
 def test_what_depends_on_something_else_is_done_again(tmp_path):

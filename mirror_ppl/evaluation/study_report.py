@@ -11,6 +11,7 @@ import torch
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from mirror_ppl.domains import Domain, Observation, get_domain
 from mirror_ppl.evaluation.study_summary import (
@@ -88,10 +89,11 @@ def _show(standings: Sequence[Standing], title: str, floor: Mapping[Place, float
         here = [one for one in standings if one.place == place]
         numbers = sorted({one.rounds for one in here})
         by = {(one.model, one.rounds): one for one in here}
-        caption = (
-            "mean of people, by rounds learned from; in brackets how far mirror is ahead with "
-        )
-        caption += "as many, its 90% interval, and in how many of people"
+        number = max(one.people for one in here)
+        caption = f"mean over people ({number}), by rounds learned from"
+        if any(one.mirror for one in here):
+            caption += "; below it how far mirror is ahead with as many, the 90% interval of that "
+            caption += "over people, and in how many of them"
         if place in floor:
             caption += f"; people's own entropy: {floor[place]:.3f}"
         rows = [
@@ -111,7 +113,7 @@ def _entry(one: Standing | None) -> str:
     ahead, better = one.mirror.ahead, one.mirror.improvement
     digits = 2 if max(abs(ahead.low), abs(ahead.high)) >= 1 else 3
     low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
-    return f"{text}\n({ahead.mean:+.{digits}f}\n{low} {high}\n{100 * better.mean:.0f}%)"
+    return f"{text}\n{ahead.mean:+.{digits}f}\n[{low}, {high}]\n{100 * better.mean:.0f}%"
 
 
 def _show_shares(shares: Sequence[Share], title: str) -> None:
@@ -144,7 +146,7 @@ def _print(title: str, caption: str, heads: Sequence[str], rows: Sequence[Sequen
     for place, head in enumerate(heads):
         table.add_column(head, justify="right" if place else "left")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(Text, row))
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)

@@ -96,7 +96,7 @@ def run_cells(
         kept = _kept(folder / name, cell)
         if kept is not None:
             outcomes[place] = kept
-    report(len(outcomes), f"{len(outcomes)} were there" if outcomes else "")
+    report(len(outcomes), f"{len(outcomes)} were done before" if outcomes else "")
     todo = [place for place in range(len(cells)) if place not in outcomes]
     with ExitStack() as stack:
         if scheduler is not None:
