@@ -42,6 +42,8 @@ CODE = (
 """Files whose change makes earlier results worthless."""
 REFERENCES = ("none", "all", "oracle")
 """Communicators that learn nothing of people."""
+BEGINNINGS = 100
+"""Rounds whose beginnings tell whether a setting hides anything."""
 EVERYTHING = "-everything"
 """How learners end that read all that could be seen."""
 OBJECTIVES = {"mirror": ("mirror", "mirror-kl"), "bc": ("mirror",), "sqil": ("mirror",)}
@@ -177,16 +179,14 @@ def prediction_cells(
         UnknownNameError: there is no such learner.
         AssetError: one needs a trained guide, which there is not.
     """
-    chosen = _known(models, tuple(LEARNERS))
-    if not _has_guide(group.domain):
-        if "mirror-amortized" in chosen:
-            raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
-        left_out = {"mirror-amortized"}
-    else:
-        left_out = set()
-    if _shows_everything(group):
-        left_out |= {name for name in LEARNERS if name.endswith(EVERYTHING)}  # they are the others
-    chosen = chosen or [name for name in LEARNERS if name not in left_out]
+    chosen, guide = _known(models, tuple(LEARNERS)), _has_guide(group.domain)
+    if "mirror-amortized" in chosen and not guide:
+        raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
+    if not chosen:
+        left_out = () if guide else ("mirror-amortized",)
+        # Who reads everything is somebody else only where something is hidden.
+        ends = (EVERYTHING,) if _shows_everything(group) else ()
+        chosen = [name for name in LEARNERS if name not in left_out and not name.endswith(ends)]
     return [Prediction(group, name, tuple(sorted({*rounds}))) for name in chosen]
 
 
@@ -224,10 +224,10 @@ def _known(models: Sequence[str], known: Sequence[str]) -> list[str]:
 
 
 def _shows_everything(group: Group) -> bool:
-    """Whether the setting hides nothing that could be seen."""
-    rounds = group.recordings()
-    seen = get_domain(group.domain).visibility(group.setting, rounds.observation())
-    return bool(seen["visual"].all())
+    """Whether the setting hides nothing that could be seen as rounds begin."""
+    domain = get_domain(group.domain)
+    begin = domain.observe(domain.initial(BEGINNINGS, torch.Generator().manual_seed(0)))
+    return bool(domain.visibility(group.setting, begin)["visual"].all())
 
 
 def _has_guide(domain: str) -> bool:

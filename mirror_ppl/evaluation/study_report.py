@@ -92,8 +92,10 @@ def _show(standings: Sequence[Standing], title: str, floor: Mapping[Place, float
         number = max(one.people for one in here)
         caption = f"mean over people ({number}), by rounds learned from"
         if any(one.mirror for one in here):
-            caption += "; below it how far mirror is ahead with as many, the 90% interval of that "
-            caption += "over people, and in how many of them"
+            caption += (
+                "; below it how far mirror is ahead with as many (of who learns nothing: with "
+            )
+            caption += "the most), the 90% interval of that over people, and in how many of them"
         if place in floor:
             caption += f"; people's own entropy: {floor[place]:.3f}"
         rows = [
