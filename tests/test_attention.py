@@ -23,7 +23,8 @@ from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.svi import FitOptions, predict_actions
+from mirror_ppl.inference.predictive import predict_actions
+from mirror_ppl.inference.svi import FitOptions
 from mirror_ppl.inference.views import (
     _joined,
     build_view_table,

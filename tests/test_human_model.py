@@ -17,7 +17,8 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.evaluation.self_model import fixed_views
 from mirror_ppl.inference.exact import log_joint
 from mirror_ppl.inference.experience import experience
-from mirror_ppl.inference.svi import FitOptions, continuous_guide, fit_implants, predict_actions
+from mirror_ppl.inference.predictive import predict_actions
+from mirror_ppl.inference.svi import FitOptions, continuous_guide, fit_implants
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import (

@@ -20,6 +20,7 @@ from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.svi import (
     FitOptions,
     _draw_by_enumeration,
@@ -29,7 +30,6 @@ from mirror_ppl.inference.svi import (
     draw_implants,
     fit_implants,
     negative_elbo,
-    predict_actions,
 )
 from mirror_ppl.inference.views import build_view_table, combination_scores, restricted
 from mirror_ppl.models import HumanModel

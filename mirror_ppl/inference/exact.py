@@ -77,7 +77,7 @@ def log_joints(
         grid = combination_values(human, table)
     if combinations is not None:
         grid = {site: value[combinations] for site, value in grid.items()}
-    size = max(1, CHUNK // max(1, table.moments.numel()))
+    size = max(1, CHUNK // max(1, table.runs[0].numel()))
     parts = []
     for begin in range(0, number, size):
         some = {name: value[begin : begin + size] for name, value in draws.items()}

@@ -32,7 +32,7 @@ from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.nuts import sample_nuts
 from mirror_ppl.inference.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.inference.prior import Draws, sample_sites
-from mirror_ppl.inference.second_look import LIKELY_DRAWS, rough, second_look
+from mirror_ppl.inference.second_look import LIKELY_DRAWS, looks_twice, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
 from mirror_ppl.inference.views import build_view_table, rounds_of
@@ -229,7 +229,7 @@ def _likely(
     report: Report,
 ) -> Draws | None:
     """Roughly who people are, where what stands for all they may attend to hangs on that."""
-    if not human.attends:
+    if not looks_twice(human):
         return None
     roughly = replace(options, guide="exact", draws=LIKELY_DRAWS, exact=rough(options.exact))
     return dict(_by_importance(human, demonstrations, roughly, seed, None, report, None).draws)
@@ -257,11 +257,11 @@ def _by_importance(
             # Whatever the number of draws that others took.
             torch.manual_seed((seed + 1) * 1_000_003 + person)
             if network is None:
-                first = rough(options.exact) if human.attends else options.exact
+                first = rough(options.exact) if looks_twice(human) else options.exact
                 found = sample_exactly(human, sightings.table(), first)
             else:
                 found = sample_amortized(human, network, sightings)
-            if human.attends:
+            if looks_twice(human):
                 sightings, found = second_look(
                     human, rounds, screening, options.exact, sightings, found
                 )

@@ -16,7 +16,7 @@ from mirror_ppl.inference.importance import (
     scalar_sites,
 )
 from mirror_ppl.inference.prior import Draws, sample_sites
-from mirror_ppl.inference.second_look import Round, rough, second_look
+from mirror_ppl.inference.second_look import Round, looks_twice, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models.human import HumanModel
@@ -106,13 +106,13 @@ class OnlinePosterior:
     def _weighted(self) -> Weighted:
         human, options = self.human, ImportanceOptions()
         if self.network is None:
-            first = rough(options) if human.attends else options
+            first = rough(options) if looks_twice(human) else options
             found = sample_exactly(human, self._sightings.table(), first)
         else:
             # What the first asking has checked need not be checked again.
             sites = None if math.isnan(self.pareto_k) else self._sites
             found = sample_amortized(human, self.network, self._sightings, ENOUGH, sites=sites)
-        if human.attends:
+        if looks_twice(human):
             _, found = second_look(
                 human, self._rounds, self._screening, options, self._sightings, found
             )

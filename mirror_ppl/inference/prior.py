@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any
 
 import pyro
@@ -24,6 +24,7 @@ def sample_sites(
     people: int,
     draws: int | None = None,
     given: Mapping[str, Tensor] | None = None,
+    handler: AbstractContextManager[Any] | None = None,
 ) -> dict[str, Any]:
     """Nodes of all sites of ``prior`` and ``act``, in the order of the program.
 
@@ -32,12 +33,15 @@ def sample_sites(
         people: number of people P.
         draws: number of draws S of each; without, values have no such dimension.
         given: values ``[S, P, 1, ...]`` of sites that are not sampled.
+        handler: an effect handler of Pyro's under which the program runs.
     """
     given = given or {}
     with ExitStack() as stack:
         stack.enter_context(poutine.block())
         trace = stack.enter_context(poutine.trace())
         stack.enter_context(poutine.condition(data=dict(given)))
+        if handler is not None:
+            stack.enter_context(handler)
         if draws is not None:
             stack.enter_context(pyro.plate("draw", draws, dim=-3))
         stack.enter_context(pyro.plate("person", people, dim=-2))

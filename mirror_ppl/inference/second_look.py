@@ -24,6 +24,11 @@ Round = tuple[Observation, Visibility, Tensor, Tensor]
 """What :meth:`Sightings.add` takes."""
 
 
+def looks_twice(human: HumanModel) -> bool:
+    """Whether what stands for all that people may attend to hangs on who they are."""
+    return human.attends and not human.chained
+
+
 def rough(options: ImportanceOptions) -> ImportanceOptions:
     """Settings under which one learns roughly who somebody is."""
     return replace(
@@ -44,7 +49,7 @@ def second_look(
     """Weighted draws of one person, from the global random state.
 
     Args:
-        human: the model of people; it attends.
+        human: the model of people; see :func:`looks_twice`.
         rounds: all that is recorded of the person.
         screening: when to give up combinations of discrete sites.
         options: settings of the second time.

@@ -22,6 +22,7 @@ from torch.nn.functional import pad
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.inference.alike import fixed_prior
+from mirror_ppl.inference.chained_views import chained_views
 from mirror_ppl.inference.combinations import (
     grid_of,
     log_priors,
@@ -31,6 +32,7 @@ from mirror_ppl.inference.combinations import (
 from mirror_ppl.inference.courses import CHUNK, beliefs_and_values
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.models.attention import KEPT, VALUES, AttentionValues, Proposal
+from mirror_ppl.models.chain import Chain
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, log_likelihoods
 
@@ -77,6 +79,7 @@ class RoundViews:
         acted: ``[N, T']``.
         sights: the view under each value of attention, ``[U, G]``; ``None`` if a sight is a view.
         rounds: of each sight ``[U]``, if there is more than one round.
+        chain: attention that is summed out exactly, of one person; views are of its spans.
     """
 
     moments: Tensor
@@ -85,9 +88,12 @@ class RoundViews:
     acted: Tensor
     sights: Tensor | None = None
     rounds: Tensor | None = None
+    chain: Chain | None = None
 
     def __len__(self) -> int:
         """The number of sights U."""
+        if self.chain is not None:
+            return self.chain.sights
         return len(self.moments if self.sights is None else self.sights)
 
     def lengthened(self, steps: int) -> RoundViews:
@@ -110,6 +116,9 @@ class RoundViews:
 
     def kept(self, sights: Tensor) -> RoundViews:
         """Only some sights, and the views and moments that they have."""
+        if self.chain is not None:
+            chain, views = self.chain.kept(sights)
+            return replace(replace(self, chain=None).kept(views), chain=chain)
         if self.sights is not None:
             views, place = torch.unique(self.sights[sights], return_inverse=True)
             rounds = None if self.rounds is None else self.rounds[sights]
@@ -179,6 +188,7 @@ class Sightings:
         self._proposal: Proposal | None = None
         if human.attends:
             require_own_attention(human, supports)
+        if human.attends and not human.chained:
             known = {} if likely is not None else self.draw_ways()
             anybody = known or draw_prior(human, 1, PROPOSING_WAYS, 0)
             self._proposal = Proposal(human, anybody, likely, values)
@@ -195,6 +205,9 @@ class Sightings:
             actions: ``[1, T]``.
             real: which steps are no padding, ``[T]``.
         """
+        if self.human.chained:
+            self._add_chained(observation, told, actions, real)
+            return
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
         attended, number, seed = None, len(alive), 0
@@ -215,7 +228,8 @@ class Sightings:
         view = self.human.perceive(candidates, observation, told)
         part, which = _views(self.human, view, observation, actions, real, number)
         if self.screening is not None and self.screening.resolution > 0:
-            part, which = self._merged(part, which, self.screening)
+            part, place = self._merged(part, self.screening)
+            which = place[which]
         sights = None
         if attended is not None:
             seen = which.view(len(alive), -1)
@@ -229,10 +243,7 @@ class Sightings:
                 found = torch.logsumexp(found, -1)
                 attended = attended.thinned(self._weights() @ useful, KEPT, seed)
                 sights = sights[:, attended.kept]
-            score = self.score[:, alive] + found[:, which]
-            self.score[:, alive] = score
-            best = score.amax(0)
-            self.alive = alive[best >= best.max() - self.screening.margin]
+            self._screen(found[:, which], self.screening)
         if attended is not None:
             self._attended.append(attended)
             part = replace(part, sights=sights)
@@ -241,10 +252,44 @@ class Sightings:
         self._seen.append((alive, which))
         self._recorded.append((actions[0], real))
 
+    def _add_chained(
+        self, observation: Observation, told: Visibility, actions: Tensor, real: Tensor
+    ) -> None:
+        """The same where attention is summed out exactly."""
+        alive = self.alive
+        candidates = {name: axis[alive] for name, axis in self.grid.items()}
+        found = chained_views(
+            self.human, candidates, len(alive), observation, told, actions, real
+        )
+        values = torch.cat([self.human.action_values(some) for some in found.belief.split(CHUNK)])
+        part = RoundViews(
+            found.moments, found.belief[:, None], values[:, None], found.acted[:, None]
+        )
+        chain = found.chain
+        if self.screening is not None:
+            if self.screening.resolution > 0:
+                part, place = self._merged(part, self.screening)
+                chain = chain.of_views(place)
+            likelihoods = self._log_likelihoods(part)[:, None]
+            with self._deciding(self.draw_ways()):
+                chances = chain.log_chances(self.human, self.human.prior(), 1)
+            self._screen(chain.marginal(likelihoods, chances)[:, 0], self.screening)
+        self._rounds.append(replace(part, chain=chain))
+        self._seen.append((alive, torch.arange(len(alive), device=alive.device)))
+        self._recorded.append((actions[0], real))
+
+    def _screen(self, found: Tensor, screening: Screening) -> None:
+        """Count log-likelihoods ``[ways, M']`` of those alive, and give up the hopeless ones."""
+        alive = self.alive
+        score = self.score[:, alive] + found
+        self.score[:, alive] = score
+        best = score.amax(0)
+        self.alive = alive[best >= best.max() - screening.margin]
+
     def table(self) -> ViewTable:
         """The views that are left, as a table of one person; there was at least one round."""
         index, rounds, sights, views, moments = [], [], 0, 0, 0
-        shifted, attended = [], []
+        shifted, attended, chains, counts = [], [], [], []
         steps = max(len(real) for _, real in self._recorded)
         for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
             # Only what somebody who was never given up has seen is worth keeping.
@@ -259,8 +304,16 @@ class Sightings:
             shifted.append(torch.where(part.moments == NO_VIEW, NO_VIEW, part.moments + moments))
             if part.sights is not None:
                 attended.append(part.sights + views)
+            if part.chain is not None:
+                chains.append(part.chain)
+                counts.append(len(part.moments))
             sights, views = sights + len(part), views + len(part.moments)
             moments = moments + part.acted.numel()
+        attention = None
+        if chains:
+            attention = Chain.one_after_another(chains, counts)
+        elif attended:
+            attention = self._attention(attended)
         return ViewTable(
             sites=tuple(self.grid),
             sizes=self.sizes,
@@ -272,7 +325,7 @@ class Sightings:
             recorded=self._padded_to(steps, 0)[None],
             steps=self._padded_to(steps, 1)[None],
             view_counts=torch.tensor([views]),
-            attention=self._attention(attended) if attended else None,
+            attention=attention,
         )
 
     def _attention(self, sights: list[Tensor]) -> Attention:
@@ -321,15 +374,13 @@ class Sightings:
         others = {name: way for name, way in self.draw_ways().items() if name not in self.grid}
         return log_priors(self.human, self.grid, others, 1)[:, 0]
 
-    def _merged(
-        self, part: RoundViews, which: Tensor, screening: Screening
-    ) -> tuple[RoundViews, Tensor]:
-        """The views of a round with moments that count as one made one; ``which`` each is then."""
+    def _merged(self, part: RoundViews, screening: Screening) -> tuple[RoundViews, Tensor]:
+        """The views of a round with moments that count as one made one; which each view is then."""
         ways = {name: way[: screening.alike] for name, way in self.draw_ways().items()}
         real = torch.zeros_like(part.acted, dtype=torch.bool)
         real.view(-1)[part.moments[part.moments != NO_VIEW]] = True
         keys = []
-        for some in torch.arange(len(part.acted), device=which.device).split(CHUNK):
+        for some in torch.arange(len(part.acted), device=part.acted.device).split(CHUNK):
             found = self._act(ways, part.belief[None, some], part.values[None, some])[:, 0]
             acted = part.acted[some].expand(found.shape[:-1])
             chosen = found.gather(-1, acted[..., None]).squeeze(-1)
@@ -348,7 +399,7 @@ class Sightings:
         kept = RoundViews(
             moments[distinct], part.belief[first], part.values[first], part.acted[first]
         )
-        return kept, place[which]
+        return kept, place
 
     def _log_likelihoods(self, part: RoundViews) -> Tensor:
         """Of a round's actions under each way and view, ``[ways, V]``."""

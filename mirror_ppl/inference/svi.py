@@ -30,7 +30,7 @@ from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import combination_scores, restricted
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import discrete_names, latent_sites
-from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable
+from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 Report = Callable[[str, int, int, str], None]
 """Told of long work: what it is, how many steps are done, of how many, and a message."""
@@ -303,58 +303,3 @@ def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) 
     )
     trace = poutine.trace(sampled).get_trace(table)
     return {**continuous, **values_of(latent_sites(trace))}
-
-
-@torch.no_grad()
-def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
-    """Log-probabilities ``[S, P, B, T, A]`` of actions, for each draw of the implants.
-
-    Runs the same program as fitting, with the implants conditioned on the draws and each person
-    seeing what the draw says they see.
-    """
-    number = next(iter(draws.values())).shape[0]
-    person = torch.arange(table.people, device=table.index.device)[:, None]
-    everybody = person[..., None]
-    belief, values = table.belief.flatten(1, 2), table.values.flatten(1, 2)
-    results = []
-    for draw in range(number):
-        own = {name: value[draw] for name, value in draws.items()}
-        with (
-            poutine.block(),
-            poutine.condition(data=own),
-            pyro.plate("person", table.people, dim=-PLATES),
-        ):
-            implants = human.prior()
-            sight = table.sight_of(implants).expand(table.people, table.rounds)
-            if table.attention is not None:
-                results.append(_attentive(human, implants, table, table.attention, sight))
-                continue
-            moments = table.moments[person, sight].clamp(min=0)  # [P, B, T]
-            results.append(
-                human.act(implants, belief[everybody, moments], values[everybody, moments])
-            )
-    return torch.stack(results)
-
-
-def _attentive(
-    human: HumanModel,
-    implants: Mapping[str, Tensor],
-    table: ViewTable,
-    attention: Attention,
-    sight: Tensor,
-) -> Tensor:
-    """Log-probabilities ``[P, B, T, A]`` with attention summed out, given what was done so far."""
-    person = torch.arange(table.people, device=sight.device)[:, None]
-    views = attention.sights[person, sight]  # [P, B, G']
-    moments = table.moments[person[..., None], views].clamp(min=0)  # [P, B, G', T]
-    each = human.act(implants, table.belief, table.values).flatten(-3, -2)
-    found = each.expand(table.people, *each.shape[-2:])[person[..., None, None], moments]
-    done = table.recorded[:, :, None, :, None].expand(*moments.shape, 1)
-    along = found.gather(-1, done).squeeze(-1).cumsum(-1)
-    weights = human.log_attention(
-        implants, attention.values, attention.log_weights, attention.facts
-    )
-    # What was done before a step tells what they attend to at it.
-    before = torch.nn.functional.pad(along[..., :-1], [1, 0])
-    before = torch.log_softmax(before + attention.shares(weights)[..., None], 2)
-    return torch.logsumexp(before[..., None] + found, 2)

@@ -13,6 +13,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.inference.sightings import RoundViews, Screening, Sightings
 from mirror_ppl.models.attention import VALUES
+from mirror_ppl.models.chain import Chain
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
 
@@ -26,7 +27,9 @@ def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
         row[row != NO_VIEW] = renumbered
         people.append(views_of(table, person).kept(needed))
     attention = table.attention
-    if attention is not None:
+    if isinstance(attention, Chain):
+        attention = _joined_chain(people, attention.facts)
+    elif attention is not None:
         attention = replace(attention, **_padded_sights(people))
     return replace(
         table,
@@ -40,6 +43,15 @@ def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
 def views_of(table: ViewTable, person: int) -> RoundViews:
     """One person's views, padding included."""
     attention = table.attention
+    if isinstance(attention, Chain):
+        chain = attention.of_person(person)
+        return RoundViews(
+            table.moments[person],
+            table.belief[person],
+            table.values[person],
+            table.acted[person],
+            chain=chain,
+        )
     return RoundViews(
         table.moments[person],
         table.belief[person],
@@ -60,6 +72,12 @@ def _padded(people: Sequence[RoundViews]) -> dict[str, Tensor]:
         "values": torch.stack([_pad(own.values, moments) for own in people]),
         "acted": torch.stack([_pad(own.acted, moments) for own in people]),
     }
+
+
+def _joined_chain(people: Sequence[RoundViews], facts: Mapping[str, Tensor]) -> Chain:
+    """The chains of P people as one."""
+    chains = [replace(own.chain, facts={}) for own in people if own.chain is not None]
+    return replace(Chain.of_people(chains), facts=facts)
 
 
 def _padded_sights(people: Sequence[RoundViews]) -> dict[str, Tensor]:
@@ -144,8 +162,15 @@ def build_view_table(
 def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> ViewTable:
     """The table of P people of the tables of each of them."""
     rounds, views = demonstrations.shape[1], [views_of(table, 0) for table in tables]
-    own = [table.attention for table in tables if table.attention is not None]
+    own = [table.attention for table in tables if isinstance(table.attention, Attention)]
+    chains = [table.attention for table in tables if isinstance(table.attention, Chain)]
     attention = None
+    if chains:
+        facts = {
+            name: torch.stack([_pad(one.facts[name][0], rounds) for one in chains])
+            for name in chains[0].facts
+        }
+        attention = _joined_chain(views, facts)
     if own:
 
         def padded(parts: Sequence[Tensor], fill: float = 0) -> Tensor:

@@ -37,6 +37,7 @@ from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.distinct import as_whole_numbers, random_keys
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.chain import Span
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.view_table import RecordedActions, ViewTable
@@ -200,6 +201,26 @@ class HumanModel(nn.Module):
         del observation
         return {}
 
+    def spans(self, observation: Observation) -> dict[str, Span]:
+        """At which steps of a round each site of :meth:`attend` is read, in this order.
+
+        Where this is known, attention is summed out exactly (:mod:`mirror_ppl.models.chain`). Sites
+        are read throughout the round, or at a span of it that ends before the next one begins;
+        those read throughout come first. Their distributions do not hang on each other's values.
+        Nothing is known unless this is overridden: then values are drawn that stand for all there
+        could be (:mod:`mirror_ppl.models.attention`).
+
+        Args:
+            observation: of one round, as far as it went, ``[t, K, F]``.
+        """
+        del observation
+        return {}
+
+    @property
+    def chained(self) -> bool:
+        """Whether attention is summed out exactly, see :meth:`spans`."""
+        return self.attends and type(self).spans is not HumanModel.spans
+
     def explanations(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
         """How well values of attention explain what was done, as logarithms ``[n]`` by site.
 
@@ -263,9 +284,27 @@ class HumanModel(nn.Module):
             log_weights: for how many each of them stands, ``[P, B, G]``.
             facts: of the rounds ``[P, B]``, see :meth:`facts`.
         """
+        found = self.log_attention_sites(implants, values, facts)
+        return torch.stack(torch.broadcast_tensors(*found.values())).sum(0) + log_weights
+
+    def log_attention_sites(
+        self,
+        implants: Implants,
+        values: Mapping[str, Tensor],
+        facts: Mapping[str, Tensor] | None = None,
+    ) -> dict[str, Tensor]:
+        """Log-probability of values of each site of :meth:`attend`, ``[..., P, B, G]``, by name.
+
+        Runs inside the person plate.
+
+        Args:
+            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
+            values: of the sites, ``[P, B, G]``.
+            facts: of the rounds ``[P, B]``, see :meth:`facts`.
+        """
         # Far to the left of whatever dimensions draws and enumeration take.
         given = {
-            name: value.movedim(-1, 0).view(value.shape[-1], *(1,) * SPARE, *value.shape[:-1])
+            name: value.movedim(-1, 0).reshape(value.shape[-1], *(1,) * SPARE, *value.shape[:-1])
             for name, value in values.items()
         }
         rounds = next(iter(values.values())).shape[1]
@@ -276,12 +315,14 @@ class HumanModel(nn.Module):
             pyro.plate("round", rounds, dim=-1),
         ):
             self.attend({**implants, **(facts or {})})
-        nodes = [trace.trace.nodes[name] for name in given]
-        total = sum(node["fn"].log_prob(node["value"]) for node in nodes)
-        total = torch.as_tensor(total).movedim(0, -1)
-        while total.dim() > SPARED and total.shape[0] == 1:
-            total = total.squeeze(0)
-        return total + log_weights
+        found = {}
+        for name in given:
+            node = trace.trace.nodes[name]
+            own = torch.as_tensor(node["fn"].log_prob(node["value"])).movedim(0, -1)
+            while own.dim() > SPARED and own.shape[0] == 1:
+                own = own.squeeze(0)
+            found[name] = own
+        return found
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """What a person sees by themselves at one step, masks ``[..., K]``: ``n_t``.
@@ -427,10 +468,8 @@ class HumanModel(nn.Module):
         attention = table.attention
         if attention is None:
             return table.log_likelihoods(log_probabilities)
-        weights = self.log_attention(
-            implants, attention.values, attention.log_weights, attention.facts
-        )
-        return table.log_likelihoods(log_probabilities, weights)
+        chances = attention.log_chances(self, implants, table.rounds)
+        return table.log_likelihoods(log_probabilities, chances)
 
     def model(self, table: ViewTable, world: Rounds | None = None) -> None:
         """The program, conditioned on the recorded actions of a table of views.

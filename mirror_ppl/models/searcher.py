@@ -34,6 +34,7 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility, total_rewar
 from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
 from mirror_ppl.domains.bomb_panel import BUTTONS, KINDS, STAGES
 from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.chain import Span
 from mirror_ppl.models.human import HumanModel, Implants, View
 from mirror_ppl.models.self_model import SelfModel
 
@@ -154,6 +155,19 @@ class Searcher(HumanModel):
             last = own if last is None else torch.where(here.any(-1), own, last)
             found[f"{SOUGHT}{number}"] = last
         return found
+
+    def spans(self, observation: Observation) -> dict[str, Span]:
+        """The guess counts throughout; when something is found, at that stage.
+
+        Whatever is found later than that is not found.
+        """
+        stage = observation["ego"][..., 0].long()
+        spans = {GUESS: Span(0, len(stage), len(KINDS))}
+        for number in range(STAGES):
+            first = int((stage < number).sum())
+            last = first + int((stage == number).sum())
+            spans[f"{FOUND}{number}"] = Span(first, last, last - first + 1)
+        return spans
 
     def explanations(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
         """What was pressed for was found just before; what was waited for was not."""

@@ -17,8 +17,10 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
+from mirror_ppl.models.chain import Chain
+
 if TYPE_CHECKING:
-    from mirror_ppl.models.human import Implants
+    from mirror_ppl.models.human import HumanModel, Implants
 
 
 NO_VIEW = -1
@@ -36,7 +38,9 @@ def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
     return number
 
 
-def log_likelihoods(log_probabilities: Tensor, acted: Tensor, moments: Tensor) -> Tensor:
+def log_likelihoods(
+    log_probabilities: Tensor, acted: Tensor, moments: Tensor, repeats: Tensor | None = None
+) -> Tensor:
     """Log-likelihood ``[..., V]`` of the recorded actions along views.
 
     Args:
@@ -44,12 +48,15 @@ def log_likelihoods(log_probabilities: Tensor, acted: Tensor, moments: Tensor) -
         acted: what was done there, ``[..., N, T']``.
         moments: of each step of each view, which of the N T' beliefs it is, ``[..., V, T]``;
             ``NO_VIEW`` in padding.
+        repeats: how often each of them occurs ``[..., V, T]``; once unless given.
     """
     acted = acted.expand(log_probabilities.shape[:-1])
     chosen = log_probabilities.gather(-1, acted[..., None]).squeeze(-1).flatten(-2)
     steps = moments.clamp(min=0).flatten(-2)
     found = chosen.gather(-1, steps.expand(*chosen.shape[:-1], steps.shape[-1]))
     found = found.unflatten(-1, moments.shape[-2:])
+    if repeats is not None:
+        found = found * repeats
     return torch.where(moments == NO_VIEW, 0.0, found).sum(-1)
 
 
@@ -81,12 +88,17 @@ class Attention:
     rounds: Tensor
     facts: Mapping[str, Tensor] = field(default_factory=dict)
 
+    def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
+        """See `HumanModel.log_attention`, ``[..., P, B, G]``; runs inside the person plate."""
+        del rounds
+        return human.log_attention(implants, self.values, self.log_weights, self.facts)
+
     def marginal(self, likelihoods: Tensor, log_weights: Tensor) -> Tensor:
         """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.
 
         Args:
             likelihoods: of the recorded actions under each view.
-            log_weights: of each value, see `HumanModel.log_attention`, ``[..., P, B, G]``.
+            log_weights: of each value, see :meth:`log_chances`, ``[..., P, B, G]``.
         """
         shape = self.sights.shape[1:]
         views = self.sights.flatten(1).expand(*likelihoods.shape[:-1], -1)
@@ -135,7 +147,23 @@ class ViewTable:
     recorded: Tensor
     steps: Tensor
     view_counts: Tensor
-    attention: Attention | None = None
+    attention: Attention | Chain | None = None
+
+    @cached_property
+    def runs(self) -> tuple[Tensor, Tensor | None]:
+        """The moments of each view without order ``[P, V, C]``, and how often each occurs.
+
+        Where spans of rounds are views, their moments are few. All others occur once (``None``).
+        """
+        if not isinstance(self.attention, Chain):
+            return self.moments, None
+        ordered = self.moments.sort(-1).values
+        new = torch.nn.functional.pad(ordered.diff(dim=-1) != 0, [1, 0])
+        place = new.long().cumsum(-1)
+        number = int(place.max()) + 1
+        moments = torch.full_like(ordered[..., :1], NO_VIEW).repeat(1, 1, number)
+        repeats = torch.zeros_like(moments).scatter_add(-1, place, torch.ones_like(place))
+        return moments.scatter(-1, place, ordered), repeats.to(self.belief)
 
     @property
     def people(self) -> int:
@@ -202,19 +230,19 @@ class ViewTable:
         return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
 
     def log_likelihoods(
-        self, log_probabilities: Tensor, log_attention: Tensor | None = None
+        self, log_probabilities: Tensor, log_chances: Tensor | None = None
     ) -> Tensor:
         """Log-likelihood ``[..., P, U]`` of the recorded actions under each sight.
 
         Args:
             log_probabilities: of actions ``[..., P, N, T', A]``.
-            log_attention: log-probability of each value of attention ``[..., P, B, G]``, where
-                there are such.
+            log_chances: of attention where there is such, see :meth:`Attention.log_chances` and
+                :meth:`Chain.log_chances`.
         """
-        found = log_likelihoods(log_probabilities, self.acted, self.moments)
-        if self.attention is None or log_attention is None:
+        found = log_likelihoods(log_probabilities, self.acted, *self.runs)
+        if self.attention is None or log_chances is None:
             return found
-        return self.attention.marginal(found, log_attention)
+        return self.attention.marginal(found, log_chances)
 
 
 class RecordedActions(TorchDistribution):

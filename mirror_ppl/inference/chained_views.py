@@ -1,0 +1,279 @@
+"""The views of a round span by span, where it is known when each site of attention is read.
+
+A state is what is left of all that a person may have attended to so far: a belief, what the domain
+says they know, and the values that are read throughout the round. States that are the same in that
+are one (:mod:`mirror_ppl.models.chain`). n stands for states with a value each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
+from mirror_ppl.domains import Observation, Visibility
+from mirror_ppl.domains.base import map_state
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.attention import attention_sites
+from mirror_ppl.models.chain import Chain, Level, Span
+from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.view_table import NO_VIEW
+
+
+@dataclass(frozen=True)
+class ChainedViews:
+    """What a person may see in one round.
+
+    Attributes:
+        chain: of the round; a sight for each combination of implants.
+        moments: of each view ``[V, T]``; ``NO_VIEW`` outside of its span.
+        belief: at these N moments ``[N, Z]``.
+        acted: what was done there ``[N]``.
+    """
+
+    chain: Chain
+    moments: Tensor
+    belief: Tensor
+    acted: Tensor
+
+
+@torch.no_grad()
+def chained_views(  # noqa: PLR0913 - a round, and whose it is
+    human: HumanModel,
+    combinations: Mapping[str, Tensor],
+    number: int,
+    observation: Observation,
+    told: Visibility,
+    actions: Tensor,
+    real: Tensor,
+) -> ChainedViews:
+    """Go through one round.
+
+    Args:
+        human: the model of people; its attention is :attr:`HumanModel.chained`.
+        combinations: values ``[M]`` of the discrete implants.
+        number: M.
+        observation: ``[1, T, ...]``.
+        told: ``[1, T, K]``.
+        actions: ``[1, T]``.
+        real: which steps are no padding, ``[T]``.
+
+    Raises:
+        HumanModelError: ``spans`` breaks its contract.
+    """
+    so_far = {name: value[0, real] for name, value in observation.items()}
+    steps = int(real.sum())
+    supports = attention_sites(human)
+    spans = _checked(human, human.spans(so_far), supports, steps)
+    facts = {name: fact.view(1, 1) for name, fact in human.facts(so_far).items()}
+    course = _Course(human, combinations, observation, told, actions[0])
+    states = course.beginning(number)
+    levels, rows = [], []
+    begins = [0, *(span.first for span in list(spans.values())[1:]), steps]
+    done = 0
+    for place, (site, span) in enumerate(spans.items()):
+        support, device = supports[site], actions.device
+        # Sites of other spans are not read at this one: any value will do.
+        some = {name: own[:1].expand(states.number) for name, own in supports.items()}
+        some |= states.throughout
+        now = states.at(torch.arange(states.number, device=device).repeat_interleave(span.values))
+        values = {name: own.repeat_interleave(span.values) for name, own in some.items()}
+        values[site] = support[: span.values].repeat(states.number)
+        shape = (1, states.number, span.values)
+        now, moments = course.go(now, values, begins[place], begins[place + 1], len(real))
+        if span.last == steps and span.first == 0:
+            now.throughout[site] = values[site]
+        first, following = distinct_rows(now.key())
+        index = torch.arange(span.values, device=device)
+        index[-1] += max(len(own) for own in supports.values())  # that value or any later
+        levels.append(
+            Level(
+                view=done + torch.arange(len(moments), device=device).view(shape),
+                value=index.expand(shape),
+                following=following.view(shape),
+                rounds=torch.zeros(shape[:2], dtype=torch.long, device=device),
+            )
+        )
+        rows.append(moments)
+        done += len(moments)
+        states = now.at(first)
+    moments = torch.cat(rows)
+    seen = moments[moments != NO_VIEW]
+    used, which = seen.unique(return_inverse=True)
+    moments[moments != NO_VIEW] = which
+    first, view = distinct_rows(moments)
+    chain = Chain(supports, tuple(levels), facts).of_views(view)
+    belief, acted = course.moments(used)
+    return ChainedViews(chain, moments[first], belief, acted)
+
+
+@dataclass(frozen=True)
+class _States:
+    """n people with different histories; see the module.
+
+    Attributes:
+        combination: of implants ``[n]``.
+        throughout: values ``[n]`` of sites that are read throughout the round.
+        belief: ``[n]``, an index into all beliefs so far.
+        knowledge: the domain's ``[n]``.
+    """
+
+    combination: Tensor
+    throughout: dict[str, Tensor]
+    belief: Tensor
+    knowledge: Any
+
+    @property
+    def number(self) -> int:
+        """Of states, n."""
+        return len(self.combination)
+
+    def at(self, rows: Tensor) -> _States:
+        """Some of them."""
+        return _States(
+            self.combination[rows],
+            {name: value[rows] for name, value in self.throughout.items()},
+            self.belief[rows],
+            map_state(lambda part: part[rows], self.knowledge),
+        )
+
+    def key(self) -> Tensor:
+        """Whole numbers ``[n, ...]``, equal where states are."""
+        known = [getattr(self.knowledge, part.name) for part in fields(self.knowledge)]
+        columns = [self.combination, self.belief, *self.throughout.values()]
+        columns = [as_whole_numbers(column)[:, None] for column in columns]
+        return torch.cat(columns + [as_whole_numbers(part).flatten(1) for part in known], 1)
+
+
+class _Course:
+    """Beliefs along a round, each worked out once however often it comes about.
+
+    Args:
+        human: the model of people.
+        combinations: values ``[M]`` of the discrete implants.
+        observation: ``[1, T, ...]``.
+        told: ``[1, T, K]``.
+        actions: ``[T]``.
+    """
+
+    def __init__(
+        self,
+        human: HumanModel,
+        combinations: Mapping[str, Tensor],
+        observation: Observation,
+        told: Visibility,
+        actions: Tensor,
+    ) -> None:
+        self.human, self.combinations, self.actions = human, combinations, actions
+        self.observation, self.told = observation, told
+        like = next(human.parameters())
+        self._beliefs = [like.new_zeros(1, human.belief_size)]
+        self._number = 1
+        self._known: dict[tuple[int, ...], int] = {}
+        # Steps at which the same was done before the same observation are alike to the encoder.
+        symbols = human.domain.symbols(observation)
+        symbols = [as_whole_numbers(value[0]).flatten(1) for value in symbols.values()]
+        rows = torch.cat(symbols, 1)
+        self._observed = (rows @ random_keys(rows.shape[1], rows.device, 1)).tolist()
+        self._done = [len(human.domain.actions), *actions.tolist()]
+
+    def beginning(self, number: int) -> _States:
+        """Of so many combinations before the first step, when every belief is zero."""
+        device = self.actions.device
+        every = torch.arange(number, device=device)
+        knowledge = self.human.domain.nothing_known(number, device=device)
+        return _States(every, {}, torch.zeros_like(every), knowledge)
+
+    def go(
+        self, states: _States, values: Mapping[str, Tensor], first: int, last: int, steps: int
+    ) -> tuple[_States, Tensor]:
+        """States after some steps, and the numbers of moments ``[n, T]`` on the way.
+
+        Args:
+            states: before them.
+            values: of attention ``[n]``.
+            first: of these steps.
+            last: the step after them.
+            steps: T.
+        """
+        number, belief, knowledge = states.number, states.belief, states.knowledge
+        sites = {name: own[states.combination] for name, own in self.combinations.items()}
+        moments = belief.new_full((number, steps), NO_VIEW)
+        for step in range(first, last):
+            now, told = (
+                {name: value[:, step] for name, value in part.items()}
+                for part in (self.observation, self.told)
+            )
+            view, knowledge = self.human.look({**sites, **values}, knowledge, now, told, step)
+            view = view.map(lambda part: part.expand(number, *part.shape[1:]))
+            knowledge = map_state(lambda part: part.expand(number, *part.shape[1:]), knowledge)
+            belief = self._after(belief, view, step)
+            moments[:, step] = belief * len(self.human.domain.actions) + self.actions[step]
+        throughout = dict(states.throughout)
+        return _States(states.combination, throughout, belief, knowledge), moments
+
+    def _after(self, belief: Tensor, view: View, step: int) -> Tensor:
+        """Beliefs ``[n]`` after looks at a step."""
+        looks = torch.stack([belief, view.numbers()], -1)
+        first, which = distinct_rows(looks)
+        still = None if view.still is None else view.still[first]
+        found, new = [], []
+        for place, (before, seen) in enumerate(looks[first].tolist()):
+            if still is not None and still[place]:
+                found.append(before)
+                continue
+            key = (before, seen, self._observed[step], self._done[step])
+            if key not in self._known:
+                self._known[key] = self._number
+                self._number += 1
+                new.append(place)
+            found.append(self._known[key])
+        if new:
+            some = first[new]
+            observation = {
+                name: value[:, step].expand(len(some), *value.shape[2:])
+                for name, value in self.observation.items()
+            }
+            evidence = self.human.evidence(view.map(lambda part: part[some]), observation)
+            before = torch.cat(self._beliefs)
+            self._beliefs = [before]
+            action = torch.full_like(some, self._done[step])
+            state = self.human.advance(before[belief[some]], evidence, action)
+            self._beliefs.append(state.mean)
+        return torch.tensor(found, device=belief.device)[which]
+
+    def moments(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Beliefs ``[N, Z]`` and actions ``[N]`` of the moments with these numbers."""
+        actions = len(self.human.domain.actions)
+        return torch.cat(self._beliefs)[numbers // actions], numbers % actions
+
+
+def _checked(
+    human: HumanModel, spans: Mapping[str, Span], supports: Mapping[str, Tensor], steps: int
+) -> Mapping[str, Span]:
+    """The spans, if they are as :meth:`HumanModel.spans` says."""
+    if not human.stepwise:
+        raise HumanModelError("a model with spans has to be stepwise")
+    if set(spans) != set(supports):
+        raise HumanModelError(
+            f"spans has to be of the sites of attend, {', '.join(supports)}; not of "
+            f"{', '.join(spans) or 'none'}"
+        )
+    begin = 0
+    for site, span in spans.items():
+        throughout = (span.first, span.last) == (0, steps)
+        if not begin <= span.first <= span.last <= steps or (throughout and begin > 0):
+            raise HumanModelError(
+                f'the span of "{site}", steps {span.first} to {span.last} of {steps}, begins '
+                "before the one before it is over"
+            )
+        if not 1 <= span.values <= len(supports[site]):
+            raise HumanModelError(
+                f'"{site}" has {len(supports[site])} values, not the {span.values} of its span'
+            )
+        begin = 0 if throughout else span.last
+    return spans

@@ -1,0 +1,130 @@
+"""Proposals for sites whose prior hangs on others, such as probabilities with a mean of their own.
+
+In unconstrained space such sites are a funnel: how far they spread depends on their parents, which
+no Gaussian follows. Taken relative to what their prior expects of them given the parents, ::
+
+    u = (x - m) / s        m, s  mean and standard deviation of the prior, in unconstrained space
+
+they are much nearer to one (the non-centred parametrization: Papaspiliopoulos, Roberts and Skold,
+*A general framework for the parametrization of hierarchical models*, 2007).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.models.human import HumanModel
+
+TRIED = 8
+"""Draws from the prior by which it is found what hangs on others."""
+
+
+@torch.no_grad()
+def dependent_sites(human: HumanModel, sites: Mapping[str, Any]) -> tuple[str, ...]:
+    """Those of the scalar sites whose prior differs from draw to draw of the others."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        nodes = sample_sites(human, 1, TRIED)
+    found = []
+    for name, site in sites.items():
+        moments = torch.stack(_moments(nodes[name]["fn"], site)).expand(2, TRIED, 1, 1)
+        if not bool((moments == moments[:, :1]).all()):
+            found.append(name)
+    return tuple(found)
+
+
+class RelativeGaussian:
+    """A Gaussian over scalar sites, those that hang on others relative to their prior.
+
+    Args:
+        human: the model of people.
+        sites: the D scalar sites, with the map from unconstrained space.
+        dependent: those that hang on others.
+        place: draws in unconstrained space ``[S, D]``.
+        fit: from draws ``[S, D]``, those that depend relative, to the Gaussian of these.
+    """
+
+    def __init__(
+        self,
+        human: HumanModel,
+        sites: Mapping[str, Any],
+        dependent: tuple[str, ...],
+        place: Tensor,
+        fit: Any,
+    ) -> None:
+        self.human, self.sites, self.dependent = human, sites, dependent
+        relative, _ = self._relative(place)
+        self.gaussian: MultivariateNormal = fit(relative)
+
+    def sample(self, sample_shape: torch.Size) -> Tensor:
+        """Draws ``[S, D]`` in unconstrained space."""
+        (number,) = sample_shape
+        relative = self.gaussian.sample(sample_shape)
+        placed = _Placed(self, relative)
+        with torch.random.fork_rng(devices=[]):
+            sample_sites(self.human, 1, number, handler=placed)
+        return torch.stack([placed.place[name] for name in self.sites], -1)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log density ``[S]`` in unconstrained space."""
+        relative, log_scale = self._relative(value)
+        return self.gaussian.log_prob(relative) - log_scale
+
+    @torch.no_grad()
+    def _relative(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Places ``[S, D]``, those that depend relative; and by how much that shrinks space."""
+        number, columns = len(place), place.unbind(-1)
+        given = {
+            name: site(column).view(number, 1, 1)
+            for (name, site), column in zip(self.sites.items(), columns, strict=True)
+        }
+        with torch.random.fork_rng(devices=[]):
+            nodes = sample_sites(self.human, 1, number, given)
+        relative, log_scale = [], place.new_zeros(number)
+        for (name, site), column in zip(self.sites.items(), columns, strict=True):
+            if name in self.dependent:
+                middle, scale = (part.view(-1) for part in _moments(nodes[name]["fn"], site))
+                column = (column - middle) / scale
+                log_scale = log_scale + scale.log()
+            relative.append(column)
+        return torch.stack(relative, -1), log_scale
+
+
+class _Placed(Messenger):
+    """Gives scalar sites their values, parents first, as the program goes on.
+
+    Attributes:
+        place: of each site in unconstrained space ``[S]``.
+    """
+
+    def __init__(self, proposal: RelativeGaussian, relative: Tensor) -> None:
+        super().__init__()
+        self.proposal = proposal
+        self.place: dict[str, Tensor] = {}
+        self._relative = dict(zip(proposal.sites, relative.unbind(-1), strict=True))
+
+    def _pyro_sample(self, msg: Any) -> None:
+        name, sites = msg["name"], self.proposal.sites
+        if name not in sites or name in self.place:
+            return
+        place = self._relative[name]
+        if name in self.proposal.dependent:
+            middle, scale = (part.view(-1) for part in _moments(msg["fn"], sites[name]))
+            place = middle + scale * place
+        self.place[name] = place
+        msg["value"] = sites[name](place).view(-1, 1, 1)
+        msg["done"] = True
+
+
+def _moments(fn: Any, site: Any) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of a prior in unconstrained space, to first order."""
+    middle = site.inv(fn.mean)
+    slope = site.log_abs_det_jacobian(middle, fn.mean)
+    return middle, fn.stddev * (-slope).exp()

@@ -1,0 +1,158 @@
+"""What people do next: the posterior predictive of their actions, step after step.
+
+Each action is predicted given what was done before it in its round. Attention, where it differs
+from round to round, is summed out, weighted by what those actions say of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.inference.exact import conditioned
+from mirror_ppl.inference.marginal_elbo import PLATES
+from mirror_ppl.models.chain import NEVER, NO_VALUE, Chain
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable
+
+DRAWS = 50
+"""Draws for which attention is summed out at once; bounds memory."""
+
+
+@torch.no_grad()
+def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
+    """Log-probabilities ``[S, P, B, T, A]`` of actions, for each draw of the implants.
+
+    Runs the same program as fitting, with the implants conditioned on the draws and each person
+    seeing what the draw says they see.
+    """
+    number = next(iter(draws.values())).shape[0]
+    if isinstance(table.attention, Chain):
+        parts = []
+        for begin in range(0, number, DRAWS):
+            some = {name: value[begin : begin + DRAWS] for name, value in draws.items()}
+            parts.append(_chained(human, table, table.attention, some))
+        return torch.cat(parts)
+    person = torch.arange(table.people, device=table.index.device)[:, None]
+    everybody = person[..., None]
+    belief, values = table.belief.flatten(1, 2), table.values.flatten(1, 2)
+    results = []
+    for draw in range(number):
+        own = {name: value[draw] for name, value in draws.items()}
+        with (
+            poutine.block(),
+            poutine.condition(data=own),
+            pyro.plate("person", table.people, dim=-PLATES),
+        ):
+            implants = human.prior()
+            sight = table.sight_of(implants).expand(table.people, table.rounds)
+            if table.attention is not None:
+                results.append(_attentive(human, implants, table, table.attention, sight))
+                continue
+            moments = table.moments[person, sight].clamp(min=0)  # [P, B, T]
+            results.append(
+                human.act(implants, belief[everybody, moments], values[everybody, moments])
+            )
+    return torch.stack(results)
+
+
+def _attentive(
+    human: HumanModel,
+    implants: Mapping[str, Tensor],
+    table: ViewTable,
+    attention: Attention,
+    sight: Tensor,
+) -> Tensor:
+    """Log-probabilities ``[P, B, T, A]`` with attention summed out, given what was done so far."""
+    person = torch.arange(table.people, device=sight.device)[:, None]
+    views = attention.sights[person, sight]  # [P, B, G']
+    moments = table.moments[person[..., None], views].clamp(min=0)  # [P, B, G', T]
+    each = human.act(implants, table.belief, table.values).flatten(-3, -2)
+    found = each.expand(table.people, *each.shape[-2:])[person[..., None, None], moments]
+    done = table.recorded[:, :, None, :, None].expand(*moments.shape, 1)
+    along = found.gather(-1, done).squeeze(-1).cumsum(-1)
+    weights = human.log_attention(
+        implants, attention.values, attention.log_weights, attention.facts
+    )
+    # What was done before a step tells what they attend to at it.
+    before = torch.nn.functional.pad(along[..., :-1], [1, 0])
+    before = torch.log_softmax(before + attention.shares(weights)[..., None], 2)
+    return torch.logsumexp(before[..., None] + found, 2)
+
+
+def _chained(
+    human: HumanModel, table: ViewTable, chain: Chain, draws: Mapping[str, Tensor]
+) -> Tensor:
+    """Log-probabilities ``[S, P, B, T, A]`` where attention is a chain: its forward recursion."""
+    number = len(next(iter(draws.values())))
+    with conditioned(draws, number, table.people):
+        implants = human.prior()
+        each = human.act(implants, table.belief, table.values).squeeze(-2)  # [S, P, N, A]
+        each = each.expand(number, table.people, *each.shape[-2:])
+        chances = chain.log_chances(human, implants, table.rounds)
+        chances = chances.expand(number, table.people, table.rounds, *chances.shape[-2:])
+        sight = table.sight_of(implants).expand(number, table.people, table.rounds)
+    acted = table.acted.squeeze(-1).expand(number, *table.acted.shape[:2])[..., None]
+    chosen = each.gather(-1, acted).squeeze(-1)  # [S, P, N]
+    *_, steps = table.recorded.shape
+    found = each.new_zeros(number, table.people, table.rounds, steps, each.shape[-1])
+    by_level = [chain.chances(chances, place) for place in range(len(chain.levels))]
+    for person, place in table.real.nonzero().tolist():
+        so_far = each.new_full((number, chain.sights), NEVER)
+        so_far.scatter_(1, sight[:, person, place, None], 0.0)
+        for level, own in zip(chain.levels, by_level, strict=True):
+            (states,) = (level.rounds[person] == place).nonzero(as_tuple=True)
+            real = level.value[person, states] != NO_VALUE  # [H, K]
+            moments = table.moments[person, level.view[person, states][real]]  # [E, T]
+            log_chance = own[:, person, states] + so_far[:, states, None]
+            log_chance = log_chance[:, real]  # [S, E]
+            now = (moments != NO_VIEW).any(0)
+            if now.any():
+                done, predicted = _along(
+                    moments[:, now], chosen[:, person], each[:, person], log_chance
+                )
+                found[:, person, place, now] = predicted
+                log_chance = log_chance + done
+            following = level.following[person, states][real]
+            so_far = _gathered(log_chance, following)
+    return found
+
+
+def _along(
+    moments: Tensor, chosen: Tensor, each: Tensor, log_chance: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The steps of a span.
+
+    Args:
+        moments: of E courses ``[E, T]``.
+        chosen: log-probabilities of what was done at each moment ``[S, N]``.
+        each: of every action ``[S, N, A]``.
+        log_chance: of each course before the span ``[S, E]``.
+
+    Returns:
+        The log-likelihood of each course ``[S, E]``, and log-probabilities ``[S, T, A]`` of
+        actions.
+    """
+    used, which = moments.unique(return_inverse=True)
+    taken = chosen[:, used][:, which]  # [S, E, T]
+    total = taken.cumsum(-1)
+    weights = torch.softmax(total - taken + log_chance[..., None], 1)
+    draws, _, steps = weights.shape
+    # Many courses are at the same moment.
+    place = torch.arange(steps, device=which.device) * len(used) + which
+    share = weights.new_zeros(draws, steps * len(used))
+    share.index_add_(1, place.flatten(), weights.flatten(1))
+    share = share.view(draws, steps, -1)
+    return total[..., -1], (share @ each[:, used].exp()).log()
+
+
+def _gathered(log_chance: Tensor, following: Tensor) -> Tensor:
+    """Log-probabilities ``[S, H]`` of states, of those ``[S, E]`` that lead to them."""
+    highest = log_chance.amax(1, keepdim=True)
+    total = log_chance.new_zeros(len(log_chance), int(following.max()) + 1)
+    total.index_add_(1, following, (log_chance - highest).exp())
+    return total.log().clamp(min=NEVER) + highest

@@ -1,0 +1,247 @@
+"""Attention that is read at one stretch of a round after another, summed out exactly.
+
+Where each site of ``attend`` counts at certain steps only (its :class:`Span`), what a person may
+have attended to need not be gone through combination by combination. What is left of the values
+read so far is the belief and the knowledge that they led to; many lead to the same. So the sum runs
+from the end of the round to its beginning, over *states* in which a span may begin::
+
+    L_i(h) = sum_m p(m_i = m | psi) prod_{t in span i} p(a_t | zH_t(h, m)) L_{i+1}(h'(h, m))
+
+where ``h'`` is the state in which the next span begins. This is the forward-backward recursion of
+hidden Markov models (Rabiner, *A tutorial on hidden Markov models*, 1989), with spans for steps.
+
+P stands for people, B for their rounds, S for states, K for values, V for views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+if TYPE_CHECKING:
+    from mirror_ppl.models.human import HumanModel, Implants
+
+NO_VALUE = -1
+"""Index of a value in padding."""
+NEVER = -1e30
+"""Logarithm of as good as no probability; finite, so that gradients are numbers."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """The steps of a round at which a site of ``attend`` is read.
+
+    Attributes:
+        first: the first of them.
+        last: the step after the last.
+        values: how many values of the site's support differ in what is seen there, from the first
+            on; all that follow see what the last of these does.
+    """
+
+    first: int
+    last: int
+    values: int
+
+
+@dataclass(frozen=True)
+class Level:
+    """All that may happen at the span of one site.
+
+    Attributes:
+        view: of the steps of that span, ``[P, S, K]``, an index into the V views.
+        value: that leads to it, an index into what :meth:`Chain.log_chances` gives of the site,
+            ``[P, S, K]``; ``NO_VALUE`` in padding.
+        following: the state in which the next span begins ``[P, S, K]``; of no meaning at the last.
+        rounds: the round of each state ``[P, S]``.
+    """
+
+    view: Tensor
+    value: Tensor
+    following: Tensor
+    rounds: Tensor
+
+    def at(self, states: Tensor) -> Level:
+        """Only some states ``[s]``."""
+        return Level(*(part[:, states] for part in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What people may have attended to in their rounds, span after span.
+
+    A combination of a person's implants has one *sight* of a round: a state of the first level.
+
+    Attributes:
+        supports: of the sites of ``attend``, ``[n]``, in the order of their spans.
+        levels: of each site.
+        facts: of the rounds ``[P, B]``, see `HumanModel.facts`.
+    """
+
+    supports: Mapping[str, Tensor]
+    levels: tuple[Level, ...]
+    facts: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def sights(self) -> int:
+        """Number of sights U, padding included."""
+        return self.levels[0].view.shape[1]
+
+    def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
+        """Log-probabilities of values ``[..., P, B, I, 2 n]`` of the I sites.
+
+        Of each value, then of each value or any that follows it. Runs inside the person plate.
+
+        Args:
+            human: the model of people.
+            implants: as :meth:`HumanModel.prior` returned them, ``[..., P, 1]``.
+            rounds: B.
+        """
+        people = self.levels[0].view.shape[0]
+        most = max(len(support) for support in self.supports.values())
+        # Shorter supports are filled up with their last value, which is then left out.
+        values = {
+            name: torch.cat([support, support[-1:].expand(most - len(support))]).expand(
+                people, rounds, most
+            )
+            for name, support in self.supports.items()
+        }
+        found = human.log_attention_sites(implants, values, self.facts)
+        parts = []
+        for name, support in self.supports.items():
+            own = pad(found[name][..., : len(support)], [0, most - len(support)], value=NEVER)
+            later = own.flip(-1).logcumsumexp(-1).flip(-1)
+            parts.append(torch.cat([own, later], -1))
+        return torch.stack(torch.broadcast_tensors(*parts), -2)
+
+    def marginal(self, likelihoods: Tensor, log_chances: Tensor) -> Tensor:
+        """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.
+
+        Args:
+            likelihoods: of the recorded actions under each view.
+            log_chances: see :meth:`log_chances`.
+        """
+        after = None
+        for number, level in reversed(list(enumerate(self.levels))):
+            score = _taken(likelihoods, level.view) + self.chances(log_chances, number)
+            if after is not None:
+                score = score + _taken(after, level.following)
+            score = torch.where(level.value == NO_VALUE, NEVER, score)
+            after = torch.logsumexp(score, -1)
+        assert after is not None
+        return after
+
+    def chances(self, log_chances: Tensor, number: int) -> Tensor:
+        """Of the values of one level, ``[..., P, S, K]``; see :meth:`log_chances`."""
+        level, own = self.levels[number], log_chances[..., number, :]
+        place = level.rounds[..., None] * own.shape[-1] + level.value.clamp(min=0)
+        return _taken(own.flatten(-2), place)
+
+    def kept(self, sights: Tensor) -> tuple[Chain, Tensor]:
+        """Of one person only some sights ``[u]``, and the views ``[v]`` that they lead to."""
+        levels, states = [], sights
+        for level in self.levels:
+            own = level.at(states)
+            states, following = _renumbered(own.following, own.value != NO_VALUE)
+            levels.append(replace(own, following=following))
+        everywhere = torch.cat([level.view[level.value != NO_VALUE] for level in levels])
+        views = everywhere.unique()
+        place = views.new_zeros(int(views.max()) + 1)
+        place[views] = torch.arange(len(views), device=views.device)
+        return replace(self, levels=tuple(levels)).of_views(place), views
+
+    def of_views(self, place: Tensor) -> Chain:
+        """With the view ``place[v]`` for each view v."""
+        levels = tuple(
+            replace(one, view=place[torch.where(one.value == NO_VALUE, one.view[0, 0, 0], one.view)])
+            for one in self.levels
+        )
+        return replace(self, levels=levels)
+
+    def of_person(self, person: int) -> Chain:
+        """Of one of the P people."""
+        levels = tuple(
+            Level(*(part[person : person + 1] for part in vars(level).values()))
+            for level in self.levels
+        )
+        facts = {name: fact[person : person + 1] for name, fact in self.facts.items()}
+        return Chain(self.supports, levels, facts)
+
+    @classmethod
+    def one_after_another(cls, rounds: Sequence[Chain], views: Sequence[int]) -> Chain:
+        """Of one person's rounds, of which each has so many ``views``."""
+        begins = [sum(views[:place]) for place in range(len(views))]
+        levels = []
+        for number in range(len(rounds[0].levels)):
+            own = [chain.levels[number] for chain in rounds]
+            behind = [
+                chain.levels[number + 1].view.shape[1] if number + 1 < len(chain.levels) else 0
+                for chain in rounds
+            ]
+            width = max(level.view.shape[-1] for level in own)
+            parts = []
+            for place, (level, begin) in enumerate(zip(own, begins, strict=True)):
+                missing = [0, width - level.view.shape[-1]]
+                parts.append(
+                    (
+                        pad(level.view + begin, missing, value=begin),
+                        pad(level.value, missing, value=NO_VALUE),
+                        pad(level.following + sum(behind[:place]), missing),
+                        torch.full_like(level.rounds, place),
+                    )
+                )
+            levels.append(Level(*(torch.cat(some, 1) for some in zip(*parts, strict=True))))
+        facts = {
+            name: torch.cat([chain.facts[name] for chain in rounds], 1) for name in rounds[0].facts
+        }
+        return cls(rounds[0].supports, tuple(levels), facts)
+
+    @classmethod
+    def of_people(cls, people: Sequence[Chain]) -> Chain:
+        """Of P people, of each of whom there is one; all have facts of the same number of rounds."""
+        levels = []
+        for own in zip(*(chain.levels for chain in people), strict=True):
+            states = max(level.view.shape[1] for level in own)
+            width = max(level.view.shape[2] for level in own)
+            levels.append(
+                Level(
+                    _padded([level.view for level in own], states, width, 0),
+                    _padded([level.value for level in own], states, width, NO_VALUE),
+                    _padded([level.following for level in own], states, width, 0),
+                    torch.cat(
+                        [pad(level.rounds, [0, states - level.rounds.shape[1]]) for level in own]
+                    ),
+                )
+            )
+        facts = {
+            name: torch.cat([chain.facts[name] for chain in people]) for name in people[0].facts
+        }
+        return cls(people[0].supports, tuple(levels), facts)
+
+
+def _padded(parts: Sequence[Tensor], states: int, width: int, fill: int) -> Tensor:
+    """Of P people ``[1, s, k]`` as ``[P, states, width]``."""
+    return torch.cat(
+        [
+            pad(part, [0, width - part.shape[2], 0, states - part.shape[1]], value=fill)
+            for part in parts
+        ]
+    )
+
+
+def _taken(values: Tensor, place: Tensor) -> Tensor:
+    """Of values ``[..., P, n]`` those at ``[P, S, K]``: ``[..., P, S, K]``."""
+    found = values.gather(-1, place.flatten(-2).expand(*values.shape[:-1], -1))
+    return found.unflatten(-1, place.shape[-2:])
+
+
+def _renumbered(following: Tensor, real: Tensor) -> tuple[Tensor, Tensor]:
+    """The states that are reached ``[s]``, and what follows, numbered among them."""
+    states = following[real].unique()
+    place = states.new_zeros(int(following.max()) + 1)
+    place[states] = torch.arange(len(states), device=states.device)
+    return states, torch.where(real, place[following], 0)

@@ -1,0 +1,136 @@
+"""Attention summed out span by span, against every combination of its values by itself."""
+
+from dataclasses import replace
+from itertools import product
+
+import pyro
+import pytest
+import torch
+from pyro import poutine
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains.bomb_defusal import BombDefusal
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.exact import conditioned, log_joints
+from mirror_ppl.inference.predictive import predict_actions
+from mirror_ppl.inference.prior import draw_prior
+from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.models.chain import Span
+from mirror_ppl.models.searcher import Searcher
+from mirror_ppl.models.self_model import SelfModel
+
+WORLD = BombDefusal()
+WAIT = 0
+ACTIONS = ((WAIT, WAIT, 1, 2, WAIT, WAIT, 4), (3, WAIT, 1), (WAIT, WAIT))
+"""Rounds that end with the third press, and one that ends before."""
+TELLING = (1, 4)
+"""When the type is told, and when the second terminal is shown, in the first round."""
+
+
+@pytest.fixture(scope="module")
+def searcher():
+    torch.manual_seed(0)
+    human = Searcher(SelfModel(WORLD))
+    with torch.no_grad():  # actions that hang on beliefs, as those of a trained self-model do
+        for weight in human.self_model.q_network.parameters():
+            weight.mul_(2.0)
+    return human
+
+
+def recorded(courses=ACTIONS, told=True):
+    """Rounds of one person."""
+    rounds, steps = len(courses), max(len(course) for course in courses)
+    actions = torch.full((1, rounds, steps), WAIT)
+    for place, course in enumerate(courses):
+        actions[0, place, : len(course)] = torch.tensor(course)
+    state = WORLD.initial(rounds, torch.Generator().manual_seed(3))
+    observed = [WORLD.observe(state)]
+    for step in range(steps):
+        state = WORLD.transition(state, actions[0, :, step])
+        observed.append(WORLD.observe(state))
+    observation = {name: torch.stack([o[name] for o in observed], 1)[None] for name in observed[0]}
+    heard = {
+        "visual": torch.zeros(1, rounds, steps, 6, dtype=torch.bool),
+        "verbal": torch.zeros(1, rounds, steps, 1, dtype=torch.bool),
+    }
+    if told:
+        heard["verbal"][0, 0, TELLING[0]] = True
+        heard["visual"][0, 0, TELLING[1]] = WORLD.sought(
+            {name: value[0, 0, TELLING[1]] for name, value in observation.items()}
+        )
+    return Demonstrations(
+        domain=WORLD.name,
+        setting="unlabelled",
+        people=("somebody",),
+        ego=observation.pop("ego"),
+        observations=observation,
+        actions=actions,
+        told=heard,
+        round_counts=torch.tensor([rounds]),
+        lengths=torch.tensor([[len(course) for course in courses]]),
+    )
+
+
+def by_combination(human, rounds, draws):
+    """Log-probabilities ``[S, t, A]`` of actions in each round, and of all that was done ``[S]``.
+
+    Every guess with every time at which each terminal may have been found, one by one.
+    """
+    number = len(draws["reads_type"])
+    total, predicted = torch.zeros(number), []
+    for observation, told, actions, real in rounds_of(rounds, 0):
+        steps = int(real.sum())
+        seen = {name: value[:, :steps] for name, value in observation.items()}
+        heard = {name: mask[:, :steps] for name, mask in told.items()}
+        stage = seen["ego"][0, :, 0]
+        lengths = [int((stage == number).sum()) for number in range(3)]
+        facts = {name: fact.view(1, 1) for name, fact in human.facts(
+            {name: value[0] for name, value in seen.items()}).items()}
+        joint, along = [], []
+        for guess, *found in product((0, 1), *(range(length + 1) for length in lengths)):
+            chance = torch.full((number,), 0.5).log()
+            for place, (time, length) in enumerate(zip(found, lengths, strict=True)):
+                terminal = 1 + int(facts[f"sought_{place}"])
+                p = draws[f"notices_terminal {terminal}"].flatten()
+                if time < length:
+                    chance = chance + p.log()
+                chance = chance + time * torch.log1p(-p)
+            values = {"guess": guess, **{f"found_{k}": time for k, time in enumerate(found)}}
+            attention = {name: torch.tensor([value]) for name, value in values.items()}
+            each = []
+            for draw in range(number):
+                sites = {"reads_type": draws["reads_type"][draw, 0], **attention}
+                view = human.perceive(sites, seen, heard)
+                belief = human.believe(
+                    view.map(lambda part: part.expand(1, *part.shape[1:])), seen, actions[:, :steps]
+                )[None]
+                own = {name: value[draw : draw + 1] for name, value in draws.items()}
+                with conditioned(own, 1, 1):
+                    found_here = human.act(human.prior(), belief, human.action_values(belief))
+                each.append(found_here[0, 0, 0])
+            each = torch.stack(each)  # [S, t, A]
+            done = each.gather(-1, actions[:, :steps, None].expand(number, -1, 1)).squeeze(-1)
+            before = done.cumsum(-1) - done
+            along.append((chance[:, None] + before)[..., None] + each)
+            joint.append(chance + done.sum(-1))
+        along = torch.stack(along).logsumexp(0)
+        predicted.append(along - along.logsumexp(-1, keepdim=True))
+        total = total + torch.stack(joint).logsumexp(0)
+    return predicted, total
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_the_sum_is_that_over_all_combinations(searcher, told):
+    rounds = recorded(told=told)
+    draws = draw_prior(searcher, 1, 4, 0)
+    draws["reads_type"] = torch.tensor([0, 0, 1, 0]).view(4, 1, 1)
+    predicted, total = by_combination(searcher, rounds, draws)
+    table = build_view_table(searcher, rounds)
+    joints = log_joints(searcher, table, {n: v for n, v in draws.items() if n not in table.sites})
+    chosen = joints[torch.arange(4), 0, draws["reads_type"].flatten()]
+    torch.testing.assert_close(chosen - torch.tensor(0.5).log(), total, rtol=1e-4, atol=1e-4)
+    found = predict_actions(searcher, table, draws)[:, 0]
+    for place, expected in enumerate(predicted):
+        steps = expected.shape[1]
+        torch.testing.assert_close(found[:, place, :steps], expected, rtol=1e-4, atol=1e-4)
