@@ -12,7 +12,7 @@ from mirror_ppl.inference.alike import Alike, fixed_prior
 from mirror_ppl.inference.combinations import grid_of, perceived_sites
 from mirror_ppl.inference.exact import combination_values, log_joints
 from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.importance import Sampler
+from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -29,7 +29,8 @@ from mirror_ppl.inference.exact import acts_on_beliefs
 from mirror_ppl.inference.guide_file import load_guide, network_for, save_guide
 from mirror_ppl.inference.guide_training import GuideOptions, simulate_examples, train_guide
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
-from mirror_ppl.inference.importance import ImportanceOptions, Sampler, places, scalar_sites
+from mirror_ppl.inference.importance import ImportanceOptions
+from mirror_ppl.inference.sampler import Sampler, places, scalar_sites
 from mirror_ppl.inference.sightings import Sightings
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import FitOptions

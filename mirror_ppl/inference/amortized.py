@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from mirror_ppl.inference.alike import Alike
-from mirror_ppl.inference.importance import Sampler, Weighted, places, scalar_sites
+from mirror_ppl.inference.sampler import Sampler, Weighted, places, scalar_sites
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import layers

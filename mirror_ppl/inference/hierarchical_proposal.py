@@ -11,7 +11,7 @@ they are much nearer to one (the non-centred parametrization: Papaspiliopoulos, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -57,11 +57,11 @@ class RelativeGaussian:
         sites: Mapping[str, Any],
         dependent: tuple[str, ...],
         place: Tensor,
-        fit: Any,
+        fit: Callable[[Tensor], MultivariateNormal],
     ) -> None:
         self.human, self.sites, self.dependent = human, sites, dependent
         relative, _ = self._relative(place)
-        self.gaussian: MultivariateNormal = fit(relative)
+        self.gaussian = fit(relative)
 
     def sample(self, sample_shape: torch.Size) -> Tensor:
         """Draws ``[S, D]`` in unconstrained space."""

@@ -1,45 +1,25 @@
 """Posteriors by importance: how a person may decide, weighted by what their rounds say of it.
 
-Draws of the sites that perception does not read (how somebody decides) come from a proposal; what
-they see is marginalized exactly under each of them. With S draws ``psi_s ~ q`` of a person::
-
-    w_s = p(psi_s) sum_m p(m | psi_s) p(actions | m, psi_s) / q(psi_s)
-
-where ``m`` runs over all combinations of the discrete sites that perception reads. So the posterior
-is right whatever the proposal, if it has enough draws; Pareto k tells whether it has (Vehtari,
-Simpson, Gelman, Yao and Gabry, *Pareto smoothed importance sampling*, 2015).
+Draws of the sites that perception does not read (how somebody decides) come from a proposal that is
+adapted stage by stage; what they see is marginalized exactly under each of them. So the posterior
+is right whatever the proposal, if it has enough draws (:mod:`mirror_ppl.inference.sampler`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal, biject_to
+from torch.distributions import MultivariateNormal
 
-from mirror_ppl.inference.alike import Alike, fixed_prior
-from mirror_ppl.inference.exact import (
-    combination_values,
-    expected_counts,
-    log_joints,
-    require_acting_on_beliefs,
-)
-from mirror_ppl.inference.prior import Draws, sample_sites, values_of
-from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
-from mirror_ppl.inference.views import restricted
+from mirror_ppl.inference.hierarchical_proposal import RelativeGaussian, dependent_sites
+from mirror_ppl.inference.sampler import Proposal, Sampler, Weighted, places
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
-ANYHOW = 0.1
-"""Share of what is proposed with a residual from the prior."""
 PLAIN_STAGES = 2
 """Stages that propose scalar sites alone, which is enough where a residual hardly matters."""
-LEARNED_FROM = 64
-"""Draws by which it is learned where to look for the residual."""
 PRUNING_DRAWS = 64
 """Draws from the prior after which combinations of discrete sites are given up."""
 
@@ -69,210 +49,6 @@ class ImportanceOptions:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
 
 
-@dataclass(frozen=True)
-class Weighted:
-    """Weighted draws of one person's implants.
-
-    Attributes:
-        policy: values of the sites that perception does not read, ``[S, 1, 1, ...]``.
-        alike: combinations of the discrete sites that it reads, those still possible; G sets.
-        log_joint: log-probability of each of these sets and of the recorded actions under each
-            draw, ``[S, G]``, up to what all of them share.
-        log_weights: normalized and Pareto-smoothed, ``[S]``.
-        pareto_k: of the weights.
-    """
-
-    policy: Draws
-    alike: Alike
-    log_joint: Tensor
-    log_weights: Tensor
-    pareto_k: float
-
-    @property
-    def effective(self) -> float:
-        """Effective number of draws."""
-        return float(1 / self.log_weights.exp().square().sum())
-
-    def sample(self, number: int, values: Mapping[str, Tensor]) -> Draws:
-        """Joint draws ``[number, 1, 1, ...]`` of all sites from the global random state.
-
-        Args:
-            number: of draws.
-            values: of the discrete sites for every combination, ``[M]``.
-        """
-        # Systematic resampling, in random order: draws are repeated as little as can be.
-        ladder = (torch.arange(number) + torch.rand(())) / number
-        place = torch.searchsorted(self.log_weights.exp().cumsum(0), ladder.to(self.log_weights))
-        place = place.clamp(max=len(self.log_weights) - 1)[torch.randperm(number)]
-        # By the inverse of their distribution; multinomial is slow where there are many.
-        distinct, which = place.unique(return_inverse=True)
-        ladder = torch.softmax(self.log_joint[distinct].double(), -1).cumsum(-1)[which]
-        chosen = torch.searchsorted(ladder, ladder[:, -1:] * torch.rand_like(ladder[:, :1]))
-        combination = self.alike.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))[:, None]
-        discrete = {site: value[combination][..., None] for site, value in values.items()}
-        return {name: value[place] for name, value in self.policy.items()} | discrete
-
-
-class Proposal(Protocol):
-    """A density over the scalar sites in unconstrained space; torch distributions are such."""
-
-    def sample(self, sample_shape: torch.Size) -> Tensor:
-        """Draws ``[S, D]``."""
-        ...
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Log density ``[S]``."""
-        ...
-
-
-class Sampler:
-    """Draws of one person from several proposals, the first of which is the prior.
-
-    Every draw is weighted by the mixture of all that was proposed (Veach and Guibas, *Optimally
-    combining sampling techniques for Monte Carlo rendering*, 1995), so that weights are bounded.
-    Proposals are of the scalar sites; all others are drawn from the prior given those.
-
-    Args:
-        human: the model of people.
-        table: views of one person's rounds.
-        alike: the possible combinations, if they are known.
-        sites: see :func:`scalar_sites`, of a model that is known to act on beliefs alone; looked
-            up and checked unless given.
-
-    Raises:
-        HumanModelError: actions depend on what is seen otherwise than through beliefs.
-
-    Attributes:
-        alike: combinations of the discrete sites that are still possible.
-        place: the scalar sites of all draws, in unconstrained space ``[S, D]``.
-    """
-
-    def __init__(
-        self,
-        human: HumanModel,
-        table: ViewTable,
-        alike: Alike | None = None,
-        sites: Mapping[str, Any] | None = None,
-    ) -> None:
-        if sites is None:
-            require_acting_on_beliefs(human, table)
-        self.human = human
-        self.table = table
-        self.sites = scalar_sites(human) if sites is None else sites
-        if alike is None:
-            alike = Alike.of(table, fixed_prior(human, combination_values(human, table)))
-        self.alike = alike
-        self.place = torch.zeros(0, len(self.sites), device=table.index.device)
-        self._from_prior = 0
-        self._proposals: list[tuple[int, Proposal]] = []
-        self._policies: list[Draws] = []
-        self._joints: list[Tensor] = []
-        self._log_prior = torch.zeros(0, device=table.index.device)
-        self._residual: ResidualProposal | None = None
-        self._log_residual = torch.zeros(2, 0, device=table.index.device)
-
-    def draw(self, number: int) -> None:
-        """Draw from the prior."""
-        policy, _ = complete(self.human, self.table, {}, number)
-        self.take(policy, self._joint(policy, number))
-
-    def take(self, policy: Draws, joint: Tensor) -> None:
-        """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
-        place = places(self.sites, policy, len(joint))
-        given = {name: policy[name] for name in self.sites}
-        _, log_prior = complete(self.human, self.table, given, len(joint))
-        self._add(policy, joint, place, log_prior)
-        self._from_prior += len(joint)
-
-    def prune(self, margin: float) -> None:
-        """Give up combinations that are behind the best by more than that under every draw."""
-        joint = torch.cat(self._joints)
-        keep = (joint - joint.max()).amax(0) >= -margin
-        self.alike = self.alike.kept(keep)
-        self._joints = [joint[:, keep] for joint in self._joints]
-        if self.table.real.any():
-            alive = torch.zeros_like(self.table.index[:, 0], dtype=torch.bool)
-            alive[0, self.alike.members] = True
-            self.table = restricted(self.table, alive)
-
-    def learn_residual(self) -> None:
-        """From now on propose the residual, too, by what is known so far.
-
-        A share of :data:`ANYHOW` of what is proposed has a residual from the prior all the same.
-        """
-        found = self.weighted()
-        if SITE not in found.policy or not self.table.real.any():
-            return
-        best = found.log_weights.topk(min(LEARNED_FROM, len(found.log_weights))).indices
-        counts = expected_counts(
-            self.human,
-            self.table,
-            {name: value[best] for name, value in found.policy.items()},
-            found.log_weights[best],
-            self.alike.first,
-            self.alike.log_prior if self.alike.fixed else None,
-        )
-        self._residual = ResidualProposal.of(self.human, self.table, counts)
-        self._log_residual = self._residual_densities(
-            found.policy, self._residual.gaussian(found.policy)
-        )
-
-    def _residual_densities(self, policy: Draws, gaussian: MultivariateNormal) -> Tensor:
-        """Log densities ``[2, S]`` of residuals, by the prior and as proposed."""
-        own = {SITE: policy[SITE]}
-        _, prior = complete(self.human, self.table, own, len(policy[SITE]))
-        return torch.stack([prior, gaussian.log_prob(policy[SITE].flatten(1))])
-
-    def propose(self, proposal: Proposal, number: int) -> None:
-        """Draw some more."""
-        place = proposal.sample(torch.Size([number]))
-        given = {
-            name: site(place[:, column]).view(number, 1, 1)
-            for column, (name, site) in enumerate(self.sites.items())
-        }
-        policy, log_prior = complete(self.human, self.table, given, number)
-        if self._residual is not None:
-            gaussian = self._residual.gaussian(policy)
-            own = policy[SITE]
-            drawn = gaussian.sample().view(own.shape)
-            anyhow = torch.arange(number, device=own.device) < ANYHOW * number
-            policy[SITE] = torch.where(anyhow.view(number, *(1,) * (own.dim() - 1)), own, drawn)
-            found = self._residual_densities(policy, gaussian)
-            self._log_residual = torch.cat([self._log_residual, found], 1)
-        self._add(policy, self._joint(policy, number), place, log_prior)
-        self._proposals.append((number, proposal))
-
-    def _add(self, policy: Draws, joint: Tensor, place: Tensor, log_prior: Tensor) -> None:
-        self._policies.append(policy)
-        self._joints.append(joint)
-        self.place = torch.cat([self.place, place])
-        self._log_prior = torch.cat([self._log_prior, log_prior + _stretch(self.sites, place)])
-
-    def weighted(self) -> Weighted:
-        """All draws, with their weights."""
-        joint = torch.cat(self._joints)
-        log_prior, either = self._log_prior, torch.zeros_like(self._log_prior)
-        if self._residual is not None:
-            prior, proposed = self._log_residual
-            log_prior = log_prior + prior
-            either = torch.logaddexp(prior + math.log(ANYHOW), proposed + math.log1p(-ANYHOW))
-        parts = [log_prior + math.log(self._from_prior / len(joint))]
-        for number, proposal in self._proposals:
-            parts.append(proposal.log_prob(self.place) + either + math.log(number / len(joint)))
-        mixture = torch.logsumexp(torch.stack(parts), 0)
-        log_weights, pareto_k = _smoothed(joint.logsumexp(-1) + log_prior - mixture)
-        policy = {
-            name: torch.cat([one[name] for one in self._policies]) for name in self._policies[0]
-        }
-        return Weighted(policy, self.alike, joint, log_weights, pareto_k)
-
-    def _joint(self, policy: Draws, number: int) -> Tensor:
-        alike = self.alike
-        prior = alike.log_prior if alike.fixed else None
-        joint = log_joints(self.human, self.table, policy, alike.first, prior)[:, 0]
-        return joint.expand(number, -1)
-
-
 @torch.no_grad()
 def sample_exactly(
     human: HumanModel,
@@ -283,8 +59,9 @@ def sample_exactly(
     """Weighted draws of one person by adaptive importance sampling.
 
     The first stage draws from the prior; each that follows draws the scalar sites from a Gaussian,
-    in unconstrained space, that has the moments of the weighted draws so far. If that is not
-    enough after a few stages, those that follow propose the residual of the policy, too.
+    in unconstrained space, that has the moments of the weighted draws so far, and discrete sites of
+    the policy by how probable they are so far. If that is not enough after a few stages, those that
+    follow propose the residual of the policy, too.
 
     Args:
         human: the model of people.
@@ -293,12 +70,22 @@ def sample_exactly(
         near: draws from much the same posterior, whose moments are used from the first stage on.
     """
     sampler = Sampler(human, table)
+    dependent = dependent_sites(human, sampler.sites)
+
+    def near_to(place: Tensor, log_weights: Tensor) -> Proposal:
+        def fit(some: Tensor) -> MultivariateNormal:
+            return _gaussian(some, log_weights, options.wider)
+
+        if not dependent:
+            return fit(place)
+        return RelativeGaussian(human, sampler.sites, dependent, place, fit)
+
     few = min(PRUNING_DRAWS, options.proposals)
     sampler.draw(few)
     sampler.prune(options.prune_margin)
     if near is not None and sampler.sites:
         found = places(sampler.sites, near.policy)
-        sampler.propose(_gaussian(found, near.log_weights, options.wider), options.proposals)
+        sampler.propose(near_to(found, near.log_weights), options.proposals)
     elif options.proposals > few:
         sampler.draw(options.proposals - few)
     for stage in range(options.stages if sampler.sites else 0):
@@ -307,53 +94,9 @@ def sample_exactly(
             return found
         if stage == PLAIN_STAGES:
             sampler.learn_residual()
-        gaussian = _gaussian(sampler.place, found.log_weights, options.wider)
-        sampler.propose(gaussian, options.proposals)
+        sampler.learn_discrete()
+        sampler.propose(near_to(sampler.place, found.log_weights), options.proposals)
     return sampler.weighted()
-
-
-@torch.no_grad()
-def complete(
-    human: HumanModel, table: ViewTable, given: Mapping[str, Tensor], number: int
-) -> tuple[Draws, Tensor]:
-    """Draws ``[S, 1, 1, ...]`` of every site that views do not depend on, some of them given.
-
-    Returns:
-        The draws, those that are not given from the prior; and the log prior density ``[S]`` of
-        those that are given.
-    """
-    nodes = sample_sites(human, 1, number, given)
-    values = values_of(nodes)
-    log_prior = torch.zeros(number, device=table.index.device)
-    for name in given:
-        log_prior = log_prior + nodes[name]["fn"].log_prob(values[name]).view(number)
-    policy = {name: value for name, value in values.items() if name not in table.sites}
-    return policy, log_prior
-
-
-def scalar_sites(human: HumanModel) -> dict[str, Any]:
-    """Continuous sites of one number a person, with the map from unconstrained space."""
-    with torch.random.fork_rng(devices=[]):
-        return {
-            name: biject_to(node["fn"].support)
-            for name, node in sample_sites(human, 1).items()
-            if not node["fn"].has_enumerate_support and node["fn"].event_dim == 0
-        }
-
-
-def places(sites: Mapping[str, Any], policy: Mapping[str, Tensor], number: int = 0) -> Tensor:
-    """The scalar sites of draws in unconstrained space, ``[S, D]``; S is given if D is 0."""
-    if not sites:
-        return torch.zeros(number, 0)
-    return torch.stack([site.inv(policy[name].flatten()) for name, site in sites.items()], -1)
-
-
-def _stretch(sites: Mapping[str, Any], place: Tensor) -> Tensor:
-    """Log of by how much space is stretched on the way from unconstrained space, ``[S]``."""
-    total = place.new_zeros(len(place))
-    for column, site in enumerate(sites.values()):
-        total = total + site.log_abs_det_jacobian(place[:, column], site(place[:, column]))
-    return total
 
 
 def _gaussian(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateNormal:
@@ -364,14 +107,3 @@ def _gaussian(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateN
     # Where few draws have all the weight, their spread says nothing.
     floor = 1e-3 * place.var(0) + 1e-8
     return MultivariateNormal(mean, covariance + torch.diag(floor))
-
-
-def _smoothed(raw: Tensor) -> tuple[Tensor, float]:
-    """Normalized, Pareto-smoothed log weights ``[S]`` and their Pareto k."""
-    raw = raw.double()
-    if float(raw.max() - raw.min()) < 1e-9:
-        return torch.log_softmax(raw, 0), -math.inf
-    from mirror_ppl.inference.export import az
-
-    smooth, pareto_k = az.psislw(raw.cpu().numpy())
-    return torch.log_softmax(torch.as_tensor(smooth, device=raw.device), 0), float(pareto_k)

@@ -9,13 +9,9 @@ import torch
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
-from mirror_ppl.inference.importance import (
-    ImportanceOptions,
-    Weighted,
-    sample_exactly,
-    scalar_sites,
-)
+from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.prior import Draws, sample_sites
+from mirror_ppl.inference.sampler import Weighted, scalar_sites
 from mirror_ppl.inference.second_look import Round, looks_twice, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import rounds_of

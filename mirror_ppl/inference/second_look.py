@@ -13,7 +13,8 @@ from dataclasses import replace
 from torch import Tensor
 
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.importance import ImportanceOptions, Weighted, sample_exactly
+from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.models.human import HumanModel
 
