@@ -20,10 +20,10 @@ from mirror_ppl.inference.exact import log_joints
 from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.online import OnlinePosterior
+from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.svi import FitOptions
 from mirror_ppl.inference.views import (
     _joined,

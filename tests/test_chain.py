@@ -1,22 +1,16 @@
 """Attention summed out span by span, against every combination of its values by itself."""
 
-from dataclasses import replace
 from itertools import product
 
-import pyro
 import pytest
 import torch
-from pyro import poutine
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.bomb_defusal import BombDefusal
-from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.exact import conditioned, log_joints
 from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import build_view_table, rounds_of
-from mirror_ppl.models.chain import Span
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 
@@ -85,8 +79,10 @@ def by_combination(human, rounds, draws):
         heard = {name: mask[:, :steps] for name, mask in told.items()}
         stage = seen["ego"][0, :, 0]
         lengths = [int((stage == number).sum()) for number in range(3)]
-        facts = {name: fact.view(1, 1) for name, fact in human.facts(
-            {name: value[0] for name, value in seen.items()}).items()}
+        facts = {
+            name: fact.view(1, 1)
+            for name, fact in human.facts({name: value[0] for name, value in seen.items()}).items()
+        }
         joint, along = [], []
         for guess, *found in product((0, 1), *(range(length + 1) for length in lengths)):
             chance = torch.full((number,), 0.5).log()

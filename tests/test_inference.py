@@ -18,9 +18,9 @@ from mirror_ppl.errors import CheckpointError
 from mirror_ppl.inference.exact import draw_combinations, log_joint, log_prior, marginals
 from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.svi import (
     FitOptions,
     _draw_by_enumeration,

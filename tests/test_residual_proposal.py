@@ -6,8 +6,8 @@ import torch
 from mirror_ppl.inference import importance, residual_proposal
 from mirror_ppl.inference.exact import expected_counts
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
-from mirror_ppl.inference.sampler import Sampler, complete
 from mirror_ppl.inference.residual_proposal import ResidualProposal, _laplace
+from mirror_ppl.inference.sampler import Sampler, complete
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.views import rounds_of

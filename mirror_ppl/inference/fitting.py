@@ -20,9 +20,9 @@ from mirror_ppl.inference.amortized import AmortizedGuide
 from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.pooling import Pooling, Population
+from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.summary import summarize, summarize_newcomer
-from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models.human import HumanModel

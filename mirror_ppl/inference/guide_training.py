@@ -29,8 +29,8 @@ from mirror_ppl.inference.amortized import (
 )
 from mirror_ppl.inference.calibration import prior_people
 from mirror_ppl.inference.guides import run_identity
-from mirror_ppl.inference.sampler import places, scalar_sites
 from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.inference.sampler import places, scalar_sites
 from mirror_ppl.inference.sightings import Sightings
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent

@@ -31,9 +31,9 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from mirror_ppl.inference.sampler import places, scalar_sites
 from mirror_ppl.inference.nuts import run_chain
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
+from mirror_ppl.inference.sampler import places, scalar_sites
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 

@@ -33,6 +33,8 @@ DRAWS = 128
 """What is worked out at once; bounds memory."""
 MOMENTS = 1024
 """So many moments are looked at, those that are expected to have come about most often."""
+COUNTED = 0.99
+"""Or fewer, if this share of all that was done was done at them."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,9 @@ class ResidualProposal:
         counts = counts.flatten(0, 1)
         belief, values = (part[0].flatten(0, 1) for part in (table.belief, table.values))
         often = counts.sum(-1)
-        some = often.topk(min(MOMENTS, len(often))).indices
+        ordered, places = often.sort(descending=True)
+        most = int((ordered.cumsum(0) < COUNTED * ordered.sum()).sum()) + 1
+        some = places[: min(most, MOMENTS)]
         # Each of the others counts as the one in which somebody believes much the same.
         nearest = torch.cdist(belief, belief[some]).argmin(-1)
         counts = counts.new_zeros(len(some), counts.shape[-1]).index_add(0, nearest, counts)

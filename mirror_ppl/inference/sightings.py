@@ -258,9 +258,7 @@ class Sightings:
         """The same where attention is summed out exactly."""
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
-        found = chained_views(
-            self.human, candidates, len(alive), observation, told, actions, real
-        )
+        found = chained_views(self.human, candidates, len(alive), observation, told, actions, real)
         values = torch.cat([self.human.action_values(some) for some in found.belief.split(CHUNK)])
         part = RoundViews(
             found.moments, found.belief[:, None], values[:, None], found.acted[:, None]

@@ -157,7 +157,9 @@ class Chain:
     def of_views(self, place: Tensor) -> Chain:
         """With the view ``place[v]`` for each view v."""
         levels = tuple(
-            replace(one, view=place[torch.where(one.value == NO_VALUE, one.view[0, 0, 0], one.view)])
+            replace(
+                one, view=place[torch.where(one.value == NO_VALUE, one.view[0, 0, 0], one.view)]
+            )
             for one in self.levels
         )
         return replace(self, levels=levels)
@@ -202,7 +204,7 @@ class Chain:
 
     @classmethod
     def of_people(cls, people: Sequence[Chain]) -> Chain:
-        """Of P people, of each of whom there is one; all have facts of the same number of rounds."""
+        """Of P people, of each of whom there is one, with facts of as many rounds."""
         levels = []
         for own in zip(*(chain.levels for chain in people), strict=True):
             states = max(level.view.shape[1] for level in own)
