@@ -57,7 +57,7 @@ class Level:
         value: that leads to it, an index into what :meth:`Chain.log_chances` gives of the site,
             ``[P, S, K]``; ``NO_VALUE`` in padding.
         following: the state in which the next span begins ``[P, S, K]``; of no meaning at the last.
-        rounds: the round of each state ``[P, S]``.
+        rounds: the round of each state ``[P, S]``; ``NO_VALUE`` in padding.
     """
 
     view: Tensor
@@ -138,7 +138,7 @@ class Chain:
     def chances(self, log_chances: Tensor, number: int) -> Tensor:
         """Of the values of one level, ``[..., P, S, K]``; see :meth:`log_chances`."""
         level, own = self.levels[number], log_chances[..., number, :]
-        place = level.rounds[..., None] * own.shape[-1] + level.value.clamp(min=0)
+        place = level.rounds[..., None].clamp(min=0) * own.shape[-1] + level.value.clamp(min=0)
         return _taken(own.flatten(-2), place)
 
     def kept(self, sights: Tensor) -> tuple[Chain, Tensor]:
@@ -214,9 +214,7 @@ class Chain:
                     _padded([level.view for level in own], states, width, 0),
                     _padded([level.value for level in own], states, width, NO_VALUE),
                     _padded([level.following for level in own], states, width, 0),
-                    torch.cat(
-                        [pad(level.rounds, [0, states - level.rounds.shape[1]]) for level in own]
-                    ),
+                    _padded([level.rounds[..., None] for level in own], states, 1, NO_VALUE)[..., 0],
                 )
             )
         facts = {
