@@ -1,9 +1,12 @@
 """Where to look for a residual: the Gaussian that is proposed, what it is learned from, weights."""
 
+import math
+
 import pytest
 import torch
 
 from mirror_ppl.inference import importance, residual_proposal
+from mirror_ppl.inference import sampler as sampler_module
 from mirror_ppl.inference.exact import expected_counts
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.residual_proposal import ResidualProposal, _laplace
@@ -150,3 +153,24 @@ def test_the_residual_is_proposed_only_where_scalars_are_not_enough(human, table
     assert not learned
     sample_exactly(human, table, ImportanceOptions(proposals=256, enough=1e6, stages=4))
     assert learned == [256 * 3]
+
+
+def test_residuals_count_as_they_were_drawn(human, table, monkeypatch):
+    """From the prior until it was learned where to look, and a tenth of them afterwards."""
+    monkeypatch.setattr(sampler_module, "_smoothed", lambda raw: (raw, 0.0))
+    torch.manual_seed(0)
+    sampler = Sampler(human, table)
+    sampler.draw(100)
+    gaussian = importance._gaussian(sampler.place, torch.full((100,), -math.log(100.0)), 1.5)
+    sampler.propose(gaussian, 60)
+    sampler.learn_residual()
+    sampler.propose(gaussian, 40)
+    prior, proposed = sampler._log_residual.double().exp()
+    scalars = sampler._log_prior[0].double().exp()
+    own = gaussian.log_prob(sampler.place).double().exp()
+    mixture = (
+        0.5 * scalars * prior + 0.3 * own * prior + 0.2 * own * (0.1 * prior + 0.9 * proposed)
+    )
+    found = sampler.weighted()
+    expected = found.log_joint.double().logsumexp(-1) + (scalars * prior / mixture).log()
+    torch.testing.assert_close(found.log_weights.double(), expected, rtol=1e-4, atol=1e-3)

@@ -1,0 +1,153 @@
+"""Importance sampling of a hierarchical toy whose posterior is known: proposals, weights."""
+
+from dataclasses import replace
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+from mirror_ppl.domains import get_domain
+from mirror_ppl.inference import importance
+from mirror_ppl.inference.hierarchical_proposal import RelativeGaussian, dependent_sites
+from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.prior import draw_prior
+from mirror_ppl.inference.sampler import Sampler, places, scalar_sites
+from mirror_ppl.inference.views import build_view_table
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.toy import RATES, ToyHuman
+from mirror_ppl.people import simulate
+
+HABITS, CHANCES = (0.2, 0.6), (0.98, 0.02)
+"""Rates of the second action with nothing in sight, and how probable each is."""
+EVEN = (1.0, 1.5)
+NEAR = 0.02
+"""By how much it is less probable that they see a bin further."""
+
+
+class Habitual(ToyHuman):
+    """A toy whose rate in sight is spread as ``evenness`` says, and whose other rate is a habit."""
+
+    def prior(self):
+        like = next(self.self_model.parameters())
+        bins = NEAR ** torch.arange(len(self.domain.reach_bins)).to(like)
+        evenness = pyro.sample("evenness", dist.LogNormal(*like.new_tensor(EVEN)))
+        return {
+            "reach": pyro.sample("reach", dist.Categorical(bins / bins.sum())),
+            "evenness": evenness,
+            "in_sight": pyro.sample("in_sight", dist.Beta(evenness, evenness)),
+            "habit": pyro.sample("habit", dist.Categorical(like.new_tensor(CHANCES))),
+        }
+
+    def act(self, implants, belief, values):
+        rate = torch.tensor(HABITS)[implants["habit"].long()]
+        return super().act({**implants, "otherwise": rate}, belief, values)
+
+
+@pytest.fixture(scope="module")
+def toy():
+    torch.manual_seed(0)
+    return Habitual(SelfModel(get_domain("driving")))
+
+
+@pytest.fixture(scope="module")
+def table(toy):
+    """Somebody who changes lanes at half of their steps."""
+    recorded = simulate("driving", "fog", people=1, rounds=3, seed=0)
+    shape = recorded.actions.shape
+    second = (torch.arange(shape.numel()) % 2 > 0).long().view(shape)
+    return build_view_table(toy, replace(recorded, actions=second))
+
+
+def exact(table):
+    """Posterior probability of the second habit, and mean of the other rate, on a grid of evenness.
+
+    By conjugacy: actions are throws of two coins, given the reach.
+    """
+    seen = table.belief[0, :, :, 0] > 0  # [N, T']
+    evenness = torch.linspace(EVEN[0] - 6 * EVEN[1], EVEN[0] + 6 * EVEN[1], 4001).double().exp()
+    prior = dist.LogNormal(*torch.tensor(EVEN).double()).log_prob(evenness) + evenness.log()
+    evidence, rates = [], []
+    for combination in range(table.index.shape[-1]):
+        moments = table.moments[0, table.index[0, :, combination]]
+        moments = moments[moments >= 0]
+        near, second = seen.flatten()[moments], table.acted.flatten()[moments] == 1
+        one, two = (second & near).sum(), (~second & near).sum()
+        three, four = (second & ~near).sum(), (~second & ~near).sum()
+        own = prior + beta(evenness + one, evenness + two) - beta(evenness, evenness)
+        own = own + combination * torch.tensor(NEAR).log()
+        for rate, chance in zip(torch.tensor(HABITS), torch.tensor(CHANCES), strict=True):
+            evidence.append(own + chance.log() + three * rate.log() + four * torch.log1p(-rate))
+            rates.append((evenness + one) / (2 * evenness + one + two))
+    weights = torch.softmax(torch.stack(evidence).flatten(), 0).view(len(evidence), -1)
+    return {
+        "habit": float(weights[1::2].sum()),
+        "in_sight": float((weights * torch.stack(rates)).sum()),
+    }
+
+
+def beta(one, two):
+    one, two = torch.as_tensor(one).double(), torch.as_tensor(two).double()
+    return torch.lgamma(one) + torch.lgamma(two) - torch.lgamma(one + two)
+
+
+def test_the_posterior_is_that_of_conjugacy(toy, table):
+    truth = exact(table)
+    assert 0.2 < truth["habit"] < 0.95  # of a prior of .02, so that proposals have to find it
+    for seed in range(3):
+        torch.manual_seed(seed)
+        found = sample_exactly(toy, table, ImportanceOptions())
+        assert found.effective > 200 and found.pareto_k < 0.7
+        weights = found.log_weights.exp().float()
+        for name, expected in truth.items():
+            value = found.policy[name].flatten().float()
+            mean = float((weights * value).sum())
+            error = float((weights * (value - mean).square()).sum() / found.effective) ** 0.5
+            assert abs(mean - expected) < 4.5 * error + 1e-3, (name, mean, expected)
+
+
+def test_draws_before_something_was_learned_count_as_they_were_drawn(toy, table):
+    """Half of the draws have discrete sites from the prior, half as learned."""
+    truth = exact(table)
+    torch.manual_seed(0)
+    sampler = Sampler(toy, table)
+    sampler.draw(2000)
+    place, weights = sampler.place, sampler.weighted().log_weights
+    gaussian = importance._gaussian(place, weights, 1.5)
+    sampler.propose(gaussian, 2000)
+    sampler.learn_discrete()
+    sampler.propose(gaussian, 500)
+    found = sampler.weighted()
+    share = float((found.log_weights.exp() * found.policy["habit"].flatten()).sum())
+    expected = truth["habit"]
+    error = (expected * (1 - expected) / found.effective) ** 0.5
+    assert abs(share - expected) < 4.5 * error
+
+
+def test_what_hangs_on_others_is_found(toy):
+    assert dependent_sites(toy, scalar_sites(toy)) == ("in_sight",)
+    human = HumanModel(SelfModel(get_domain("driving")))
+    assert dependent_sites(human, scalar_sites(human)) == ()
+
+
+def test_a_relative_gaussian_is_the_density_of_what_it_draws(toy):
+    """Of the logit of a rate given ``evenness``: a Gaussian with the prior's first two moments."""
+    sites = scalar_sites(toy)
+    drawn = draw_prior(toy, 1, 400, 0)
+    place = places(sites, drawn)
+    torch.manual_seed(0)
+    proposal = RelativeGaussian(
+        toy, sites, ("in_sight",), place, lambda some: MultivariateNormal(some.mean(0), some.T.cov())
+    )
+    found = proposal.sample(torch.Size([500]))
+    assert found.shape == (500, 2)
+    names = list(sites)
+    log_even, rate = found[:, names.index("evenness")], found[:, names.index("in_sight")]
+    # Of Beta(e, e): mean 1/2, variance 1 / (4 (2 e + 1)), stretched by 4 in the logit.
+    scale = 2 / (2 * log_even.exp() + 1).sqrt()
+    columns = found.clone()
+    columns[:, names.index("in_sight")] = rate / scale
+    expected = proposal.gaussian.log_prob(columns) - scale.log()
+    torch.testing.assert_close(proposal.log_prob(found), expected, rtol=1e-4, atol=1e-4)
