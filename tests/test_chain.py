@@ -1,16 +1,19 @@
 """Attention summed out span by span, against every combination of its values by itself."""
 
+from dataclasses import replace
 from itertools import product
 
 import pytest
 import torch
 
-from mirror_ppl.data import Demonstrations
+from mirror_ppl.data import Demonstrations, concatenate
 from mirror_ppl.domains.bomb_defusal import BombDefusal
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.exact import conditioned, log_joints
 from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.views import build_view_table, restricted, rounds_of
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 
@@ -32,7 +35,7 @@ def searcher():
     return human
 
 
-def recorded(courses=ACTIONS, told=True):
+def recorded(courses=ACTIONS, told=True, person="somebody"):
     """Rounds of one person."""
     rounds, steps = len(courses), max(len(course) for course in courses)
     actions = torch.full((1, rounds, steps), WAIT)
@@ -56,7 +59,7 @@ def recorded(courses=ACTIONS, told=True):
     return Demonstrations(
         domain=WORLD.name,
         setting="unlabelled",
-        people=("somebody",),
+        people=(person,),
         ego=observation.pop("ego"),
         observations=observation,
         actions=actions,
@@ -130,3 +133,104 @@ def test_the_sum_is_that_over_all_combinations(searcher, told):
     for place, expected in enumerate(predicted):
         steps = expected.shape[1]
         torch.testing.assert_close(found[:, place, :steps], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_people_of_different_rounds_are_joined(searcher):
+    """Each as by themselves; padding of the shorter ones changes nothing."""
+    one, other = (
+        recorded(),
+        recorded(((2, 2), (WAIT, 3, WAIT, WAIT, WAIT, WAIT, WAIT, 1, 1)), person="other"),
+    )
+    both = concatenate([one, other])
+    draws = draw_prior(searcher, 2, 3, 1)
+    draws["reads_type"] = torch.zeros_like(draws["reads_type"])
+    table = build_view_table(searcher, both)
+    predicted = predict_actions(searcher, table, draws)
+    policy = {name: value for name, value in draws.items() if name not in table.sites}
+    joints = log_joints(searcher, table, policy)
+    for place, alone in enumerate((one, other)):
+        own = {name: value[:, place : place + 1] for name, value in draws.items()}
+        single = build_view_table(searcher, alone)
+        steps, rounds = alone.shape[2], alone.shape[1]
+        real = alone.mask[0]
+        expected = predict_actions(searcher, single, own)[:, 0]
+        found = predicted[:, place, :rounds, :steps]
+        torch.testing.assert_close(found[:, real], expected[:, real], rtol=1e-4, atol=1e-5)
+        mine = {name: value for name, value in own.items() if name not in table.sites}
+        expected = log_joints(searcher, single, mine)[:, 0]
+        torch.testing.assert_close(joints[:, place], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_given_up_changes_nothing_of_the_rest(searcher):
+    """Of those who read the type and those who do not, after the first are given up."""
+    rounds = recorded()
+    draws = draw_prior(searcher, 1, 3, 2)
+    table = build_view_table(searcher, rounds)
+    policy = {name: value for name, value in draws.items() if name not in table.sites}
+    whole = log_joints(searcher, table, policy)
+    less = restricted(table, torch.tensor([[False, True]]))
+    assert less.moments.shape[1] < table.moments.shape[1]
+    torch.testing.assert_close(log_joints(searcher, less, policy)[..., 1], whole[..., 1])
+    assert (log_joints(searcher, less, policy)[..., 0] < -1e5).all()
+
+
+def test_screening_counts_what_the_table_does(searcher):
+    """Ways are scored as the table of the same rounds has it, without merging moments."""
+    sightings = Sightings(searcher, Screening(margin=1e6, ways=3, resolution=0))
+    for one_round in rounds_of(recorded(), 0):
+        sightings.add(*one_round)
+    table = sightings.table()
+    policy = {name: value for name, value in sightings.ways.items() if name not in table.sites}
+    joints = log_joints(searcher, table, policy)[:, 0]
+    torch.testing.assert_close(sightings.score + sightings.log_prior, joints)
+
+
+def test_the_sum_has_the_gradient_of_its_differences(searcher):
+    """By how probably terminals are noticed."""
+    table = build_view_table(searcher, recorded())
+    draws = draw_prior(searcher, 1, 1, 3)
+    site = next(f"notices_terminal {k}" for k in range(1, 7) if looked_for(table, k))
+
+    def likelihood(value):
+        given = {**draws, site: value}
+        with conditioned(given, 1, 1):
+            return searcher.log_likelihoods(searcher.prior(), table).sum()
+
+    value = draws[site].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(likelihood(value), value)
+    with torch.no_grad():
+        step = 1e-3
+        expected = (likelihood(value + step) - likelihood(value - step)) / (2 * step)
+    assert slope.isfinite().all() and float(slope) == pytest.approx(float(expected), rel=0.02)
+
+
+def looked_for(table, terminal):
+    """Whether a terminal is lit in the first round."""
+    return int(table.attention.facts["sought_0"][0, 0]) == terminal - 1
+
+
+def test_somebody_without_rounds_has_a_table(searcher):
+    nobody = recorded().select_rounds([])
+    table = build_view_table(searcher, nobody)
+    assert predict_actions(searcher, table, draw_prior(searcher, 1, 2, 0)).shape[:2] == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda spans: {"guess": spans["guess"]}, "spans has to be of the sites of attend, guess"),
+        (
+            lambda spans: {**spans, "found_1": replace(spans["found_1"], first=1)},
+            'the span of "found_1", steps 1 to 4 of 7, begins before the one before it is over',
+        ),
+        (
+            lambda spans: {**spans, "found_0": replace(spans["found_0"], values=62)},
+            '"found_0" has 61 values, not the 62 of its span',
+        ),
+    ],
+)
+def test_spans_that_cannot_be_are_refused(searcher, change, message, monkeypatch):
+    spans = Searcher.spans
+    monkeypatch.setattr(Searcher, "spans", lambda self, seen: change(spans(self, seen)))
+    with pytest.raises(HumanModelError, match=message):
+        build_view_table(searcher, recorded())

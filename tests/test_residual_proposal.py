@@ -168,9 +168,7 @@ def test_residuals_count_as_they_were_drawn(human, table, monkeypatch):
     prior, proposed = sampler._log_residual.double().exp()
     scalars = sampler._log_prior[0].double().exp()
     own = gaussian.log_prob(sampler.place).double().exp()
-    mixture = (
-        0.5 * scalars * prior + 0.3 * own * prior + 0.2 * own * (0.1 * prior + 0.9 * proposed)
-    )
+    mixture = 0.5 * scalars * prior + 0.3 * own * prior + 0.2 * own * (0.1 * prior + 0.9 * proposed)
     found = sampler.weighted()
     expected = found.log_joint.double().logsumexp(-1) + (scalars * prior / mixture).log()
     torch.testing.assert_close(found.log_weights.double(), expected, rtol=1e-4, atol=1e-3)

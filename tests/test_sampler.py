@@ -139,7 +139,11 @@ def test_a_relative_gaussian_is_the_density_of_what_it_draws(toy):
     place = places(sites, drawn)
     torch.manual_seed(0)
     proposal = RelativeGaussian(
-        toy, sites, ("in_sight",), place, lambda some: MultivariateNormal(some.mean(0), some.T.cov())
+        toy,
+        sites,
+        ("in_sight",),
+        place,
+        lambda some: MultivariateNormal(some.mean(0), some.T.cov()),
     )
     found = proposal.sample(torch.Size([500]))
     assert found.shape == (500, 2)

@@ -105,6 +105,8 @@ def chained_views(  # noqa: PLR0913 - a round, and whose it is
     seen = moments[moments != NO_VIEW]
     used, which = seen.unique(return_inverse=True)
     moments[moments != NO_VIEW] = which
+    if not len(used):  # of padding alone; act() is asked about something all the same
+        used = used.new_zeros(1)
     first, view = distinct_rows(moments)
     chain = Chain(supports, tuple(levels), facts).of_views(view)
     belief, acted = course.moments(used)

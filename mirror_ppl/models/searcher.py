@@ -146,6 +146,9 @@ class Searcher(HumanModel):
     def facts(self, observation: Observation) -> dict[str, Tensor]:
         """What was looked for at each stage; at those not reached, what was looked for last."""
         stage = observation["ego"][..., 0].long()
+        if not stage.shape[-1]:  # of nobody's round nothing was looked for
+            nothing = stage.new_zeros(stage.shape[:-1])
+            return {f"{SOUGHT}{number}": nothing for number in range(STAGES)}
         sought = self.domain.sought(observation).long().argmax(-1)
         last, found = None, {}
         for number in range(STAGES):
