@@ -24,6 +24,8 @@ of what those tell is relevant. Writes a table of every person (CSV), a summary 
 A run that is stopped goes on where it was when the same command is given again; the exit status is
 1 if something failed."""
 FAILED = 1
+TOLD = 0.03
+"""Of an item at a step, in rounds from which it is learned how to help."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,10 @@ class Options:
     """Rounds of each person in which they are spoken to."""
     draws: int = 64
     """Posterior draws that are planned with."""
+    told: float | None = None
+    """Chance that an item that can be communicated is told, at each step of the rounds that are
+    learned from. Unless given .03 of assistance and relevance, so that everybody can learn what
+    people make of messages, and none of prediction."""
     out: Path = Path("runs/evaluate")
     """Folder for the results; made if it is not there."""
     jobs: int = -1
@@ -65,6 +71,8 @@ class Options:
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")
+        if self.told is not None and not 0 <= self.told <= 1:
+            raise OptionError(f"--told must be from 0 to 1, not {self.told}")
         if not self.domain:
             raise OptionError("--domain needs at least one world")
         wrong = [number for number in self.rounds if not 1 <= number <= 20]  # noqa: PLR2004
@@ -135,6 +143,9 @@ def _cells(options: Options) -> list[Any]:
         if name not in every:
             raise UnknownNameError.of("setting", name, every)
     predicting = options.study == "prediction"
+    told = options.told
+    if told is None:
+        told = 0.0 if predicting else TOLD
     cells: list[Any] = []
     for domain, settings in domains.items():
         if options.population not in (known := PEOPLE[domain].populations):
@@ -148,7 +159,7 @@ def _cells(options: Options) -> list[Any]:
             )
         for setting in dict.fromkeys(own):
             for seed in range(options.seeds or (5 if predicting else 2)):
-                group = Group(domain, setting, options.population, options.people, seed)
+                group = Group(domain, setting, options.population, options.people, seed, told)
                 cells += (
                     prediction_cells(group, options.models, options.rounds)
                     if predicting

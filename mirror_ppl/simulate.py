@@ -32,6 +32,9 @@ class Options:
     """How many people, at least 1."""
     rounds: int = 40
     """How many rounds each of them plays, at least 1."""
+    told: float = 0.0
+    """Chance that an item that can be communicated is told, at each step, whoever it helps: rounds
+    that tell what people make of messages."""
     seed: int = 0
     """The same seed gives the same people in every setting, and the same command the same file."""
     device: str = "cpu"
@@ -41,6 +44,8 @@ class Options:
         for name in ("people", "rounds"):
             if (number := getattr(self, name)) < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")
+        if not 0 <= self.told <= 1:
+            raise OptionError(f"--told must be from 0 to 1, not {self.told}")
 
 
 def main(options: Options) -> None:
@@ -68,6 +73,7 @@ def main(options: Options) -> None:
             options.seed,
             usable_device(options.device),
             progress,
+            options.told,
         )
     provenance = {**demonstrations.provenance, "command": _command(options)}
     path = save_demonstrations(options.out, replace(demonstrations, provenance=provenance))
@@ -87,7 +93,8 @@ def _command(options: Options) -> str:
 
     values = {part.name: getattr(options, part.name) for part in fields(options)}
     values["setting"] = options.setting or get_domain(options.domain).settings[-1]
-    parts = [f"--{name} {value}" for name, value in values.items() if name != "out"]
+    unsaid = {"out"} if options.told else {"out", "told"}
+    parts = [f"--{name} {value}" for name, value in values.items() if name not in unsaid]
     return " ".join([PROGRAM, *parts])
 
 

@@ -1,5 +1,7 @@
 """People who defuse bombs: what they know, when they press, and how they are learned."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -104,14 +106,16 @@ def test_finding_takes_as_long_as_a_geometric_variable(seed):
     assert float(recording.rewards.max()) == 4 and float(recording.rewards.min()) == -1
 
 
-def test_predictions_are_the_frequencies_of_what_people_do(seed):
+@pytest.mark.parametrize("told", [0.0, 0.05])
+def test_predictions_are_the_frequencies_of_what_people_do(seed, told):
     """Scores of predictions are their entropies on average, if and only if they are right."""
     for reads in (True, False):
         people = Defusers(torch.linspace(0.04, 0.3, 6).expand(30, 6), torch.full((30,), reads))
         start = draw_starts(30, 20, seed, "test", str(reads), domain=WORLD, fates=people.fates)
-        recording = record(people, start)
+        gossip = torch.rand(30, 20, 60, 7, generator=torch.Generator().manual_seed(seed))
+        recording = record(people, replace(start, gossip=gossip), told=told)
         chances = people.predictive(
-            recording.probabilities, recording.observation, recording.actions
+            recording.probabilities, recording.observation, recording.actions, recording.told
         )
         torch.testing.assert_close(chances.sum(-1), torch.ones_like(chances[..., 0]))
         chosen = chances.gather(-1, recording.actions[..., None]).squeeze(-1)
@@ -130,11 +134,23 @@ def test_predictions_by_hand():
     observation = {name: torch.stack([o[name] for o in observations], 2) for name in ("ego",)} | {
         name: torch.stack([o[name] for o in observations], 2) for name in ("visual", "verbal")
     }
-    found = people.predictive(torch.zeros(1, 1, 4, 5), observation, torch.tensor([[actions]]))
+    told = {"visual": torch.zeros(1, 1, 4, 6).bool(), "verbal": torch.zeros(1, 1, 4, 1).bool()}
+
+    def check(*expected):
+        found = people.predictive(None, observation, torch.tensor([[actions]]), told)
+        for step, chances in enumerate(expected):
+            assert found[0, 0, step].tolist() == pytest.approx(chances)
+
     half = [0.9, 0.05, 0.0, 0.0, 0.05]
     sure = [0.9, 0.0, 0.0, 0.0, 0.1]
-    for step, expected in enumerate([half, half, sure, sure]):
-        assert found[0, 0, step].tolist() == pytest.approx(expected)
+    check(half, half, sure, sure)
+    # Who is told that it is Type A knows it from then on, whatever they took it for.
+    told["verbal"][0, 0, 2] = True
+    right = [0.9, 0.1, 0.0, 0.0, 0.0]
+    check(half, half, right, right)
+    # Who is shown the lit terminal presses at once.
+    told["visual"][0, 0, 3] = WORLD.sought({n: v[0, 0, 3] for n, v in observation.items()})
+    check(half, half, right, [0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def test_branches_are_all_that_chance_may_decide():

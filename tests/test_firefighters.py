@@ -260,12 +260,17 @@ def test_branches_are_all_that_a_step_can_lead_to(generator):
         now = WORLD.transition(now, act(probability, luck))
 
 
-def test_predictions_without_reading_minds_are_right_on_average(seed):
+@pytest.mark.parametrize("told", [0.0, 0.03])
+def test_predictions_without_reading_minds_are_right_on_average(seed, told):
     """Surprise by what they do is what the predictive distribution says: its entropy."""
     people = simulated_people("search_rescue", "smoke", "paper", 4, 0)
     start = draw_starts(4, 300, seed, "predictive", domain=WORLD, fates=people.fates)
-    recording = record(people, start)
-    chances = people.predictive(recording.probabilities, recording.observation, recording.actions)
+    items = sum(len(part.items) for part in WORLD.modalities)
+    gossip = torch.rand(4, 300, WORLD.horizon, items, generator=torch.Generator().manual_seed(seed))
+    recording = record(people, replace(start, gossip=gossip), told=told)
+    chances = people.predictive(
+        recording.probabilities, recording.observation, recording.actions, recording.told
+    )
     torch.testing.assert_close(chances.sum(-1), torch.ones(chances.shape[:-1]))
     alive = torch.arange(WORLD.horizon) < recording.lengths[..., None]
     surprise = -chances.gather(-1, recording.actions[..., None])[..., 0].log()

@@ -7,6 +7,7 @@ import torch
 
 from mirror_ppl.console import run
 from mirror_ppl.data import load_demonstrations
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import CARS, FOG_REACH, Driving, DrivingState, lane_rewards
 from mirror_ppl.domains.lane_values import action_values
 from mirror_ppl.errors import UnknownNameError
@@ -440,6 +441,29 @@ def test_fog_costs_reward():
 def test_the_same_call_gives_the_same_recordings(fog):
     learned_reward.cache_clear()
     assert simulate("driving", "fog", "paper", people=10, rounds=20, seed=0).equals(fog)
+
+
+@pytest.mark.parametrize("domain", list(PEOPLE))
+def test_what_is_told_is_recorded_and_comes_about_as_often_as_asked_for(domain):
+    """Of what can be told; the people are the same, and the rounds begin alike."""
+    quiet = simulate(domain, people=2, rounds=20, seed=0)
+    spoken_to = simulate(domain, people=2, rounds=20, seed=0, told=0.1)
+    assert not any(mask.any() for mask in quiet.told.values())
+    assert torch.equal(spoken_to.ego[:, :, 0], quiet.ego[:, :, 0])
+    assert not torch.equal(spoken_to.actions, quiet.actions)
+    can_be = get_domain(domain).communicable(
+        {name: value[:, :, :-1] for name, value in spoken_to.observation().items()}
+    )
+    chances = sum(int((can_be[n] & spoken_to.mask[..., None]).sum()) for n in can_be)
+    told = sum(int(mask.sum()) for mask in spoken_to.told.values())
+    assert not any((mask & ~can_be[name]).any() for name, mask in spoken_to.told.items())
+    assert abs(told - 0.1 * chances) < 4.5 * (0.09 * chances) ** 0.5
+    assert spoken_to.provenance["told"] == 0.1 and "told" not in quiet.provenance
+
+
+def test_what_is_told_is_a_probability():
+    with pytest.raises(ValueError, match="told must be from 0 to 1, not 2"):
+        simulate(people=1, rounds=1, told=2.0)
 
 
 def test_another_seed_gives_other_people_and_rounds(fog):

@@ -17,7 +17,7 @@ from mirror_ppl.inference.sampler import Sampler, places, scalar_sites
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.toy import RATES, ToyHuman
+from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.people import simulate
 
 HABITS, CHANCES = (0.2, 0.6), (0.98, 0.02)

@@ -59,6 +59,7 @@ class Group:
         population: of whom there are more.
         people: how many, P.
         seed: of the people and their rounds.
+        told: chance that an item that can be communicated is told, at each step of their rounds.
     """
 
     domain: str
@@ -66,6 +67,7 @@ class Group:
     population: str
     people: int
     seed: int
+    told: float = 0.0
 
     def __str__(self) -> str:
         return f"{self.domain}, {self.setting}, seed {self.seed}"
@@ -73,7 +75,15 @@ class Group:
     @lru_cache(maxsize=4)  # noqa: B019 - groups are values
     def recordings(self, rounds: int = RECORDED) -> Demonstrations:
         """Rounds of these people."""
-        return simulate(self.domain, self.setting, self.population, self.people, rounds, self.seed)
+        return simulate(
+            self.domain,
+            self.setting,
+            self.population,
+            self.people,
+            rounds,
+            self.seed,
+            told=self.told,
+        )
 
     @property
     def self_model(self) -> SelfModel:

@@ -244,6 +244,7 @@ def _row(group: Group, model: str, rounds: int, person: str) -> dict[str, Any]:
         "setting": group.setting,
         "population": group.population,
         "seed": group.seed,
+        "told": group.told,
         "person": person,
         "model": model,
         "rounds": rounds,

@@ -6,6 +6,7 @@ from round to round, is summed out, weighted by what those actions say of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import pyro
@@ -99,7 +100,9 @@ def _chained(
     acted = table.acted.squeeze(-1).expand(number, *table.acted.shape[:2])[..., None]
     chosen = each.gather(-1, acted).squeeze(-1)  # [S, P, N]
     *_, steps = table.recorded.shape
-    found = each.new_zeros(number, table.people, table.rounds, steps, each.shape[-1])
+    actions = each.shape[-1]
+    shape = (number, table.people, table.rounds, steps, actions)
+    found = each.new_full(shape, -math.log(actions))  # in padding
     by_level = [chain.chances(chances, place) for place in range(len(chain.levels))]
     for person, place in table.real.nonzero().tolist():
         so_far = each.new_full((number, chain.sights), NEVER)

@@ -214,7 +214,9 @@ class Chain:
                     _padded([level.view for level in own], states, width, 0),
                     _padded([level.value for level in own], states, width, NO_VALUE),
                     _padded([level.following for level in own], states, width, 0),
-                    _padded([level.rounds[..., None] for level in own], states, 1, NO_VALUE)[..., 0],
+                    _padded([level.rounds[..., None] for level in own], states, 1, NO_VALUE)[
+                        ..., 0
+                    ],
                 )
             )
         facts = {

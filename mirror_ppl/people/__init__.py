@@ -69,7 +69,7 @@ def simulated_people(
     return own.simulated(setting, population, people, seed, device)
 
 
-def simulate(
+def simulate(  # noqa: PLR0913 - everything recordings can depend on
     domain: str = "driving",
     setting: str | None = None,
     population: str = "paper",
@@ -78,8 +78,9 @@ def simulate(
     seed: int = 0,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    told: float = 0.0,
 ) -> Demonstrations:
-    """Record rounds of simulated people to whom nobody tells anything.
+    """Record rounds of simulated people.
 
     Args:
         domain: a domain's name.
@@ -93,6 +94,8 @@ def simulate(
         device: where the work is done and the recordings lie. Another kind of device has other
             random numbers, and so the same people in other rounds.
         progress: is told of every step of the rounds.
+        told: chance that an item that can be communicated is told, at each step and whoever it
+            helps; nobody tells them anything unless given.
 
     Returns:
         P people with B rounds each, which end when all is done. Its truths are ``sight_...`` for
@@ -104,14 +107,16 @@ def simulate(
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
-        ValueError: fewer than one person or round.
+        ValueError: fewer than one person or round, or ``told`` is no probability.
     """
     setting = setting or get_domain(domain).settings[-1]
     for name, number in (("people", people), ("rounds", rounds)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, not {number}")
+    if not 0 <= told <= 1:
+        raise ValueError(f"told must be from 0 to 1, not {told}")
     own = simulated_people(domain, setting, population, people, seed, device)
-    return recorded(own, setting, population, rounds, seed, device, progress)
+    return recorded(own, setting, population, rounds, seed, device, progress, told)
 
 
 __all__ = [

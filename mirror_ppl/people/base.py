@@ -95,7 +95,7 @@ class SimulatedPeople(ABC):
         """What is true of each ``[P]``, by the names of the sites that infer it."""
 
     def predictive(
-        self, probabilities: Tensor, observation: Observation, actions: Tensor
+        self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
     ) -> Tensor:
         """Probabilities ``[P, B, T, A]`` of actions to somebody who knows everything but luck.
 
@@ -105,8 +105,9 @@ class SimulatedPeople(ABC):
             probabilities: of each step, given what they had in mind, ``[P, B, T, A]``.
             observation: what there was to observe, ``[P, B, T + 1, ...]``.
             actions: what was done, ``[P, B, T]``.
+            told: what was communicated, ``[P, B, T, K]``.
         """
-        del observation, actions
+        del observation, actions, told
         return probabilities
 
     def select(self, index: list[int]) -> Self:

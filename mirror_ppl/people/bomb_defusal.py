@@ -146,11 +146,11 @@ class Defusers(SimulatedPeople):
         return replace(memory, step=torch.zeros_like(memory.step), fate=memory.fate[..., :0])
 
     def predictive(
-        self, probabilities: Tensor, observation: Observation, actions: Tensor
+        self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
     ) -> Tensor:
         """Of actions ``[P, B, T, A]``, given what was done before but not what they had in mind.
 
-        Who has not pressed yet has not found it yet; what was pressed tells what they believe in.
+        Who has not pressed yet has not found it yet; what was pressed tells what they guess.
         """
         now = {name: value[:, :, :-1] for name, value in observation.items()}
         chance, symbol = self._counts(now)
@@ -159,14 +159,17 @@ class Defusers(SimulatedPeople):
         buttons = right_button(
             self.domain.rules, kinds.expand(*symbol.shape, -1), symbol[..., None]
         )
-        informed = self.sees(now)["verbal"][..., 0, None]
-        believed = torch.where(informed, (true[..., None] == kinds).to(chance.dtype), 0.5)
+        shown = told["visual"].take_along_dim(read_panel(now["visual"])[0][..., None], -1)
+        chance = torch.where(shown.squeeze(-1), 1.0, chance)
+        heard = told["verbal"][..., 0].long().cumsum(2) > 0
+        informed = (self.sees(now)["verbal"][..., 0] | heard)[..., None]
         pressed = actions[..., None] == 1 + buttons
-        told = torch.where((actions == WAIT)[..., None], 1.0, pressed.to(chance.dtype))
-        # Of the steps before.
-        so_far = torch.cat([torch.ones_like(told[:, :, :1]), told[:, :, :-1]], 2).cumprod(2)
-        believed = believed * so_far
-        believed = believed / believed.sum(-1, keepdim=True).clamp(min=1e-12)
+        # What was pressed before they knew it tells what they guessed.
+        silent = (actions == WAIT)[..., None] | informed
+        telling = torch.where(silent, 1.0, pressed.to(chance.dtype))
+        so_far = torch.cat([torch.ones_like(telling[:, :, :1]), telling[:, :, :-1]], 2).cumprod(2)
+        guessed = so_far / so_far.sum(-1, keepdim=True).clamp(min=1e-12)
+        believed = torch.where(informed, (true[..., None] == kinds).to(chance.dtype), guessed)
         press = one_hot(1 + buttons, len(self.domain.actions)).to(chance.dtype)
         press = (believed[..., None] * press).sum(-2)
         wait = one_hot(torch.zeros_like(symbol), len(self.domain.actions)).to(chance.dtype)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from mirror_ppl import __version__
 from mirror_ppl.console import Progress
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward
+from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, total_reward
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.populations import derived_generator
@@ -26,12 +26,15 @@ class Start:
         scenario: indices into the domain's scenarios ``[P, B]``.
         luck: uniform numbers ``[P, B, T]`` that choose actions, see `mirror_ppl.people.base.act`.
         fate: uniform numbers ``[P, B, L]`` that decide what is chance in a person's mind.
+        gossip: uniform numbers ``[P, B, T, N]`` that decide which of the domain's items are told,
+            if any are.
     """
 
     state: Any
     scenario: Tensor
     luck: Tensor
     fate: Tensor | None = None
+    gossip: Tensor | None = None
 
     def select(self, people: slice) -> Start:
         """The rounds of some of the people."""
@@ -40,6 +43,7 @@ class Start:
             self.scenario[people],
             self.luck[people],
             None if self.fate is None else self.fate[people],
+            None if self.gossip is None else self.gossip[people],
         )
 
 
@@ -54,6 +58,7 @@ class Recording:
         probabilities: of the actions, given what people had in mind, ``[P, B, T, A]``.
         memory: what they knew when they acted, ``[P, B, T, ...]``.
         lengths: steps ``[P, B]`` until all was done, or all T.
+        told: which items were communicated before each action, ``[P, B, T, K]`` by modality.
     """
 
     observation: Observation
@@ -62,6 +67,7 @@ class Recording:
     probabilities: Tensor
     memory: Any
     lengths: Tensor
+    told: Visibility
 
 
 def draw_starts(
@@ -103,13 +109,16 @@ def draw_starts(
     )
 
 
-def record(people: SimulatedPeople, start: Start, progress: Progress | None = None) -> Recording:
-    """Let people play rounds to the end; nobody tells them anything.
+def record(
+    people: SimulatedPeople, start: Start, progress: Progress | None = None, told: float = 0.0
+) -> Recording:
+    """Let people play rounds to the end.
 
     Args:
         people: P people.
         start: how their rounds ``[P, B]`` begin.
         progress: is told of every step.
+        told: chance that an item that can be communicated is, at each step; by chance alone.
     """
     domain = people.domain
     state, memory = start.state, people.start(start.luck.shape[1], fate=start.fate)
@@ -117,10 +126,13 @@ def record(people: SimulatedPeople, start: Start, progress: Progress | None = No
     probabilities, memories = [], []
     lengths = torch.zeros_like(start.scenario)
     under_way = lengths == 0
-    for luck in start.luck.unbind(-1):
+    heard = []
+    for step, luck in enumerate(start.luck.unbind(-1)):
         under_way &= ~domain.over(state)
         lengths += under_way
-        probability, memory = people.step(memory, observations[-1])
+        gossip = None if start.gossip is None else start.gossip[:, :, step]
+        heard.append(_told(domain, observations[-1], gossip, under_way, told))
+        probability, memory = people.step(memory, observations[-1], heard[-1])
         action = act(probability, luck)
         following = domain.transition(state, action)
         rewards.append(total_reward(domain.rewards(state, action, following)))
@@ -140,7 +152,22 @@ def record(people: SimulatedPeople, start: Start, progress: Progress | None = No
         probabilities=torch.stack(probabilities, 2),
         memory=map_state(lambda *parts: torch.stack(parts, 2), *memories),
         lengths=lengths,
+        told={name: torch.stack([one[name] for one in heard], 2) for name in heard[0]},
     )
+
+
+def _told(
+    domain: Domain, observation: Observation, gossip: Tensor | None, under_way: Tensor, rate: float
+) -> Visibility:
+    """Which items ``[P, B, K]`` are told, by numbers ``[P, B, N]``; none without those."""
+    can_be = domain.communicable(observation)
+    if gossip is None:
+        return {name: torch.zeros_like(mask) for name, mask in can_be.items()}
+    lucky = (gossip < rate).split([len(part.items) for part in domain.modalities], -1)
+    return {
+        part.name: can_be[part.name] & own & under_way[..., None]
+        for part, own in zip(domain.modalities, lucky, strict=True)
+    }
 
 
 def recorded(
@@ -151,6 +178,7 @@ def recorded(
     seed: int,
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
+    told: float = 0.0,
 ) -> Demonstrations:
     """Recordings of simulated people; see `mirror_ppl.people.simulate`."""
     domain, truth = people.domain, people.truth()
@@ -165,8 +193,12 @@ def recorded(
         domain=domain,
         fates=people.fates,
     )
-    recording = record(people, start, progress)
-    chances = people.predictive(recording.probabilities, recording.observation, recording.actions)
+    if told > 0:
+        start = replace(start, gossip=_gossip(number, rounds, seed, setting, domain, device))
+    recording = record(people, start, progress, told)
+    chances = people.predictive(
+        recording.probabilities, recording.observation, recording.actions, recording.told
+    )
     return Demonstrations(
         domain=domain.name,
         setting=setting,
@@ -174,11 +206,31 @@ def recorded(
         ego=recording.observation["ego"],
         observations={part.name: recording.observation[part.name] for part in domain.modalities},
         actions=recording.actions,
+        told=recording.told,
         round_counts=torch.full((number,), rounds),
         lengths=recording.lengths,
         rewards=recording.rewards,
         scenarios=start.scenario,
         truth=truth,
         action_entropy=torch.special.entr(chances).sum(-1),
-        provenance={"population": population, "seed": seed, "version": __version__},
+        provenance={"population": population, "seed": seed, "version": __version__}
+        | ({"told": told} if told > 0 else {}),
     )
+
+
+def _gossip(
+    people: int,
+    rounds: int,
+    seed: int,
+    setting: str,
+    domain: Domain,
+    device: torch.device | str,
+) -> Tensor:
+    """Numbers ``[P, B, T, N]`` that decide what is told, for each person from a generator."""
+    items = sum(len(part.items) for part in domain.modalities)
+    drawn = []
+    for person in range(people):
+        generator = derived_generator(seed, "told", setting, person, device=device)
+        shape = (rounds, domain.horizon, items)
+        drawn.append(torch.rand(shape, generator=generator, device=device))
+    return torch.stack(drawn)

@@ -151,7 +151,7 @@ class Firefighters(SimulatedPeople):
         return replace(memory, fate=memory.fate[..., :0, :0])
 
     def predictive(
-        self, probabilities: Tensor, observation: Observation, actions: Tensor
+        self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
     ) -> Tensor:
         """Of actions ``[P, B, T, A]``, given what was done before but not what they had in mind.
 
@@ -162,7 +162,8 @@ class Firefighters(SimulatedPeople):
         found = []
         for step, action in enumerate(actions.unbind(-1)):
             now = {name: value[:, :, step] for name, value in observation.items()}
-            knowledge = self._learn(memory, now, None)
+            heard = {name: mask[:, :, step] for name, mask in told.items()}
+            knowledge = self._learn(memory, now, heard)
             chance = self._next(memory, knowledge, now)
             memory = Mind(knowledge.corridors, knowledge.rooms, memory.goal, memory.fate)
             goals = (goals[..., None, :] @ chance).squeeze(-2)
