@@ -84,6 +84,7 @@ def main(options: Options) -> int:
     Raises:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
+    from mirror_ppl.data import asset_path, load_demonstrations
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.files import prepare_output_folder
     from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
@@ -101,6 +102,9 @@ def main(options: Options) -> int:
     self_model, _ = load_self_model(weights, options.domain)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
+    # What is so for everybody is learned first, as by a fit: people are drawn from what is open.
+    name = f"{options.domain}_{setting}_paper.nc"
+    human.learn_world(load_demonstrations(asset_path(name)))
     network = network_for(options.guide, options.guide_file, human)
     folder = prepare_output_folder(options.out)
     settings = InferenceOptions(options.guide, options.draws)
