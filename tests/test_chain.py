@@ -3,6 +3,8 @@
 from dataclasses import replace
 from itertools import product
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
@@ -14,6 +16,8 @@ from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import build_view_table, restricted, rounds_of
+from mirror_ppl.models.chain import Chain
+from mirror_ppl.models.loading import check_contract
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 
@@ -234,3 +238,87 @@ def test_spans_that_cannot_be_are_refused(searcher, change, message, monkeypatch
     monkeypatch.setattr(Searcher, "spans", lambda self, seen: change(spans(self, seen)))
     with pytest.raises(HumanModelError, match=message):
         build_view_table(searcher, recorded())
+
+
+class ReadsLater(Searcher):
+    """Still sees at the second stage what they look for there if they found it at the first."""
+
+    spans = Searcher.spans
+
+    def sees(self, implants, observation, step):
+        seen = super().sees(implants, observation, step)
+        also = (implants["found_0"] == 0)[..., None] & (observation["ego"][..., :1] == 1)
+        return {**seen, "visual": seen["visual"] | (also & self.domain.sought(observation))}
+
+
+class TooFew(Searcher):
+    """Says that whatever is found later than at once is not found."""
+
+    def spans(self, observation):
+        return {
+            name: replace(span, values=1) if name == "found_0" else span
+            for name, span in super().spans(observation).items()
+        }
+
+
+class Hangs(Searcher):
+    """Finds what counts later than at the stage before."""
+
+    spans = Searcher.spans
+
+    def attend(self, implants):
+        sites = super().attend(implants)
+        chances = torch.linspace(0.1, 0.9, 61)[sites["found_0"].long()]
+        mood = pyro.sample("mood", dist.Bernoulli(chances))
+        return {**sites, "mood": mood}
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (ReadsLater, 'the span of "found_0" is steps 0 to .*, but at step .* it is read outside'),
+        (TooFew, 'the span of "found_0" is .* its values from number 0 on differ'),
+        (Hangs, '"mood" of attend hangs on another of its sites'),
+    ],
+)
+def test_spans_that_are_not_so_are_found(searcher, kind, message):
+    with pytest.raises(HumanModelError, match=message):
+        check_contract(kind(searcher.self_model))
+
+
+class Late(Searcher):
+    """Has an act of its own, of whole rounds."""
+
+    def act(self, implants, belief, values):
+        return super().act(implants, belief, values)
+
+
+class Sees(Searcher):
+    """Has sight of its own, of which nobody says when it is read."""
+
+    def sees(self, implants, observation, step):
+        return super().sees(implants, observation, step)
+
+
+@pytest.mark.parametrize("kind", [Late, Sees])
+def test_who_may_break_spans_is_summed_out_as_elsewhere(searcher, kind):
+    """By values that stand for all; exactly where there are few of them."""
+    human, rounds = kind(searcher.self_model), recorded(((WAIT, 2, 1, 3),), told=False)
+    assert searcher.chained and not human.chained
+    check_contract(human)
+    assert not isinstance(build_view_table(human, rounds).attention, Chain)
+
+
+def test_merging_moments_hardly_changes_anything(searcher):
+    """Moments whose log-probabilities fall on the same points of a grid of .03 are one."""
+    rounds = recorded()
+    draws = draw_prior(searcher, 1, 8, 5)
+    tables = [
+        build_view_table(searcher, rounds, screening=Screening(margin=1e6, resolution=width))
+        for width in (0, 0.03)
+    ]
+    assert tables[1].belief.shape[1] < tables[0].belief.shape[1]
+    policy = {name: value for name, value in draws.items() if name not in tables[0].sites}
+    exact, merged = (log_joints(searcher, table, policy) for table in tables)
+    # Twelve steps, each up to half a grid's width off under the ways that are compared.
+    assert (exact - merged).abs().max() < 12 * 0.03

@@ -1,5 +1,6 @@
 """Importance sampling of a hierarchical toy whose posterior is known: proposals, weights."""
 
+import math
 from dataclasses import replace
 
 import pyro
@@ -10,6 +11,7 @@ from torch.distributions import MultivariateNormal
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.inference import importance
+from mirror_ppl.inference import sampler as sampler_module
 from mirror_ppl.inference.hierarchical_proposal import RelativeGaussian, dependent_sites
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.prior import draw_prior
@@ -17,7 +19,7 @@ from mirror_ppl.inference.sampler import Sampler, places, scalar_sites
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.toy import ToyHuman
+from mirror_ppl.models.toy import RATES, ToyHuman
 from mirror_ppl.people import simulate
 
 HABITS, CHANCES = (0.2, 0.6), (0.98, 0.02)
@@ -117,7 +119,7 @@ def test_draws_before_something_was_learned_count_as_they_were_drawn(toy, table)
     place, weights = sampler.place, sampler.weighted().log_weights
     gaussian = importance._gaussian(place, weights, 1.5)
     sampler.propose(gaussian, 2000)
-    sampler.learn_discrete()
+    sampler.learn_discrete(sampler.weighted())
     sampler.propose(gaussian, 500)
     found = sampler.weighted()
     share = float((found.log_weights.exp() * found.policy["habit"].flatten()).sum())
@@ -155,3 +157,145 @@ def test_a_relative_gaussian_is_the_density_of_what_it_draws(toy):
     columns[:, names.index("in_sight")] = rate / scale
     expected = proposal.gaussian.log_prob(columns) - scale.log()
     torch.testing.assert_close(proposal.log_prob(found), expected, rtol=1e-4, atol=1e-4)
+
+
+class Spread(ToyHuman):
+    """A toy of whom something else than a number decides how far rates in sight are spread."""
+
+    def prior(self):
+        like = next(self.self_model.parameters())
+        bins = NEAR ** torch.arange(len(self.domain.reach_bins)).to(like)
+        sites = self.hyper(like)
+        (evenness,) = (evenness_of(site) for site in sites.values())
+        return {
+            "reach": pyro.sample("reach", dist.Categorical(bins / bins.sum())),
+            "in_sight": pyro.sample("in_sight", dist.Beta(evenness, evenness)),
+            "otherwise": pyro.sample("otherwise", dist.Beta(*like.new_tensor(RATES["otherwise"]))),
+            **sites,
+        }
+
+
+def evenness_of(site):
+    """Beta(1, 1) or Beta(60, 60), by a kind or the sign of a vector."""
+    high = (site[..., 0] > 0) if site.dtype.is_floating_point else site == 1
+    return torch.where(high, 60.0, 1.0)
+
+
+class ByKind(Spread):
+    def hyper(self, like):
+        return {"kind": pyro.sample("kind", dist.Categorical(like.new_ones(2) / 2))}
+
+
+class ByVector(Spread):
+    def hyper(self, like):
+        return {"sign": pyro.sample("sign", dist.Normal(like.new_zeros(1), 1.0).to_event(1))}
+
+
+@pytest.mark.parametrize(("kind", "name"), [(ByKind, "kind"), (ByVector, "sign")])
+def test_priors_that_hang_on_other_sites_count_as_they_are(toy, table, kind, name):
+    """Half of the prior is Beta(1, 1) and half Beta(60, 60): the posterior by conjugacy."""
+    human = kind(toy.self_model)
+    assert dependent_sites(human, scalar_sites(human)) == ()
+    seen = table.belief[0, :, :, 0] > 0
+    evidence = torch.zeros(2, table.index.shape[-1]).double()
+    for combination in range(table.index.shape[-1]):
+        moments = table.moments[0, table.index[0, :, combination]]
+        moments = moments[moments >= 0]
+        near, second = seen.flatten()[moments], table.acted.flatten()[moments] == 1
+        one, two = (second & near).sum(), (~second & near).sum()
+        three, four = (second & ~near).sum(), (~second & ~near).sum()
+        a, b = RATES["otherwise"]
+        for place, e in enumerate((1.0, 60.0)):
+            evidence[place, combination] = (
+                beta(e + one, e + two) - beta(e, e) + beta(a + three, b + four) - beta(a, b)
+            ) + combination * torch.tensor(NEAR).log()
+    expected = float(torch.softmax(evidence.logsumexp(1), 0)[1])
+    assert 0.02 < expected < 0.98
+    for seed in range(3):
+        torch.manual_seed(seed)
+        found = sample_exactly(human, table, ImportanceOptions(proposals=2048))
+        high = evenness_of(found.policy[name]).flatten() > 1
+        share = float((found.log_weights.exp() * high).sum())
+        error = (expected * (1 - expected) / found.effective) ** 0.5
+        assert abs(share - expected) < 4.5 * error
+
+
+class Odd(ToyHuman):
+    """A toy with a site of a distribution that has no moments, or several numbers a value."""
+
+    odd = dist.HalfCauchy(torch.tensor(1.0))
+
+    def prior(self):
+        return {**super().prior(), "odd": pyro.sample("odd", self.odd)}
+
+
+@pytest.mark.parametrize(
+    ("odd", "middle", "expected"),
+    [
+        (dist.HalfCauchy(torch.tensor(1.0)), 1.0, 0.5),
+        (dist.StudentT(torch.tensor(1.0)), 0.0, 0.5),
+        (
+            dist.TransformedDistribution(
+                dist.Normal(torch.tensor(0.0), 1.0), [torch.distributions.SigmoidTransform()]
+            ),
+            0.5,
+            0.5,
+        ),
+        (dist.OneHotCategorical(torch.ones(3) / 3), None, 1 / 3),
+    ],
+)
+def test_any_distribution_can_be_a_prior(toy, table, odd, middle, expected):
+    """What nothing recorded tells of keeps its prior: so much of it is below a number."""
+    human = Odd(toy.self_model)
+    human.odd = odd
+    torch.manual_seed(0)
+    found = sample_exactly(human, table, ImportanceOptions())
+    below = (found.policy["odd"][..., 0] == 1) if odd.event_dim else found.policy["odd"] < middle
+    share = float((found.log_weights.exp() * below.flatten()).sum())
+    assert abs(share - expected) < 4.5 * (expected * (1 - expected) / found.effective) ** 0.5
+
+
+class OnlyAHabit(ToyHuman):
+    """Nobody's rates are open but for the habit."""
+
+    def prior(self):
+        like = next(self.self_model.parameters())
+        bins = NEAR ** torch.arange(len(self.domain.reach_bins)).to(like)
+        return {
+            "reach": pyro.sample("reach", dist.Categorical(bins / bins.sum())),
+            "habit": pyro.sample("habit", dist.Categorical(like.new_tensor(CHANCES))),
+        }
+
+    def act(self, implants, belief, values):
+        rate = torch.tensor(HABITS)[implants["habit"].long()]
+        rates = {"in_sight": torch.full_like(rate, 0.5), "otherwise": rate}
+        return super().act({**implants, **rates}, belief, values)
+
+
+def test_discrete_sites_alone_are_proposed_too(toy, table):
+    torch.manual_seed(0)
+    found = sample_exactly(OnlyAHabit(toy.self_model), table, ImportanceOptions())
+    assert found.effective > 400  # of the prior's draws 2 in 100 would count
+
+
+def test_discrete_sites_count_as_they_were_drawn(toy, table, monkeypatch):
+    """From the prior until it was learned how probable they are."""
+    monkeypatch.setattr(sampler_module, "_smoothed", lambda raw: (raw, 0.0))
+    torch.manual_seed(0)
+    sampler = Sampler(toy, table)
+    sampler.draw(100)
+    gaussian = importance._gaussian(sampler.place, torch.full((100,), -math.log(100.0)), 1.5)
+    sampler.propose(gaussian, 60)
+    sampler.learn_discrete(sampler.weighted())
+    sampler.propose(gaussian, 40)
+    found = sampler.weighted()
+    scalars, _ = sampler._log_prior.double()
+    habit = found.policy["habit"].flatten()
+    prior = torch.tensor(CHANCES).double()[habit].log()
+    learned = sampler._log_chances["habit"][habit]
+    own = gaussian.log_prob(sampler.place).double()
+    stages = [scalars + prior, own + prior, own + learned]
+    shares = torch.tensor([0.5, 0.3, 0.2]).double().log()
+    mixture = (torch.stack(stages, -1) + shares).logsumexp(-1)
+    expected = found.log_joint.double().logsumexp(-1) + scalars + prior - mixture
+    torch.testing.assert_close(found.log_weights.double(), expected, rtol=1e-4, atol=1e-3)

@@ -17,9 +17,8 @@ from torch import Tensor
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.attention import attention_sites
-from mirror_ppl.models.chain import Chain, Level, Span
+from mirror_ppl.models.chain import Chain, Level, check_spans
 from mirror_ppl.models.human import HumanModel, View
 from mirror_ppl.models.view_table import NO_VIEW
 
@@ -68,7 +67,8 @@ def chained_views(  # noqa: PLR0913 - a round, and whose it is
     so_far = {name: value[0, real] for name, value in observation.items()}
     steps = int(real.sum())
     supports = attention_sites(human)
-    spans = _checked(human, human.spans(so_far), supports, steps)
+    spans = human.spans(so_far)
+    check_spans(spans, {site: len(support) for site, support in supports.items()}, steps)
     facts = {name: fact.view(1, 1) for name, fact in human.facts(so_far).items()}
     course = _Course(human, combinations, observation, told, actions[0])
     states = course.beginning(number)
@@ -252,30 +252,3 @@ class _Course:
         """Beliefs ``[N, Z]`` and actions ``[N]`` of the moments with these numbers."""
         actions = len(self.human.domain.actions)
         return torch.cat(self._beliefs)[numbers // actions], numbers % actions
-
-
-def _checked(
-    human: HumanModel, spans: Mapping[str, Span], supports: Mapping[str, Tensor], steps: int
-) -> Mapping[str, Span]:
-    """The spans, if they are as :meth:`HumanModel.spans` says."""
-    if not human.stepwise:
-        raise HumanModelError("a model with spans has to be stepwise")
-    if set(spans) != set(supports):
-        raise HumanModelError(
-            f"spans has to be of the sites of attend, {', '.join(supports)}; not of "
-            f"{', '.join(spans) or 'none'}"
-        )
-    begin = 0
-    for site, span in spans.items():
-        throughout = (span.first, span.last) == (0, steps)
-        if not begin <= span.first <= span.last <= steps or (throughout and begin > 0):
-            raise HumanModelError(
-                f'the span of "{site}", steps {span.first} to {span.last} of {steps}, begins '
-                "before the one before it is over"
-            )
-        if not 1 <= span.values <= len(supports[site]):
-            raise HumanModelError(
-                f'"{site}" has {len(supports[site])} values, not the {span.values} of its span'
-            )
-        begin = 0 if throughout else span.last
-    return spans

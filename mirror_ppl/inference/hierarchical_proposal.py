@@ -19,25 +19,51 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.inference.prior import sample_sites, values_of
 from mirror_ppl.models.human import HumanModel
 
-TRIED = 8
+TRIED = 64
 """Draws from the prior by which it is found what hangs on others."""
 
 
 @torch.no_grad()
 def dependent_sites(human: HumanModel, sites: Mapping[str, Any]) -> tuple[str, ...]:
-    """Those of the scalar sites whose prior differs from draw to draw of the others."""
+    """Those of the scalar sites whose prior hangs on other scalar sites, and on nothing else.
+
+    What hangs on sites of other kinds, too, is left out: those are not proposed together with the
+    scalar ones. So is what has no moments.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        nodes = sample_sites(human, 1, TRIED)
-    found = []
-    for name, site in sites.items():
-        moments = torch.stack(_moments(nodes[name]["fn"], site)).expand(2, TRIED, 1, 1)
-        if not bool((moments == moments[:, :1]).all()):
-            found.append(name)
-    return tuple(found)
+        drawn = values_of(sample_sites(human, 1, TRIED))
+        scalars = {name: drawn[name] for name in sites}
+        first = {name: value[:1].expand_as(value) for name, value in drawn.items()}
+        others = {name: value for name, value in drawn.items() if name not in sites}
+        for name, node in sample_sites(human, 1, TRIED).items():
+            if name in others and node["fn"].has_enumerate_support:
+                # Every value, however improbable.
+                support = node["fn"].enumerate_support(expand=False).flatten(1)
+                each = torch.arange(TRIED, device=support.device) % len(support)
+                others[name] = support[each].reshape_as(others[name]).to(others[name])
+        one_way = sample_sites(human, 1, TRIED, {**first, **scalars})
+        other_way = sample_sites(human, 1, TRIED, {**first, **others})
+    return tuple(
+        name
+        for name, site in sites.items()
+        if _differs(one_way[name]["fn"], site) and _differs(other_way[name]["fn"], site) is False
+    )
+
+
+def _differs(fn: Any, site: Any) -> bool | None:
+    """Whether moments of a prior differ from draw to draw; ``None`` where it has none."""
+    try:
+        moments = torch.stack(torch.broadcast_tensors(*_moments(fn, site)))
+    except NotImplementedError:
+        return None
+    if not (moments.isfinite().all() and (moments[1] > 0).all()):
+        return None
+    moments = moments.expand(2, TRIED, 1, 1)
+    return not bool((moments == moments[:, :1]).all())
 
 
 class RelativeGaussian:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from mirror_ppl.inference.hierarchical_proposal import RelativeGaussian, dependent_sites
-from mirror_ppl.inference.sampler import Proposal, Sampler, Weighted, places
+from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted, places
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
@@ -73,6 +73,9 @@ def sample_exactly(
     dependent = dependent_sites(human, sampler.sites)
 
     def near_to(place: Tensor, log_weights: Tensor) -> Proposal:
+        if not sampler.sites:
+            return NoScalars()
+
         def fit(some: Tensor) -> MultivariateNormal:
             return _gaussian(some, log_weights, options.wider)
 
@@ -88,13 +91,13 @@ def sample_exactly(
         sampler.propose(near_to(found, near.log_weights), options.proposals)
     elif options.proposals > few:
         sampler.draw(options.proposals - few)
-    for stage in range(options.stages if sampler.sites else 0):
+    for stage in range(options.stages if sampler.sites or sampler.supports else 0):
         found = sampler.weighted()
         if found.effective >= options.enough:
             return found
         if stage == PLAIN_STAGES:
             sampler.learn_residual()
-        sampler.learn_discrete()
+        sampler.learn_discrete(found)
         sampler.propose(near_to(sampler.place, found.log_weights), options.proposals)
     return sampler.weighted()
 

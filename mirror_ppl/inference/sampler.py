@@ -35,7 +35,8 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
 ANYHOW = 0.1
-"""Share of what is proposed that is from the prior, of the residual and of discrete sites."""
+"""Share of what is proposed that is not by what was learned, of the residual and of discrete sites.
+"""
 LEARNED_FROM = 64
 """Draws by which it is learned where to look for the residual."""
 
@@ -94,6 +95,18 @@ class Proposal(Protocol):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density ``[S]``."""
         ...
+
+
+class NoScalars:
+    """The proposal of no scalar sites."""
+
+    def sample(self, sample_shape: torch.Size) -> Tensor:
+        """Nothing, ``[S, 0]``."""
+        return torch.zeros(*sample_shape, 0)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Zeros ``[S]``."""
+        return value.new_zeros(len(value))
 
 
 @dataclass(frozen=True)
@@ -168,8 +181,9 @@ class Sampler:
     def take(self, policy: Draws, joint: Tensor) -> None:
         """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
         place = places(self.sites, policy, len(joint))
-        given = {name: policy[name] for name in (*self.sites, *self.supports)}
-        _, log_priors = _completed(self.human, self.table, given, len(joint))
+        # All of it is given: priors may hang on any of these sites.
+        own = (*self.sites, *self.supports)
+        _, log_priors = _completed(self.human, self.table, policy, len(joint), own)
         self._add(policy, joint, place, log_priors)
         self._stages.append(_Stage(len(joint)))
 
@@ -206,12 +220,12 @@ class Sampler:
             found.policy, self._residual.gaussian(found.policy)
         )
 
-    def learn_discrete(self) -> None:
+    def learn_discrete(self, found: Weighted) -> None:
         """From now on propose discrete sites of the policy, too, by what is known so far.
 
-        Each by itself, and :data:`ANYHOW` as often from what the prior makes of it on average.
+        Each by itself; a share of :data:`ANYHOW` is as often as in the first draws, which are from
+        the prior, or any value alike.
         """
-        found = self.weighted()
         for name, support in self.supports.items():
             own = found.policy[name].flatten()[:, None] == support
             anybody = own[: self._stages[0].number].double().mean(0)
@@ -228,7 +242,7 @@ class Sampler:
     def propose(self, proposal: Proposal, number: int) -> None:
         """Draw some more."""
         place = proposal.sample(torch.Size([number]))
-        given = {
+        given: dict[str, Tensor] = {
             name: site(place[:, column]).view(number, 1, 1)
             for column, (name, site) in enumerate(self.sites.items())
         }
@@ -336,7 +350,9 @@ def _policy_supports(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
         return {
             name: node["fn"].enumerate_support(expand=False).flatten()
             for name, node in sample_sites(human, 1).items()
-            if node["fn"].has_enumerate_support and name not in table.sites
+            if node["fn"].has_enumerate_support
+            and node["fn"].event_dim == 0
+            and name not in table.sites
         }
 
 

@@ -23,6 +23,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from mirror_ppl.errors import HumanModelError
+
 if TYPE_CHECKING:
     from mirror_ppl.models.human import HumanModel, Implants
 
@@ -46,6 +48,37 @@ class Span:
     first: int
     last: int
     values: int
+
+
+def check_spans(spans: Mapping[str, Span], sizes: Mapping[str, int], steps: int) -> None:
+    """Make sure that spans are as `HumanModel.spans` says.
+
+    Args:
+        spans: by site.
+        sizes: number of values of each site of ``attend``.
+        steps: of the round.
+
+    Raises:
+        HumanModelError: they are not.
+    """
+    if set(spans) != set(sizes):
+        raise HumanModelError(
+            f"spans has to be of the sites of attend, {', '.join(sizes)}; not of "
+            f"{', '.join(spans) or 'none'}"
+        )
+    begin = 0
+    for site, span in spans.items():
+        throughout = (span.first, span.last) == (0, steps)
+        if not begin <= span.first <= span.last <= steps or (throughout and begin > 0):
+            raise HumanModelError(
+                f'the span of "{site}", steps {span.first} to {span.last} of {steps}, begins '
+                "before the one before it is over"
+            )
+        if not 1 <= span.values <= sizes[site]:
+            raise HumanModelError(
+                f'"{site}" has {sizes[site]} values, not the {span.values} of its span'
+            )
+        begin = 0 if throughout else span.last
 
 
 @dataclass(frozen=True)

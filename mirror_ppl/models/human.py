@@ -196,7 +196,7 @@ class HumanModel(nn.Module):
 
         Args:
             observation: everything there was to observe, ``[..., T, K, F]``, as far as the round
-                went.
+                went; T is 0 of padding.
         """
         del observation
         return {}
@@ -206,12 +206,14 @@ class HumanModel(nn.Module):
 
         Where this is known, attention is summed out exactly (:mod:`mirror_ppl.models.chain`). Sites
         are read throughout the round, or at a span of it that ends before the next one begins;
-        those read throughout come first. Their distributions do not hang on each other's values.
-        Nothing is known unless this is overridden: then values are drawn that stand for all there
-        could be (:mod:`mirror_ppl.models.attention`).
+        those read throughout come first. Their distributions do not hang on each other's values,
+        and the model is ``stepwise``. Nothing is known unless this is overridden, nor where a class
+        that derives from the one that does overrides ``attend``, ``sees``, ``look`` or ``perceive``
+        and not this: then values are drawn that stand for all there could be
+        (:mod:`mirror_ppl.models.attention`).
 
         Args:
-            observation: of one round, as far as it went, ``[t, K, F]``.
+            observation: of one round, as far as it went, ``[t, K, F]``; t is 0 of padding.
         """
         del observation
         return {}
@@ -219,7 +221,13 @@ class HumanModel(nn.Module):
     @property
     def chained(self) -> bool:
         """Whether attention is summed out exactly, see :meth:`spans`."""
-        return self.attends and type(self).spans is not HumanModel.spans
+        if not self.attends or not self.stepwise:
+            return False
+        order = type(self).__mro__
+        known = next(place for place, one in enumerate(order) if "spans" in vars(one))
+        changed = {"attend", "sees", "look", "perceive"}
+        since = any(changed & set(vars(one)) for one in order[:known])
+        return order[known] is not HumanModel and not since
 
     def explanations(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
         """How well values of attention explain what was done, as logarithms ``[n]`` by site.

@@ -19,6 +19,7 @@ from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.searcher_variants import KnowingRobot, KnowingSearcher, PerceptualSearcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
+from mirror_ppl.models.span_contract import check_spans_hold
 from mirror_ppl.models.variants import VARIANTS
 
 MIRROR = "mirror"
@@ -145,6 +146,9 @@ def check_contract(human: HumanModel) -> None:
             total = log_probabilities.exp().sum(-1)
             if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
                 raise HumanModelError("act has to return log-probabilities: they do not sum to 1")
+        method = "spans"
+        if human.chained:
+            check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
         _check_sites(trace.trace, people)
     except MirrorError:
         raise

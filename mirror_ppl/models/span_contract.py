@@ -1,0 +1,116 @@
+"""Whether what a human model says of its spans is so, tried on a made-up round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.domains.base import Observation, map_state
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.chain import Span, check_spans
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.sites import latent_sites
+
+STEPS = 12
+
+
+@torch.no_grad()
+def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
+    """Make sure that attention can be summed out span by span.
+
+    Args:
+        human: the model of people; its attention is :attr:`HumanModel.chained`.
+        discrete: values ``[1]`` of the discrete implants of somebody.
+
+    Raises:
+        HumanModelError: spans are not as :meth:`HumanModel.spans` says: they overlap, a site is
+            read outside of its span, values that are said to be alike are not, or the distribution
+            of a site hangs on another one.
+    """
+    domain = human.domain
+    device = next(human.parameters()).device
+    generator = torch.Generator(device).manual_seed(0)
+    state, observed, steps = domain.initial(1, generator), [], min(STEPS, domain.horizon)
+    while len(observed) < steps and not bool(domain.over(state)):
+        observed.append(domain.observe(state))
+        # Every other action is the first one, lest the round is over at once.
+        action = torch.randint(len(domain.actions), (1,), generator=generator, device=device)
+        state = domain.transition(state, action * (len(observed) % 2))
+    so_far = {name: torch.cat([one[name] for one in observed]) for name in observed[0]}
+    spans = human.spans(so_far)
+    supports = _check_independence(human, so_far)
+    check_spans(spans, {name: len(support) for name, support in supports.items()}, len(observed))
+    # What one site hides at its first value it may show at its last.
+    for place in (0, -1):
+        others = {name: own[place].view(1) for name, own in supports.items()}
+        _check_looks(human, spans, supports, {**discrete, **others}, observed)
+
+
+def _check_looks(
+    human: HumanModel,
+    spans: Mapping[str, Span],
+    supports: Mapping[str, Tensor],
+    usual: Mapping[str, Tensor],
+    observed: Sequence[Observation],
+) -> None:
+    """No value of a site changes what is seen where its span says so; all others are usual."""
+    knowledge = human.domain.nothing_known(1, device=observed[0]["ego"].device)
+    for step, now in enumerate(observed):
+        can_be = human.domain.communicable(now)
+        told = {name: torch.zeros_like(mask) for name, mask in can_be.items()}
+        for site, span in spans.items():
+            inside = span.first <= step < span.last
+            some = supports[site][span.values - 1 if inside else 0 :]
+            number = len(some)
+
+            def repeated(part: Tensor, number: int = number) -> Tensor:
+                return part.expand(number, *part.shape[1:])
+
+            sites = {name: repeated(value) for name, value in usual.items()}
+            known = map_state(repeated, knowledge)
+            view, _ = human.look({**sites, site: some}, known, now, told, step)
+            numbers = view.map(repeated).numbers()
+            if bool((numbers != numbers[:1]).any()):
+                what = (
+                    f"its values from number {span.values - 1} on differ in what is seen"
+                    if inside
+                    else "it is read outside of it"
+                )
+                raise HumanModelError(
+                    f'the span of "{site}" is steps {span.first} to {span.last}, but at step '
+                    f"{step} {what}"
+                )
+        _, knowledge = human.look(usual, knowledge, now, told, step)
+
+
+def _check_independence(human: HumanModel, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Supports ``[n]`` of the sites of attention, none of which hangs on another."""
+    with torch.random.fork_rng(devices=[]), poutine.block(), pyro.plate("person", 1, dim=-2):
+        torch.manual_seed(0)
+        implants = human.prior()
+        facts = {name: fact.view(1, 1) for name, fact in human.facts({**so_far}).items()}
+        with poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
+            human.attend({**implants, **facts})
+        supports = {
+            name: node["fn"].enumerate_support(expand=False).flatten()
+            for name, node in latent_sites(trace.trace).items()
+        }
+        for site, own in supports.items():
+            found = []
+            for place in (0, -1):
+                values = {
+                    name: support[place].expand(1, 1, len(own))
+                    for name, support in supports.items()
+                }
+                values[site] = own.expand(1, 1, -1)
+                found.append(human.log_attention_sites(implants, values, facts)[site])
+            if not torch.equal(*torch.broadcast_tensors(*found)):
+                raise HumanModelError(
+                    f'"{site}" of attend hangs on another of its sites, so that spans cannot be '
+                    "summed out one after another"
+                )
+    return supports
