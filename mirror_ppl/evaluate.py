@@ -130,6 +130,13 @@ def main(options: Options) -> int:
     return FAILED if failed else 0
 
 
+def _told(options: Options) -> float:
+    """How much is told in the rounds that are learned from."""
+    if options.told is not None:
+        return options.told
+    return 0.0 if options.study == "prediction" else TOLD
+
+
 def _cells(options: Options) -> list[Any]:
     """What is to be done."""
     from mirror_ppl.domains import get_domain
@@ -143,9 +150,7 @@ def _cells(options: Options) -> list[Any]:
         if name not in every:
             raise UnknownNameError.of("setting", name, every)
     predicting = options.study == "prediction"
-    told = options.told
-    if told is None:
-        told = 0.0 if predicting else TOLD
+    told = _told(options)
     cells: list[Any] = []
     for domain, settings in domains.items():
         if options.population not in (known := PEOPLE[domain].populations):
@@ -185,7 +190,8 @@ def _origin(options: Options) -> dict[str, Any]:
 
     return {
         "command": PROGRAM,
-        "options": {name: value for name, value in asdict(options).items() if name != "jobs"},
+        "options": {name: value for name, value in asdict(options).items() if name != "jobs"}
+        | {"told": _told(options)},
         "version": __version__,
         "torch": torch.__version__,
         "machine": {"processor": platform.machine(), "cores": os.cpu_count()},

@@ -131,9 +131,9 @@ def test_reads_what_was_told(modality, random_clone):
     assert torch.equal(before[:, :, :5], after[:, :, :5])
     assert (before[:, :, 5] != after[:, :, 5]).any(-1)[behind].all()
     added = (clone.inputs(changed) - clone.inputs(data))[:, :, 5][behind]
-    # The symbols of that car in that modality, and its mask.
+    # The symbols of that car in that modality, that it is visible, and that it was told.
     symbols = Driving().symbols(data.observation())[modality][:, :, 5, 2][behind]
-    assert torch.equal(added.sum(-1), symbols.sum(-1) + 1)
+    assert torch.equal(added.sum(-1), symbols.sum(-1) + 2)
 
 
 def test_words_that_training_lacked_change_nothing(generator):

@@ -15,6 +15,7 @@ from mirror_ppl.baselines import NetworkPerson
 from mirror_ppl.baselines.training import mean_nll
 from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
+from mirror_ppl.errors import OptionError
 from mirror_ppl.evaluation import learners, study
 from mirror_ppl.evaluation.learners import LEARNERS, PLANNABLE, TEST, Group, learn
 from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
@@ -331,3 +332,18 @@ def test_bars_are_of_the_most_rounds_and_silence_is_told():
     (bar,) = ax.patches
     assert bar.get_height() == pytest.approx(60)  # pyright: ignore[reportAttributeAccessIssue]
     assert [text.get_text() for text in ax.texts] == ["nothing told"]
+
+
+def test_people_are_told_things_where_help_is_compared():
+    """And by what was asked for, if anything was."""
+    for study, told, expected in (
+        ("prediction", None, 0.0),
+        ("assistance", None, 0.03),
+        ("relevance", None, 0.03),
+        ("assistance", 0.0, 0.0),
+        ("prediction", 0.1, 0.1),
+    ):
+        cells = evaluate._cells(evaluate.Options(study, models=("bc",), seeds=1, told=told))
+        assert {cell.group.told for cell in cells} == {expected}
+    with pytest.raises(OptionError, match="--told must be from 0 to 1, not 2"):
+        evaluate.Options("assistance", told=2.0)

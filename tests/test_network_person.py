@@ -103,7 +103,7 @@ def test_who_acts_on_what_they_are_told_is_told(generator):
     weights, hidden, sizes = human.networks.weights, human.networks.hidden, DOMAIN.symbol_sizes
     for value in weights.values():
         value.data.zero_()
-    visual = len(DOMAIN.modalities[0].items) * (sizes["visual"] + 1)
+    visual = len(DOMAIN.modalities[0].items) * (sizes["visual"] + 2)
     spoken = len(DOMAIN.modalities[1].items) * sizes["verbal"]
     weights["input"].data[0, sizes["ego"] + visual + spoken, 2 * hidden] = 20.0
     for layer in ("layer_1", "layer_2", "layer_3"):
@@ -135,3 +135,16 @@ def test_the_world_that_is_planned_in_can_be_another(generator):
     human = NetworkPerson(SelfModel(driving), untrained(driving), "fog", other)
     assert human.known_world(human.draws(1)) is other
     assert NETWORK in human.draws(1)
+
+
+def test_what_the_setting_shows_anyway_can_be_told(generator):
+    """In bomb defusal, where all terminals are in view: a network hears that one is shown."""
+    human = network("bomb_defusal", generator, "unlabelled")
+    domain = human.domain
+    now = domain.observe(domain.initial(1, generator))
+    told = {name: torch.zeros_like(mask) for name, mask in domain.communicable(now).items()}
+    silent, _ = human.look({}, None, now, told, 0)
+    told["visual"] = domain.sought(now)
+    shown, _ = human.look({}, None, now, told, 0)
+    difference = human.evidence(shown, now) - human.evidence(silent, now)
+    assert int((difference != 0).sum()) == 1 and float(difference.sum()) == 1.0

@@ -514,12 +514,14 @@ def command(*args):
     return run(Options, main, prog=PROGRAM, description=DESCRIPTION, args=args)
 
 
-def test_command_writes_what_simulate_returns(tmp_path, capsys):
+@pytest.mark.parametrize("rate", [0.0, 0.2])
+def test_command_writes_what_simulate_returns(rate, tmp_path, capsys):
     path = tmp_path / "made" / "people.nc"
     args = ["--people", "2", "--rounds", "3", "--population", "diverse", "--setting", "clear"]
+    args += ["--told", str(rate)] if rate else []
     assert command("--out", str(path), "--seed", "4", *args) == 0
     loaded = load_demonstrations(path)
-    made = simulate("driving", "clear", "diverse", 2, 3, 4)
+    made = simulate("driving", "clear", "diverse", 2, 3, 4, told=rate)
     assert replace(loaded, provenance=made.provenance).equals(made)
     # What is written makes the same recordings again, wherever to.
     told = loaded.provenance["command"]
@@ -541,6 +543,7 @@ def test_command_writes_what_simulate_returns(tmp_path, capsys):
         ("--population", "papers"),
         ("--device", "toaster"),
         ("--people", "0"),
+        ("--told", "1.5"),
         ("--rounds", "-1"),
         ("--rounds", "many"),
     ],

@@ -2,12 +2,12 @@
 
 Implements the baseline BC of MIRROR (Chen, Fong and Soh, RSS 2022; supplement, section D)::
 
-    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])          48 units
+    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])     48 units
     a_t ~ Categorical(softmax(output(relu(layer(h_t)))))          one layer of 32
 
 with a network of its own for each person, fitted to that person's rounds by maximum likelihood.
 ``x_t`` are the domain's symbols of all items of all modalities and ``v_t`` masks: which items the
-setting lets an unaided person see, or were told.
+setting lets an unaided person see, or were told; ``m_t`` is which of them were told.
 
 Departures from the supplement:
 
@@ -17,7 +17,8 @@ Departures from the supplement:
 - It does not say whether BC reads all items or only those in sight. ``sight`` has both. With
   "setting" the clone is *given* the sight that MIRROR has to infer wherever the setting alone
   limits people's sight; with "everything" it has as much to go by as MIRROR has.
-- Masks are inputs, so that what is communicated can enter.
+- Masks are inputs, so that what is communicated can enter, and by itself which items were told:
+  of what the setting shows anyway a message may still say that it counts.
 - Weights on inputs begin at zero: a symbol that the recordings lack adds nothing. The output's bias
   begins at the frequencies of the person's actions.
 - Weight decay, and early stopping on the person's validation rounds; `BehaviourCloneOptions` tells

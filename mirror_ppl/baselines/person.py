@@ -2,8 +2,8 @@
 
 What the network remembers is the person's belief, and what it says of actions their values::
 
-    zH_t = h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])
-    v_t  = what the setting lets an unaided person see, or what they are told
+    zH_t = h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])
+    v_t  = what the setting lets an unaided person see, or what they are told; m_t the latter alone
     a_t ~ Categorical(softmax(y(h_t)))
 
 There is nothing to infer any more: training made a point estimate of the network.
@@ -29,6 +29,8 @@ from mirror_ppl.models.self_model import SelfModel
 
 NETWORK = "network"
 """Name of the only site: which network it is, of one."""
+TOLD = "told_"
+"""Prefix of masks of what is told, which networks read besides what is seen."""
 
 
 class NetworkPerson(HumanModel):
@@ -96,13 +98,16 @@ class NetworkPerson(HumanModel):
         """What the setting shows and what is told; whatever follows is left to the network."""
         del implants, step
         seen = self.networks.visible(self.setting, observation)
-        return View({name: mask | told[name] for name, mask in seen.items()}), knowledge
+        heard = {TOLD + name: mask for name, mask in told.items()}
+        return View({**seen, **heard}), knowledge
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
         """What networks read at each step, ``[..., I]``, without the action before."""
         none = torch.full(observation["ego"].shape[:-1], self._none, dtype=torch.long)
         none = none.to(observation["ego"].device)
-        inputs = network_inputs(self.domain, observation, view.visible, none)
+        seen = {name: view.visible[name] for name in self._modalities}
+        told = {name: view.visible[TOLD + name] for name in self._modalities}
+        inputs = network_inputs(self.domain, observation, seen, told, none)
         return inputs[..., : -(self._none + 1)]
 
     def advance(
@@ -138,6 +143,10 @@ class NetworkPerson(HumanModel):
         """Log-probabilities of actions ``[..., T, A]``."""
         del implants, belief
         return values.log_softmax(-1)
+
+    @property
+    def _modalities(self) -> tuple[str, ...]:
+        return tuple(modality.name for modality in self.domain.modalities)
 
     @property
     def _none(self) -> int:

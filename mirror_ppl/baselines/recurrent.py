@@ -2,11 +2,12 @@
 
 What the supplement's baselines have in common (section D)::
 
-    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])
+    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])
     y_t = output(relu(layer_L(... relu(layer_1(h_t)))))          a number for each action
 
 ``x_t`` are the domain's symbols of all items of all modalities and ``v_t`` masks: which items the
-setting lets an unaided person see, or were told. P stands for people, H for the GRU's units.
+setting lets an unaided person see, or were told. ``m_t`` is which were told. P stands for people, H
+for the GRU's units.
 """
 
 from __future__ import annotations
@@ -30,7 +31,11 @@ LAYER = "layer_"
 
 
 def network_inputs(
-    domain: Domain, observation: Observation, visible: Visibility, previous: Tensor
+    domain: Domain,
+    observation: Observation,
+    seen: Visibility,
+    told: Visibility,
+    previous: Tensor,
 ) -> Tensor:
     """What a recurrent network reads at each step, ``[..., I]``; zero for all that is not visible.
 
@@ -38,15 +43,18 @@ def network_inputs(
         domain: the world.
         observation: everything that there was to observe, ego ``[..., E]`` and modalities
             ``[..., K, F]`` in the domain's units.
-        visible: seen or told, ``[..., K]`` for each modality.
+        seen: what the setting shows, ``[..., K]`` for each modality.
+        told: what is communicated, likewise.
         previous: indices ``[...]`` of the actions before, A where there was none.
     """
     symbols = domain.symbols(observation)
     dtype = symbols["ego"].dtype
     parts = [symbols["ego"]]
     for modality in domain.modalities:
-        mask = visible[modality.name].to(dtype)
-        parts += [(symbols[modality.name] * mask[..., None]).flatten(-2), mask]
+        heard = told[modality.name]
+        mask = (seen[modality.name] | heard).to(dtype)
+        heard = heard.to(dtype).expand(mask.shape)
+        parts += [(symbols[modality.name] * mask[..., None]).flatten(-2), mask, heard]
     parts.append(one_hot(previous, len(domain.actions) + 1).to(dtype))
     return torch.cat(parts, -1)
 
@@ -65,8 +73,8 @@ def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations
     """What a baseline reads at each step of recorded rounds, ``[P, B, T, I]``."""
     observation = demonstrations.observation()
     steps = demonstrations.shape[2]
-    visible = {
-        name: mask[:, :, :steps] | demonstrations.told[name]
+    seen = {
+        name: mask[:, :, :steps]
         for name, mask in visible_items(domain, sight, demonstrations.setting, observation).items()
     }
     observation = {name: value[:, :, :steps] for name, value in observation.items()}
@@ -74,12 +82,12 @@ def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations
     none = torch.full_like(actions[:, :, :1], len(domain.actions))
     # Padding has the action -1, which is nobody's business but has to have a symbol.
     previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
-    return network_inputs(domain, observation, visible, previous)
+    return network_inputs(domain, observation, seen, demonstrations.told, previous)
 
 
 def input_size(domain: Domain) -> int:
     """I, the number of inputs that `network_inputs` makes."""
-    items = sum(len(m.items) * (domain.symbol_sizes[m.name] + 1) for m in domain.modalities)
+    items = sum(len(m.items) * (domain.symbol_sizes[m.name] + 2) for m in domain.modalities)
     return domain.symbol_sizes["ego"] + items + len(domain.actions) + 1
 
 

@@ -4,7 +4,7 @@ Implements the baseline SQIL of MIRROR (Chen, Fong and Soh, RSS 2022; supplement
 Reddy, Dragan and Levine, *SQIL: Imitation Learning via Reinforcement Learning with Sparse Rewards*
 (ICLR 2020)::
 
-    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, a_{t-1}])                    48 units
+    h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])               48 units
     Q(h_t, .) = output(relu(layer_3(relu(layer_2(relu(layer_1(h_t)))))))    three layers of 32
     a_t ~ Categorical(softmax(Q(h_t, .)))
 
@@ -117,7 +117,8 @@ class SoftQ(RecurrentNetworks):
         for _ in range(domain.horizon):
             observation = domain.observe(state)
             seen = self.visible(setting, observation)
-            inputs.append(network_inputs(domain, observation, seen, last))
+            nothing = {name: torch.zeros_like(mask) for name, mask in seen.items()}
+            inputs.append(network_inputs(domain, observation, seen, nothing, last))
             hidden = self.step(hidden, inputs[-1])
             chances = self.act(hidden).exp()
             last = torch.stack(
