@@ -336,14 +336,14 @@ def test_bars_are_of_the_most_rounds_and_silence_is_told():
 
 def test_people_are_told_things_where_help_is_compared():
     """And by what was asked for, if anything was."""
-    for study, told, expected in (
+    for name, told, expected in (
         ("prediction", None, 0.0),
         ("assistance", None, 0.03),
         ("relevance", None, 0.03),
         ("assistance", 0.0, 0.0),
         ("prediction", 0.1, 0.1),
     ):
-        cells = evaluate._cells(evaluate.Options(study, models=("bc",), seeds=1, told=told))
+        cells = evaluate._cells(evaluate.Options(name, models=("bc",), seeds=1, told=told))
         assert {cell.group.told for cell in cells} == {expected}
     with pytest.raises(OptionError, match="--told must be from 0 to 1, not 2"):
         evaluate.Options("assistance", told=2.0)

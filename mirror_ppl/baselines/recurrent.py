@@ -82,7 +82,7 @@ def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations
     none = torch.full_like(actions[:, :, :1], len(domain.actions))
     # Padding has the action -1, which is nobody's business but has to have a symbol.
     previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
-    return network_inputs(domain, observation, seen, demonstrations.told, previous)
+    return network_inputs(domain, observation, seen, dict(demonstrations.told), previous)
 
 
 def input_size(domain: Domain) -> int:
