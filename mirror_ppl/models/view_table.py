@@ -134,7 +134,9 @@ class ViewTable:
         recorded: actions ``[P, B, T]``, 0 in padding.
         steps: which steps are real ``[P, B, T]``.
         view_counts: number of real views of each person ``[P]``.
-        attention: values of what differs from round to round, if anything does.
+        attention: what differs from round to round, if anything does: values that stand for all, or
+            a chain that is summed out exactly. Of a chain views are of spans: their moments
+            outside of these are ``NO_VIEW``.
     """
 
     sites: tuple[str, ...]
