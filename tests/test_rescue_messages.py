@@ -18,6 +18,7 @@ def standing(radius):
     human = HumanModel(SelfModel(WORLD))
     draws = {
         "sight_radius": torch.full((3, 1, 1), WORLD.reach_bins.index(radius)),
+        "assumes_open": torch.tensor([0, 1, 0]).view(3, 1, 1),
         "consistency": torch.full((3, 1, 1), 3.0),
         "lapse": torch.full((3, 1, 1), 0.05),
         "residual_in": torch.zeros(3, 1, 1, 49, 8),

@@ -407,16 +407,46 @@ def test_a_person_sees_as_far_as_their_radius_and_remembers():
     told = {m.name: torch.zeros(1, steps, len(m.items), dtype=torch.bool) for m in WORLD.modalities}
     smoke = next(place for place, edge in enumerate(WORLD.reach_bins) if edge == 1.5)
     everything = len(WORLD.reach_bins) - 1
-    view = human.perceive({"sight_radius": torch.tensor([smoke, everything])}, observation, told)
-    assert view.visible["visual"].shape == (2, steps, 9)
-    assert view.visible["verbal"].shape == (2, steps, 5)
-    assert not view.taken and not view.imagined
+    implants = {
+        "sight_radius": torch.tensor([smoke, everything, smoke]),
+        "assumes_open": torch.tensor([0, 0, 1]),
+    }
+    view = human.perceive(implants, observation, told)
+    assert view.visible["visual"].shape == (3, steps, 9)
+    assert view.visible["verbal"].shape == (3, steps, 5)
+    assert not any(mask[:2].any() for mask in view.taken.values())
     assert view.visible["visual"][1].all() and view.visible["verbal"][1].all()
     seen = [{PORTIONS[k] for k in row.nonzero().flatten()} for row in view.visible["visual"][0]]
     assert seen[0] == ALWAYS
     assert seen[6] == ALWAYS | {"middle-right"}  # row 5 of the corridor
     assert seen[9] == ALWAYS | {"middle-right"} | set(ROOMS)  # the victim: no other room has one
+    # Who takes corridors to be open does so until they know better: then of the left one alone.
+    taken = {name: mask[2] for name, mask in view.taken.items()}
+    both, left = [0, 0, 0, 1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0, 0, 0, 0]
+    assert taken["visual"][0].int().tolist() == both
+    assert taken["visual"][6].int().tolist() == left
+    assert taken["verbal"][0].int().tolist() == [1, 1, 0, 0, 0]
+    assert taken["verbal"][6].int().tolist() == [1, 0, 0, 0, 0]
+    free = WORLD.observe(replace(states[0], blocked=torch.zeros_like(states[0].blocked)))
+    assert torch.equal(view.imagined["visual"][2, 0], free["visual"])
+    assert torch.equal(view.imagined["verbal"][2, 0], free["verbal"])
     check_contract(human)
+
+
+def test_an_obstacle_of_which_nothing_is_known_may_be_taken_not_to_be_there():
+    state = start(number=3)
+    state = replace(state, blocked=torch.tensor([0, 1, 2]))
+    knowledge = WORLD.nothing_known(3)
+    makes, open_to_them = torch.ones(3).bool(), torch.zeros(3).bool()
+
+    def supposed(corridors, assumes):
+        own = replace(knowledge, corridors=torch.tensor(corridors))
+        return WORLD.supposed(state, own, {"open": assumes}).blocked.tolist()
+
+    nothing, right = [[False, False]] * 3, [[False, True]] * 3
+    assert supposed(nothing, makes) == [0, 0, 0]
+    assert supposed(nothing, open_to_them) == [0, 1, 2]
+    assert supposed(right, makes) == [0, 0, 2]
 
 
 def test_views_to_train_on_have_the_items_of_each_modality():
@@ -426,4 +456,8 @@ def test_views_to_train_on_have_the_items_of_each_modality():
     observation = {name: value[:, None] for name, value in WORLD.observe(state).items()}
     visible, knowledge = plan.look(WORLD, WORLD.nothing_known(20, 1), observation, 0)
     assert visible["visual"].shape == (20, 1, 9) and visible["verbal"].shape == (20, 1, 5)
-    assert not any(mask.any() for mask in plan.taken(WORLD, knowledge, observation).values())
+    taken = plan.taken(WORLD, knowledge, observation)
+    corridors = ~knowledge.corridors & plan.assumes["open"][:, None, None]
+    assert corridors.any() and torch.equal(taken["verbal"][..., :2], corridors)
+    assert torch.equal(taken["visual"][..., [3, 5]], corridors)
+    assert not taken["verbal"][..., 2:].any() and not taken["visual"][..., :3].any()

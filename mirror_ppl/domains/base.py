@@ -105,6 +105,8 @@ class Domain(Protocol):
     The robot practises to see only so far with weights ``reach_practice`` of the reaches (all alike
     if empty), to notice what is within reach at a step with a probability between those of
     ``notice_practice``, and to be told of an item with one up to ``told_practice``.
+    ``assumptions`` are what an observer may take for granted of what they do not know; where all of
+    them leave nothing open, the world is ``settled``.
     ``mishap`` is the reward term of what people should be kept from, and what several of them are
     called. ``counterparts`` has for each visual item the verbal item that tells of the same, where
     that tells more of it.
@@ -132,6 +134,7 @@ class Domain(Protocol):
     notice_practice: tuple[float, float]
     partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...]
+    settled: bool
 
     @property
     def as_believed(self) -> Domain:

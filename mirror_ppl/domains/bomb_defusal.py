@@ -149,6 +149,7 @@ class BombDefusal:
     notice_practice = (0.25, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {}
     assumptions: tuple[str, ...] = ()
+    settled = False
 
     def __init__(self, rules: Rules = RULES) -> None:
         self.rules = rules

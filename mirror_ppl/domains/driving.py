@@ -149,6 +149,7 @@ class Driving:
         "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),
     }
     assumptions: tuple[str, ...] = ASSUMPTIONS
+    settled = True
 
     @property
     def as_believed(self) -> Driving:

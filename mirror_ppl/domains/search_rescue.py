@@ -174,7 +174,9 @@ class SearchRescue:
     told_practice = 0.05
     notice_practice = (1.0, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
-    assumptions: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ("open",)
+    """A corridor of which nothing is known is not blocked."""
+    settled = False
 
     @property
     def as_believed(self) -> SearchRescue:
@@ -336,16 +338,30 @@ class SearchRescue:
     def assume(
         self, knowledge: HouseKnowledge, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """Nothing is taken for granted."""
-        del knowledge
-        return {}, observation
+        """Who takes it for granted imagines corridors of which they know nothing to be free."""
+        unknown = ~knowledge.corridors
+        corridors, rooms = len(CORRIDORS), len(ROOMS)
+        items = {
+            "visual": torch.zeros(*unknown.shape[:-1], len(PORTIONS), dtype=torch.bool),
+            "verbal": torch.zeros(*unknown.shape[:-1], corridors + rooms, dtype=torch.bool),
+        }
+        items = {name: mask.to(unknown.device) for name, mask in items.items()}
+        items["visual"][..., list(CORRIDOR_PORTIONS)] = unknown
+        items["verbal"][..., :corridors] = unknown
+        holds = observation["verbal"][..., 0] == 1
+        known = torch.nn.functional.pad(knowledge.corridors, [0, rooms], value=True)
+        holds = holds & known
+        imagined = {"visual": portion_pixels(holds), "verbal": holds[..., None]}
+        imagined = {name: value.to(observation[name]) for name, value in imagined.items()}
+        return {"open": items}, {"ego": observation["ego"], **imagined}
 
     def supposed(
         self, state: RescueState, knowledge: HouseKnowledge, assumes: Mapping[str, Tensor]
     ) -> RescueState:
-        """The state as it is: nothing is taken for granted."""
-        del knowledge, assumes
-        return state
+        """The state without an obstacle of which they know nothing, where they assume that."""
+        sides = torch.arange(1, 1 + len(CORRIDORS), device=state.blocked.device)
+        known = ((state.blocked[..., None] == sides) & knowledge.corridors).any(-1)
+        return replace(state, blocked=torch.where(known | ~assumes["open"], state.blocked, 0))
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Observations in the form in which networks read them.

@@ -2,8 +2,8 @@
 
 In full view the yardstick is the exact planner that knows everything. In partial view it is the
 exact planner of the world as somebody with that view believes it to be who remembers everything
-and makes every assumption (see `mirror_ppl.models.views`). Where a domain has no assumptions, what
-somebody does not see stays open to them, and the return in that view is all there is to compare.
+and makes every assumption (see `mirror_ppl.models.views`). Where these leave something open, the
+return of somebody who assumes nothing is all there is to compare.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ def fixed_views(
         domain: the world.
         batch: number of rounds B.
         generator: source of the numbers that a plan needs; they decide nothing here.
-        reach: distance for each direction; given, the observer makes every assumption.
+        reach: distance for each direction; given, the observer makes every assumption where that
+            leaves nothing open, and none elsewhere.
         speech: whether everything is also told.
     """
     farthest = (domain.reach_bins[-1],) * len(domain.directions)
@@ -57,7 +58,7 @@ def fixed_views(
         keep=rates,
         told={name: torch.zeros_like(some) for name in rates},
         remembers=torch.ones_like(limited),
-        assumes=dict.fromkeys(domain.assumptions, limited),
+        assumes=dict.fromkeys(domain.assumptions, limited & domain.settled),
         noise={
             m.name: torch.rand(
                 batch,
@@ -104,7 +105,8 @@ def self_model_quality(
     Returns:
         By name: mean returns of the exact planner, of random actions and of the self-model in
         ``full`` view (everything shown and told), where there is such a setting in ``clear`` view
-        (everything shown, nothing told), of a domain without assumptions also in its partial views;
+        (everything shown, nothing told), where assumptions leave something open also in its
+        partial views;
         where the robot was taught wrong, in ``full`` view as it really is (``return_as_it_is``) and
         of the planner there (``return_exact_as_it_is``); ``share_*``, how far these
         are on the way from random to exact; and for several views ``agreement_*``, the share of
@@ -129,7 +131,7 @@ def self_model_quality(
     for name, reach in domain.partial_views.items():
         views[name] = fixed_views(domain, rounds, generator, reach)
     for name, plan in views.items():
-        if name in ("full", "clear") or not domain.assumptions:
+        if name in ("full", "clear") or not domain.settled:
             own = drive(self_model, start, plan, steps, generator)
             reached = float(returns(domain, start, own).mean())
             report[f"return_{name}"] = reached
@@ -139,7 +141,7 @@ def self_model_quality(
                 report["return_as_it_is"] = float(returns(real, start, own).mean())
                 planned = planner_actions(real, start, steps, 1.0)
                 report["return_exact_as_it_is"] = float(returns(real, start, planned).mean())
-        if name not in ("full", "clear") and not domain.assumptions:
+        if name not in ("full", "clear") and not domain.settled:
             continue
         actions = drive(self_model, start, plan, steps, generator, epsilon=0.2)
         lived = experience(domain, start, actions, plan).rounds

@@ -21,6 +21,7 @@ TITLES = {
     "sight_back_own": "sight behind, own lane",
     "sight_back_other": "sight behind, other lane",
     "sight_radius": "sight, in every direction",
+    "assumes_open": "takes unknown corridors to be free",
     "assumes_clear": "takes the unseen to be absent",
     "assumes_closing": "takes what they cannot judge to come closer",
     "consistency": "consistency of choices",
