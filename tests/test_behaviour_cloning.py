@@ -56,7 +56,7 @@ def test_solves_a_task_that_it_must(rule, options, generator):
 
 def test_is_the_gru_of_torch(random_clone):
     clone, data = random_clone
-    inputs = clone.inputs(data)
+    inputs = clone.inputs(data).steps
     assert inputs.shape[-1] == input_size(Driving())
     gru = torch.nn.GRU(inputs.shape[-1], clone.hidden, batch_first=True)
     with torch.no_grad():
@@ -74,7 +74,7 @@ def test_is_the_gru_of_torch(random_clone):
 
 def test_step_by_step_is_the_same_as_all_at_once(random_clone):
     clone, data = random_clone
-    inputs, hidden, steps = clone.inputs(data), clone.start(8), []
+    inputs, hidden, steps = clone.inputs(data).steps, clone.start(8), []
     for now in inputs.unbind(2):
         hidden = clone.step(hidden, now)
         steps.append(clone.act(hidden))
@@ -130,7 +130,7 @@ def test_reads_what_was_told(modality, random_clone):
     before, after = clone.log_probabilities(data), clone.log_probabilities(changed)
     assert torch.equal(before[:, :, :5], after[:, :, :5])
     assert (before[:, :, 5] != after[:, :, 5]).any(-1)[behind].all()
-    added = (clone.inputs(changed) - clone.inputs(data))[:, :, 5][behind]
+    added = (clone.inputs(changed).steps - clone.inputs(data).steps)[:, :, 5][behind]
     # The symbols of that car in that modality, that it is visible, and that it was told.
     symbols = Driving().symbols(data.observation())[modality][:, :, 5, 2][behind]
     assert torch.equal(added.sum(-1), symbols.sum(-1) + 2)

@@ -7,7 +7,8 @@ import torch
 from example_rounds import alternate, anything, avoid, ragged, rounds_of, untrained
 
 from mirror_ppl.baselines import SoftQOptions, fit_soft_q, held_out_nll, input_size
-from mirror_ppl.baselines.sqil import squared_errors
+from mirror_ppl.baselines.inputs import StepInputs
+from mirror_ppl.baselines.sqil import mean_error, squared_errors
 from mirror_ppl.data import concatenate
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import SWITCH
@@ -31,10 +32,12 @@ def test_the_loss_is_the_soft_bellman_error():
     own = HandSet([[[[2.0, 7.0], [3.0, 4.0], [9.0, 9.0]]]])
     ahead = HandSet([[[[5.0, 5.0], [0.0, 0.0], [8.0, 8.0]]]])
     actions = torch.tensor([[[0, 1, -1]]])
-    found = squared_errors(own, ahead, torch.zeros(1, 1, 3, 1), actions, 1.0, 0.5)
+    inputs = StepInputs.of(torch.zeros(1, 1, 3, 1))
+    errors = squared_errors(own, ahead, inputs, actions, torch.ones(1, 1), 0.5)
     first = 2.0 - 1.0 - 0.5 * torch.tensor(2.0).log()
     second = 4.0 - 1.0
-    torch.testing.assert_close(found, ((first**2 + second**2) / 2)[None])
+    torch.testing.assert_close(errors[0, 0], torch.tensor([first**2, second**2, 0.0]))
+    torch.testing.assert_close(mean_error(errors, actions), ((first**2 + second**2) / 2)[None])
 
 
 @pytest.mark.parametrize("rule", [avoid, alternate])
@@ -57,14 +60,15 @@ def test_played_rounds_are_of_the_domain_and_of_the_networks(name):
     networks = untrained(domain, ("a", "b"))
     generators = [torch.Generator().manual_seed(5), torch.Generator().manual_seed(6)]
     inputs, actions = networks.play(domain.settings[-1], 3, generators)
-    assert inputs.shape == (2, 3, domain.horizon, input_size(domain))
+    read = inputs.steps
+    assert read.shape == (2, 3, domain.horizon, input_size(domain))
     assert actions.shape == (2, 3, domain.horizon)
     assert (actions >= -1).all() and (actions[..., 0] >= 0).all()
     # What comes after the end stays after it.
     ended = actions < 0
     assert (ended[..., :-1] <= ended[..., 1:]).all()
     # Inputs hold what was done before.
-    done = inputs[..., -len(domain.actions) - 1 :].argmax(-1)
+    done = read[..., -len(domain.actions) - 1 :].argmax(-1)
     assert (done[..., 0] == len(domain.actions)).all()
     before, after = actions[..., :-1], done[..., 1:]
     assert (before == after)[before >= 0].all()

@@ -5,9 +5,10 @@ from mirror_ppl.baselines.behaviour_cloning import (
     BehaviourCloneOptions,
     fit_behaviour_clone,
 )
+from mirror_ppl.baselines.inputs import SIGHTS, input_size, network_inputs
 from mirror_ppl.baselines.logistic import LogisticOptions, PooledLogistic, fit_pooled_logistic
 from mirror_ppl.baselines.person import NetworkPerson
-from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, input_size, network_inputs
+from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.baselines.sqil import SoftQ, SoftQOptions, fit_soft_q
 from mirror_ppl.baselines.training import held_out_nll
 

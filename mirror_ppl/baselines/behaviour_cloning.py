@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mirror_ppl.baselines.inputs import StepInputs
 from mirror_ppl.baselines.recurrent import RecurrentNetworks, initial_weights
 from mirror_ppl.baselines.training import (
     Report,
@@ -116,7 +117,7 @@ def fit_behaviour_clone(
     clone.to(train.actions.device)
     decay = options.weight_decay / (train.round_counts / options.full_decay_rounds).clamp(min=1)
 
-    def loss(step: int, inputs: Tensor, actions: Tensor) -> Tensor:
+    def loss(step: int, inputs: StepInputs, actions: Tensor) -> Tensor:
         del step
         return mean_nll(clone(inputs).log_softmax(-1), actions)
 

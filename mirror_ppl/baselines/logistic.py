@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from mirror_ppl.baselines.recurrent import SIGHTS, Sight, recorded_inputs
+from mirror_ppl.baselines.inputs import SIGHTS, Sight, recorded_inputs
 from mirror_ppl.baselines.training import check_parts, mean_nll
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import Domain, get_domain, require_known

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from mirror_ppl.baselines.recurrent import RecurrentNetworks, network_inputs
+from mirror_ppl.baselines.inputs import network_inputs
+from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, Implants, View

@@ -13,82 +13,24 @@ for the GRU's units.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, Self, get_args
+from typing import Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
 
+from mirror_ppl.baselines.inputs import (
+    Sight,
+    StepInputs,
+    each_step,
+    input_size,
+    recorded_inputs,
+    visible_items,
+)
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import Domain, Observation, Visibility, require_known
 from mirror_ppl.errors import DemonstrationsError
 
-Sight = Literal["setting", "everything"]
-"""Which items a network reads: those that the setting shows or that were told, or all visual ones.
-"""
-SIGHTS: tuple[Sight, ...] = get_args(Sight)
 LAYER = "layer_"
-
-
-def network_inputs(
-    domain: Domain,
-    observation: Observation,
-    seen: Visibility,
-    told: Visibility,
-    previous: Tensor,
-) -> Tensor:
-    """What a recurrent network reads at each step, ``[..., I]``; zero for all that is not visible.
-
-    Args:
-        domain: the world.
-        observation: everything that there was to observe, ego ``[..., E]`` and modalities
-            ``[..., K, F]`` in the domain's units.
-        seen: what the setting shows, ``[..., K]`` for each modality.
-        told: what is communicated, likewise.
-        previous: indices ``[...]`` of the actions before, A where there was none.
-    """
-    symbols = domain.symbols(observation)
-    dtype = symbols["ego"].dtype
-    parts = [symbols["ego"]]
-    for modality in domain.modalities:
-        heard = told[modality.name]
-        mask = (seen[modality.name] | heard).to(dtype)
-        heard = heard.to(dtype).expand(mask.shape)
-        parts += [(symbols[modality.name] * mask[..., None]).flatten(-2), mask, heard]
-    parts.append(one_hot(previous, len(domain.actions) + 1).to(dtype))
-    return torch.cat(parts, -1)
-
-
-def visible_items(
-    domain: Domain, sight: Sight, setting: str, observation: Observation
-) -> Visibility:
-    """Which items a setting lets a baseline read, ``[..., K]`` for each modality."""
-    visible = domain.visibility(setting, observation)
-    if sight == "everything":
-        visible = visible | {"visual": torch.ones_like(visible["visual"])}
-    return visible
-
-
-def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations) -> Tensor:
-    """What a baseline reads at each step of recorded rounds, ``[P, B, T, I]``."""
-    observation = demonstrations.observation()
-    steps = demonstrations.shape[2]
-    seen = {
-        name: mask[:, :, :steps]
-        for name, mask in visible_items(domain, sight, demonstrations.setting, observation).items()
-    }
-    observation = {name: value[:, :, :steps] for name, value in observation.items()}
-    actions = demonstrations.actions
-    none = torch.full_like(actions[:, :, :1], len(domain.actions))
-    # Padding has the action -1, which is nobody's business but has to have a symbol.
-    previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
-    return network_inputs(domain, observation, seen, dict(demonstrations.told), previous)
-
-
-def input_size(domain: Domain) -> int:
-    """I, the number of inputs that `network_inputs` makes."""
-    items = sum(len(m.items) * (domain.symbol_sizes[m.name] + 2) for m in domain.modalities)
-    return domain.symbol_sizes["ego"] + items + len(domain.actions) + 1
 
 
 class RecurrentNetworks(nn.Module):
@@ -124,9 +66,9 @@ class RecurrentNetworks(nn.Module):
         """Which items a setting lets the networks read, ``[..., K]`` for each modality."""
         return visible_items(self.domain, self.sight, setting, observation)
 
-    def inputs(self, demonstrations: Demonstrations) -> Tensor:
-        """What the networks read at each step of recorded rounds, ``[P, B, T, I]``."""
-        return recorded_inputs(self.domain, self.sight, demonstrations)
+    def inputs(self, demonstrations: Demonstrations) -> StepInputs:
+        """What the networks read at each step of recorded rounds."""
+        return StepInputs.of(recorded_inputs(self.domain, self.sight, demonstrations))
 
     def start(self, rounds: int) -> Tensor:
         """The hidden state before the first step of B rounds, ``[P, B, H]`` of zeros."""
@@ -143,10 +85,10 @@ class RecurrentNetworks(nn.Module):
             values = torch.relu(torch.baddbmm(own[f"{name}_bias"], values, own[name]))
         return torch.baddbmm(own["output_bias"], values, own["output"])
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """``y_t`` at every step ``[P, B, T, A]`` of ``inputs`` ``[P, B, T, I]``."""
-        _, rounds, steps, _ = inputs.shape
-        gates = self._project(inputs.flatten(1, 2)).unflatten(1, (rounds, steps))
+    def forward(self, inputs: StepInputs) -> Tensor:
+        """``y_t`` at every step ``[P, B, T, A]`` of the steps' inputs."""
+        _, rounds, steps = inputs.place.shape
+        gates = each_step(self._project(inputs.rows), inputs.place)
         hidden, states = self.start(rounds), []
         for gate in gates.unbind(2):
             hidden = self._update(hidden, gate)

@@ -28,8 +28,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from mirror_ppl.baselines.recurrent import RecurrentNetworks, initial_weights, network_inputs
+from mirror_ppl.baselines.inputs import StepInputs, network_inputs
+from mirror_ppl.baselines.recurrent import RecurrentNetworks, initial_weights
 from mirror_ppl.baselines.training import (
     Report,
     TrainingOptions,
@@ -97,7 +99,7 @@ class SoftQ(RecurrentNetworks):
     @torch.no_grad()
     def play(
         self, setting: str, rounds: int, generators: Sequence[torch.Generator]
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[StepInputs, Tensor]:
         """Rounds as the networks themselves play them.
 
         Args:
@@ -106,7 +108,7 @@ class SoftQ(RecurrentNetworks):
             generators: one for each of them.
 
         Returns:
-            Inputs ``[P, B, T, I]``, and actions ``[P, B, T]``, -1 after the end.
+            Inputs, and actions ``[P, B, T]``, -1 after the end.
         """
         domain, people = self.domain, len(self.people)
         begin = [domain.initial(rounds, generator) for generator in generators]
@@ -129,29 +131,38 @@ class SoftQ(RecurrentNetworks):
             )
             actions.append(torch.where(domain.over(state), -1, last))
             state = domain.transition(state, last)
-        return torch.stack(inputs, 2), torch.stack(actions, 2)
+        return StepInputs.of(torch.stack(inputs, 2)), torch.stack(actions, 2)
 
 
 def squared_errors(
-    networks: SoftQ, target: SoftQ, inputs: Tensor, actions: Tensor, reward: float, discount: float
+    networks: SoftQ,
+    target: SoftQ,
+    inputs: StepInputs,
+    actions: Tensor,
+    reward: Tensor,
+    discount: float,
 ) -> Tensor:
-    """``delta^2`` of rounds of each person, ``[P]``.
+    """Squared errors of all steps of each person's rounds ``[P, B, T]``, zero in padding.
 
     Args:
         networks: what is trained.
         target: whose values are looked ahead to.
-        inputs: of rounds ``[P, B, T, I]``.
+        inputs: of the rounds.
         actions: ``[P, B, T]``, -1 in padding.
-        reward: of every step.
+        reward: of every step of a round, ``[B, 1]``.
         discount: per step.
     """
     real = actions >= 0
     with torch.no_grad():
         ahead = torch.where(real, target(inputs).logsumexp(-1), 0.0)
-        ahead = torch.nn.functional.pad(ahead[..., 1:], [0, 1])
+        ahead = pad(ahead[..., 1:], [0, 1])
     own = networks(inputs).gather(-1, actions.clamp(min=0)[..., None]).squeeze(-1)
-    error = torch.where(real, own - reward - discount * ahead, 0.0)
-    return error.square().sum((1, 2)) / real.sum((1, 2)).clamp(min=1)
+    return torch.where(real, own - reward - discount * ahead, 0.0).square()
+
+
+def mean_error(errors: Tensor, actions: Tensor) -> Tensor:
+    """``delta^2`` ``[P]``, the mean over real steps of errors ``[P, B, T]``."""
+    return errors.sum((1, 2)) / (actions >= 0).sum((1, 2)).clamp(min=1)
 
 
 def fit_soft_q(
@@ -185,9 +196,9 @@ def fit_soft_q(
     weights = initial_weights(domain, options.hidden, options.layers, generators)
     networks = SoftQ(domain, train.people, options.sight, weights).to(train.actions.device)
     target = copy.deepcopy(networks).requires_grad_(False)
-    sampled: list[tuple[Tensor, Tensor]] = []
+    sampled: list[tuple[StepInputs, Tensor]] = []
 
-    def loss(step: int, inputs: Tensor, actions: Tensor) -> Tensor:
+    def loss(step: int, inputs: StepInputs, actions: Tensor) -> Tensor:
         if step:
             with torch.no_grad():
                 for slow, fast in zip(target.parameters(), networks.parameters(), strict=True):
@@ -195,11 +206,19 @@ def fit_soft_q(
         if step % options.sample_every == 0:
             sampled.append(networks.play(train.setting, options.sampled, generators))
             del sampled[:-KEPT]
-        error = squared_errors(networks, target, inputs, actions, options.reward, options.discount)
-        own = squared_errors(
-            networks, target, *sampled[step % len(sampled)], SAMPLED, options.discount
+        # All in one pass, which costs little more than that of either.
+        played, own = sampled[step % len(sampled)]
+        steps = max(actions.shape[-1], own.shape[-1])
+        acted = [pad(part, [0, steps - part.shape[-1]], value=-1) for part in (actions, own)]
+        number = actions.shape[1]
+        reward = torch.full((number + own.shape[1], 1), SAMPLED, device=actions.device)
+        reward[:number] = options.reward
+        together = inputs.beside(played)
+        errors = squared_errors(
+            networks, target, together, torch.cat(acted, 1), reward, options.discount
         )
-        return error + options.sampled_weight * own
+        own_error = mean_error(errors[:, number:], acted[1])
+        return mean_error(errors[:, :number], acted[0]) + options.sampled_weight * own_error
 
     train_each(networks, (train, validation), loss, options, generators, report)
     return networks.requires_grad_(False)

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mirror_ppl.baselines.recurrent import SIGHTS, RecurrentNetworks, Sight
+from mirror_ppl.baselines.inputs import SIGHTS, Sight, StepInputs
+from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import require_known
 from mirror_ppl.errors import DemonstrationsError
 
 Report = Callable[[int, str], None]
 """Told of each look at the validation rounds: gradient steps done, and a message."""
-Loss = Callable[[int, Tensor, Tensor], Tensor]
-"""Of each person ``[P]``: of the number of the gradient step, inputs ``[P, B, T, I]`` and actions
+Loss = Callable[[int, StepInputs, Tensor], Tensor]
+"""Of each person ``[P]``: of the number of the gradient step, the inputs of B rounds and actions
 ``[P, B, T]``."""
 
 
@@ -164,7 +165,7 @@ class BestWeights:
         self.inputs, self.actions = networks.inputs(validation), validation.actions
         self.patience = patience
         self._kept = {name: value.detach().clone() for name, value in networks.weights.items()}
-        self._best = self.inputs.new_full((len(networks.people),), torch.inf)
+        self._best = self.inputs.rows.new_full((len(networks.people),), torch.inf)
         self._looks_since = torch.zeros_like(self._best)
 
     @torch.no_grad()
@@ -200,14 +201,14 @@ def shrink(networks: RecurrentNetworks, rates: Tensor | float) -> None:
 
 
 def draw_batch(
-    inputs: Tensor,
+    inputs: StepInputs,
     actions: Tensor,
     counts: Sequence[int],
     size: int,
     generators: Sequence[torch.Generator],
-) -> tuple[Tensor, Tensor]:
+) -> tuple[StepInputs, Tensor]:
     """Inputs and actions of ``size`` rounds of each person, of all if they have no more."""
-    if inputs.shape[1] <= size:
+    if actions.shape[1] <= size:
         return inputs, actions
     index = torch.zeros(len(counts), size, dtype=torch.long)
     padding = torch.ones(len(counts), size, dtype=torch.bool)
@@ -217,4 +218,5 @@ def draw_batch(
         padding[person, : len(own)] = False
     index, padding = index.to(actions.device), padding.to(actions.device)
     person = torch.arange(len(counts), device=actions.device)[:, None]
-    return inputs[person, index], actions[person, index].masked_fill(padding[..., None], -1)
+    own = StepInputs(inputs.rows, inputs.place[person, index])
+    return own, actions[person, index].masked_fill(padding[..., None], -1)

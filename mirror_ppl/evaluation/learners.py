@@ -24,7 +24,7 @@ from mirror_ppl.baselines import (
     fit_pooled_logistic,
     fit_soft_q,
 )
-from mirror_ppl.baselines.recurrent import Sight
+from mirror_ppl.baselines.inputs import Sight
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Domain
