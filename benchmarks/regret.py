@@ -24,6 +24,7 @@ from mirror_ppl.evaluation.assistance import PlannerOptions, Truth, play, speake
 from mirror_ppl.evaluation.assistance_cells import Pairing
 from mirror_ppl.evaluation.oracle import Oracle
 from mirror_ppl.inference.experience import map_state
+from mirror_ppl.people.driving import Drivers
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ def lost(pairing: Pairing, number: int) -> Tensor:
     said = torch.stack(flags, 1)
     # What the last action was does not matter any more.
     actions = torch.nn.functional.pad(actions, [0, 1])
+    assert isinstance(listener.driver, Drivers)
     oracle = Oracle(listener.driver, map_state(lambda part: part[0], listener.start.state))
     losses = oracle.losses(said, actions)
     spoke = said.any(-1)

@@ -311,6 +311,24 @@ def train(seed=0, options=TINY, report=lambda done, message: None, checkpoint=No
     return train_self_model(DRIVING, options, generator, report, checkpoint).state_dict()
 
 
+def test_another_class_of_self_model_can_be_trained():
+    class Other(SelfModel):
+        pass
+
+    trained = train_self_model(DRIVING, TINY, torch.Generator().manual_seed(0), kind=Other)
+    assert type(trained) is Other
+    assert_same(trained.state_dict(), train())
+
+
+def test_rounds_are_seen_as_the_options_say():
+    generator = torch.Generator().manual_seed(0)
+    plan = draw_views(DRIVING, 50, 3, generator, (1.0, 0.0, 0.0))
+    assert all((keep == 1).all() for keep in plan.keep.values())
+    assert not plan.remembers.any()
+    one, other = (train(options=replace(TINY, kinds=kinds)) for kinds in ((1, 0, 0), (0, 0, 1)))
+    assert any(not torch.equal(one[name], other[name]) for name in one)
+
+
 def stop_after(phase):
     def report(done, message):
         if done == phase:
@@ -369,6 +387,8 @@ def test_checkpoint_of_another_run_is_refused(tmp_path):
         ("batch", -1, "batch must be at least 1, not -1"),
         ("epsilon", 1.5, r"epsilon must lie in \[0, 1\], not 1.5"),
         ("discount", -0.1, r"discount must lie in \[0, 1\], not -0.1"),
+        ("kinds", (1.0, -0.1, 0.1), r"kinds must not be negative, .* not \(1.0, -0.1, 0.1\)"),
+        ("kinds", (0.0, 0.0, 0.0), "kinds must not be negative, nor all of them 0"),
     ],
 )
 def test_impossible_options_are_refused(name, value, message):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -49,8 +51,15 @@ class TrainingOptions:
     check_every: int = 5
     patience: int = 10
 
+    BY_DOMAIN = MappingProxyType[str, Mapping[str, Any]]({})
+    """What is other than the defaults in a domain, where a search found it to be better."""
     COUNTS = ("hidden", "epochs", "batch", "check_every", "patience")
     """Settings that have to be at least 1."""
+
+    @classmethod
+    def of(cls, domain: str, **changes: Any) -> Self:
+        """The settings for a domain, with changes by name."""
+        return cls(**{**cls.BY_DOMAIN.get(domain, {}), **changes})
 
     def __post_init__(self) -> None:
         require_known(self.sight, "sight", SIGHTS)

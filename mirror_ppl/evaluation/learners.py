@@ -208,7 +208,9 @@ def _trained(group: Group, train: Demonstrations, networks: RecurrentNetworks) -
 def _behaviour_cloning(sight: Sight) -> Learn:
     def learn(group: Group, rounds: int, seed: int) -> Trained:
         parts = _parts(group, rounds)
-        networks = fit_behaviour_clone(*parts, BehaviourCloneOptions(sight=sight), seed)
+        networks = fit_behaviour_clone(
+            *parts, BehaviourCloneOptions.of(group.domain, sight=sight), seed
+        )
         return _trained(group, parts[0], networks)
 
     return learn
@@ -217,7 +219,9 @@ def _behaviour_cloning(sight: Sight) -> Learn:
 def _sqil(sight: Sight) -> Learn:
     def learn(group: Group, rounds: int, seed: int) -> Trained:
         parts = _parts(group, rounds)
-        return _trained(group, parts[0], fit_soft_q(*parts, SoftQOptions(sight=sight), seed))
+        return _trained(
+            group, parts[0], fit_soft_q(*parts, SoftQOptions.of(group.domain, sight=sight), seed)
+        )
 
     return learn
 

@@ -29,7 +29,7 @@ from mirror_ppl.inference.experience import Experience, drive, experience
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
-from mirror_ppl.models.views import draw_views
+from mirror_ppl.models.views import KIND_PROBABILITIES, draw_views
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class SelfModelOptions:
         stride: of every so many steps of a round one is learned from for values; which, is drawn.
         difference_weight: how often errors count by which actions differ, besides the errors
             themselves. What people choose hangs on differences alone.
+        kinds: share of rounds that are seen in full, with items dropped, and by limited sight; see
+            `mirror_ppl.models.views`.
         exact: whether somebody who knows all that counts learns the exact planner's values, and
             not what a step leads to.
     """
@@ -78,6 +80,7 @@ class SelfModelOptions:
     length: int = 0
     stride: int = 1
     difference_weight: float = 0.0
+    kinds: tuple[float, float, float] = KIND_PROBABILITIES
     exact: bool = False
 
     @classmethod
@@ -97,6 +100,8 @@ class SelfModelOptions:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not (self.learning_rate > 0 and isfinite(self.learning_rate)):
             raise ValueError(f"learning_rate must be a positive number, not {self.learning_rate}")
+        if min(self.kinds) < 0 or not sum(self.kinds) > 0:
+            raise ValueError(f"kinds must not be negative, nor all of them 0, not {self.kinds}")
         for name in ("beta", "beta_decay", "epsilon", "epsilon_decay", "epsilon_floor", "discount"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
@@ -207,6 +212,7 @@ def train_self_model(
     checkpoint: Path | None = None,
     speech: str = "words",
     sizes: Sizes | None = None,
+    kind: type[SelfModel] = SelfModel,
 ) -> SelfModel:
     """Train a self-model from nothing.
 
@@ -219,6 +225,7 @@ def train_self_model(
         checkpoint: file that is written after each phase and continued from if it exists.
         speech: a name in `mirror_ppl.models.speech.EMBEDDINGS`.
         sizes: of the networks; the domain's own unless given.
+        kind: class of the self-model.
 
     Raises:
         AssetError: that embedding needs what is not there.
@@ -229,7 +236,8 @@ def train_self_model(
     seed = int(torch.randint(2**31, (1,), generator=generator, device=device))
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        trainer = _Trainer(domain, options, generator, seed, speech, sizes or sizes_of(domain))
+        sizes = sizes or sizes_of(domain)
+        trainer = _Trainer(domain, options, generator, seed, speech, sizes, kind)
         trainer.run(report, checkpoint)
     return trainer.self_model.eval()
 
@@ -245,6 +253,7 @@ class _Trainer:
         seed: int,
         speech: str,
         sizes: Sizes,
+        kind: type[SelfModel],
     ) -> None:
         self.domain = domain
         self.options = options
@@ -255,10 +264,11 @@ class _Trainer:
             "seed": seed,
             "speech": speech,
             "sizes": asdict(sizes),
+            "kind": kind.__name__,
         }
         self.generator = generator
         embedding = EMBEDDINGS[speech]
-        self.self_model = SelfModel(domain, sizes, embedding).to(generator.device)
+        self.self_model = kind(domain, sizes, embedding).to(generator.device)
         self.self_model.emphasis = {"verbal": options.speech_weight}
         self.target = copy.deepcopy(self.self_model.q_network)
         self.optimizer = torch.optim.Adam(
@@ -327,7 +337,7 @@ class _Trainer:
         options, domain = self.options, self.domain
         start = domain.anywhere(options.rounds, self.generator)
         length = options.length or domain.horizon
-        plan = draw_views(domain, options.rounds, length, self.generator)
+        plan = draw_views(domain, options.rounds, length, self.generator, options.kinds)
         epsilon = options.epsilon * options.epsilon_decay**self.phase
         self.starts.append(start)
         self.actions.append(
@@ -355,7 +365,8 @@ class _Trainer:
                 generator=self.generator,
                 device=self.generator.device,
             )
-            plan = draw_views(self.domain, options.batch, actions.shape[1], self.generator)
+            steps = actions.shape[1]
+            plan = draw_views(self.domain, options.batch, steps, self.generator, options.kinds)
             start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
             lived = experience(
                 self.domain,

@@ -105,9 +105,7 @@ class SelfModel(nn.Module):
         """The generative program, conditioned on what is true; returns ``z`` ``[B, T + 1, Z]``."""
         actions = rounds.actions
         with pyro.plate("self_model_round", actions.shape[0]):
-            z = pyro.sample(
-                "z", GaussianChain(self.prior(actions.shape[:1]), self.transition, actions, 0)
-            )
+            z = pyro.sample("z", self.dynamics(actions))
             for name, target in self.targets(rounds.observation).items():
                 mean, scale = self.decoders[name](z)
                 with poutine.scale(scale=self.emphasis.get(name, 1.0)):
@@ -138,6 +136,10 @@ class SelfModel(nn.Module):
         model_trace = poutine.trace(replayed).get_trace(rounds)
         bound = model_trace.log_prob_sum() - guide_trace.log_prob_sum()
         return torch.as_tensor(bound), latent_values(guide_trace)["z"]
+
+    def dynamics(self, actions: Tensor) -> GaussianChain:
+        """``p(z_0) prod_t p(z_t | z_{t-1}, a_{t-1})`` of ``actions`` ``[B, T]``."""
+        return GaussianChain(self.prior(actions.shape[:1]), self.transition, actions, 0)
 
     def prior(self, batch: torch.Size) -> Gaussian:
         """``p(z_0)``: a standard Gaussian, ``[*batch, Z]``."""

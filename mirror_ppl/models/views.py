@@ -17,6 +17,7 @@ observer would conclude; an item that is merely not visible stays unknown.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,16 +126,28 @@ class ViewPlan:
         return taken
 
 
-def draw_views(domain: Domain, batch: int, steps: int, generator: torch.Generator) -> ViewPlan:
-    """Draw a view for each of ``batch`` rounds of ``steps`` actions."""
+def draw_views(
+    domain: Domain,
+    batch: int,
+    steps: int,
+    generator: torch.Generator,
+    kinds: Sequence[float] = KIND_PROBABILITIES,
+) -> ViewPlan:
+    """Draw a view for each of ``batch`` rounds of ``steps`` actions.
+
+    Args:
+        domain: the world.
+        batch: rounds.
+        steps: actions of a round.
+        generator: source of randomness.
+        kinds: share of rounds with a view of each of ``KINDS``.
+    """
     device = generator.device
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, device=device)
 
-    kind = torch.multinomial(
-        torch.tensor(KIND_PROBABILITIES, device=device), batch, True, generator=generator
-    )
+    kind = torch.multinomial(torch.tensor(kinds, device=device), batch, True, generator=generator)
     full, dropout, sight = (kind == index for index in range(len(KINDS)))
     bins = torch.tensor(domain.reach_bins, device=device)
     shape = (batch, len(domain.directions))

@@ -1,0 +1,149 @@
+"""Sight thresholds on a continuous scale, inferred by gradients: what this package does not do.
+
+A human model of drivers in which a car is seen to the degree ``sigmoid((reach - distance) / s)``
+and what is taken for granted is so by a weight, fitted by a mean-field guide. Beliefs are the
+encoder's means, or draws of it: reparameterized, or without gradients as in the released code.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import pyro
+import pyro.distributions as dist
+import torch
+from pyro.infer import Trace_ELBO
+from pyro.infer.autoguide import AutoNormal, init_to_median
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains import Observation
+from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
+
+Latents = Literal["mean", "rsample", "sample"]
+SOFTNESS = 0.5
+"""Cells over which sight fades, a half of what cars are apart at least."""
+LEARNING_RATE = 0.05
+STEPS = 400
+
+
+def relaxed_draws(
+    human: HumanModel, rounds: Demonstrations, latents: Latents, draws: int, seed: int
+) -> dict[str, Tensor]:
+    """Posterior draws ``[S, P, 1, ...]`` of the package's own sites, of drivers.
+
+    Thresholds are rounded down to the package's bins, weights to 0 or 1.
+
+    Args:
+        human: the model whose networks and sites these are.
+        rounds: of P people.
+        latents: what beliefs are; ``sample`` has no gradients.
+        draws: their number S.
+        seed: of everything random.
+    """
+    relaxed = _Relaxed(human, rounds, latents)
+    with torch.random.fork_rng(devices=[]), pyro.settings.context(module_local_params=True):
+        torch.manual_seed(seed)
+        guide = AutoNormal(relaxed.model, init_loc_fn=init_to_median, init_scale=0.3)
+        guide()
+        optimizer = torch.optim.Adam(guide.parameters(), LEARNING_RATE)
+        loss = Trace_ELBO()
+        for _ in range(STEPS):
+            optimizer.zero_grad()
+            loss.differentiable_loss(relaxed.model, guide).backward()
+            optimizer.step()
+        with torch.no_grad():
+            found = [guide() for _ in range(draws)]
+    together = {name: torch.stack([one[name] for one in found]) for name in found[0]}
+    bins = torch.tensor(human.domain.reach_bins)
+    for site in sight_sites(human.domain):
+        place = torch.searchsorted(bins, together[site].contiguous(), right=True) - 1
+        together[site] = place.clamp(min=0)
+    for site in assumption_sites(human.domain):
+        together[site] = together[site].round().long()
+    return together
+
+
+class _Relaxed:
+    """The program, of the rounds ``[P, B, T]`` of some people."""
+
+    def __init__(self, human: HumanModel, rounds: Demonstrations, latents: Latents) -> None:
+        self.human = human
+        self.rounds = rounds
+        self.latents = latents
+        steps = rounds.actions.shape[2]
+        self.observation = {
+            name: value[:, :, :steps] for name, value in rounds.observation().items()
+        }
+        self.acted = rounds.actions.clamp(min=0)
+
+    def model(self) -> None:
+        human, domain = self.human, self.human.domain
+        people = len(self.acted)
+        like = next(human.parameters())
+        farthest = max(domain.reach_bins)
+        with pyro.plate("person", people, dim=-2):
+            implants = {
+                site: pyro.sample(site, dist.Uniform(like.new_zeros(()), farthest))
+                for site in sight_sites(domain)
+            }
+            for site in assumption_sites(domain):
+                implants[site] = pyro.sample(site, dist.Uniform(like.new_zeros(()), 1.0))
+            implants |= policy_implants(domain, human.belief_size, like)
+            belief = self._believe(self._perceive(implants))
+            found = human.act(implants, belief, human.action_values(belief))
+            chosen = found.gather(-1, self.acted[..., None]).squeeze(-1)
+            total = torch.where(self.rounds.actions >= 0, chosen, 0.0).sum((-1, -2))
+            pyro.factor("actions", total[..., None])
+
+    def _perceive(self, implants: dict[str, Tensor]) -> View:
+        """Views whose masks are weights ``[P, B, T, K]``."""
+        domain = self.human.domain
+        reach = torch.stack([implants[site] for site in sight_sites(domain)], -1)  # [P, 1, D]
+
+        def degree(observation: Observation) -> Tensor:
+            direction, distance = domain.distance(observation)
+            own = reach.expand(*direction.shape[:-1], -1).gather(-1, direction)
+            return torch.sigmoid((own - distance) / SOFTNESS)
+
+        def sees(observation: Observation) -> dict[str, Tensor]:
+            seen = degree(observation).detach() > 0.5  # noqa: PLR2004
+            return {"visual": seen, "verbal": torch.zeros_like(seen)}
+
+        knowledge, views = domain.nothing_known(1), []
+        for step in range(self.acted.shape[-1]):
+            now = {
+                name: value[..., step, :] if name == "ego" else value[..., step, :, :]
+                for name, value in self.observation.items()
+            }
+            seen = sees(now)
+            knowledge = domain.learn(knowledge, now, seen, sees)
+            known = domain.known(knowledge)
+            visible = {name: mask.to(reach) for name, mask in known.items()}
+            visible["visual"] = torch.maximum(visible["visual"], degree(now))
+            items, imagined = domain.assume(knowledge, now)
+            taken = {name: torch.zeros_like(weight) for name, weight in visible.items()}
+            for site, about in zip(assumption_sites(domain), items.values(), strict=True):
+                for name, mask in about.items():
+                    own = implants[site][..., None] * mask * (1 - visible[name])
+                    taken[name] = taken[name] + own
+            views.append(View(visible, taken, imagined))
+        return View.stack(views)
+
+    def _believe(self, view: View) -> Tensor:
+        """Beliefs ``[P, B, T, Z]``."""
+        human, actions = self.human, self.acted
+        evidence = human.evidence(view, self.observation)
+        encoder = human.self_model.encoder
+        evidence = evidence + encoder.previous_actions(actions[..., :-1])
+        if self.latents == "mean":
+            return human.self_model.believe(evidence)
+        belief, beliefs = evidence.new_zeros(*evidence.shape[:-2], human.belief_size), []
+        for step in evidence.unbind(-2):
+            state = encoder(belief, step)
+            belief = state.mean + state.scale * torch.randn_like(state.mean)
+            if self.latents == "sample":
+                belief = belief.detach()
+            beliefs.append(belief)
+        return torch.stack(beliefs, -2)
