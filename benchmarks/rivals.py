@@ -4,9 +4,9 @@
 
 For each domain, in the setting in which people see least, ten simulated people of other seeds than
 those of the comparisons are learned from 5 and 20 rounds. One setting after another is varied, the
-others staying at the best so far; printed is the mean NLL of the people's validation rounds in nats
-an action. What is best of a domain is what ``mirror_ppl.baselines`` has for it. Rounds by which
-models are compared are not looked at.
+others being at the best so far, or as they are in the package; printed is the mean NLL of the
+people's validation rounds in nats an action. What is best of a domain is what
+``mirror_ppl.baselines`` has for it. Rounds by which models are compared are not looked at.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ OPTIONS: Mapping[str, Any] = {"bc": BehaviourCloneOptions, "sqil": SoftQOptions}
 GRIDS: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
     "bc": {"weight_decay": (0.3, 1.0, 3.0, 6.0, 12.0), "learning_rate": (0.01, 0.03)},
     "sqil": {
+        "learning_rate": (0.01, 0.02, 0.03),
         "reward": (2.0, 5.0, 10.0),
         "discount": (0.0, 0.5, 0.9),
-        "weight_decay": (0.1, 0.3, 1.0, 3.0),
-        "learning_rate": (0.01, 0.02, 0.03),
+        "weight_decay": (0.03, 0.1, 0.3, 1.0),
     },
 }
 """Values of each setting, in the order in which they are varied."""
@@ -58,8 +58,7 @@ def search(domain: str, model: str, seeds: list[int]) -> None:
         losses = {}
         for value in values:
             tried = best | {name: value}
-            # What is not varied yet is as it is by default.
-            options = OPTIONS[model](**tried)
+            options = OPTIONS[model].of(domain, **tried)
             if options not in done:
                 began = monotonic()
                 means = [_loss(recorded, number, options) for number in TRAINING]

@@ -325,7 +325,9 @@ def test_rounds_are_seen_as_the_options_say():
     plan = draw_views(DRIVING, 50, 3, generator, (1.0, 0.0, 0.0))
     assert all((keep == 1).all() for keep in plan.keep.values())
     assert not plan.remembers.any()
-    one, other = (train(options=replace(TINY, kinds=kinds)) for kinds in ((1, 0, 0), (0, 0, 1)))
+    one, other = (
+        train(options=replace(TINY, kinds=kinds)) for kinds in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    )
     assert any(not torch.equal(one[name], other[name]) for name in one)
 
 

@@ -24,8 +24,10 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,8 +49,17 @@ from mirror_ppl.people.populations import derived_generator
 
 SAMPLED = 0.0
 """Reward of what the network does by itself."""
-KEPT = 5
-"""Sets of sampled rounds that are learned from."""
+LONG_ROUNDS: Mapping[str, Any] = {
+    "batch": 5,
+    "sampled": 5,
+    "kept": 50,
+    "epochs": 1500,
+    "check_every": 10,
+    "patience": 60,
+    "learning_rate": 0.01,
+    "weight_decay": 0.1,
+}
+"""Where rounds are long it takes many steps until what networks do is like what people do."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +78,7 @@ class SoftQOptions(TrainingOptions):
         sampled_weight: of the error in sampled rounds.
         sampled: rounds that are played at a time.
         sample_every: gradient steps after which as many are played anew.
+        kept: sets of sampled rounds that are learned from, the last ones.
     """
 
     learning_rate: float = 0.02
@@ -80,8 +92,10 @@ class SoftQOptions(TrainingOptions):
     sampled_weight: float = 1.0
     sampled: int = 10
     sample_every: int = 10
+    kept: int = 5
 
-    COUNTS = (*TrainingOptions.COUNTS, "sampled", "sample_every")
+    BY_DOMAIN = MappingProxyType({"search_rescue": LONG_ROUNDS, "bomb_defusal": LONG_ROUNDS})
+    COUNTS = (*TrainingOptions.COUNTS, "sampled", "sample_every", "kept")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -207,7 +221,7 @@ def fit_soft_q(
                     slow.lerp_(fast, options.target_rate)
         if step % options.sample_every == 0:
             sampled.append(networks.play(train.setting, options.sampled, generators))
-            del sampled[:-KEPT]
+            del sampled[: -options.kept]
         # All in one pass, which costs little more than that of either.
         played, own = sampled[step % len(sampled)]
         steps = max(actions.shape[-1], own.shape[-1])

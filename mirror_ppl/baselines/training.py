@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -51,7 +50,7 @@ class TrainingOptions:
     check_every: int = 5
     patience: int = 10
 
-    BY_DOMAIN = MappingProxyType[str, Mapping[str, Any]]({})
+    BY_DOMAIN: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """What is other than the defaults in a domain, where a search found it to be better."""
     COUNTS = ("hidden", "epochs", "batch", "check_every", "patience")
     """Settings that have to be at least 1."""
