@@ -38,7 +38,7 @@ from mirror_ppl.distinct import as_whole_numbers, random_keys
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.chain import Span
-from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.models.networks import Gaussian, log_softmax_of_few
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.view_table import RecordedActions, ViewTable
 
@@ -457,7 +457,7 @@ class HumanModel(nn.Module):
         logits = implants["consistency"][..., None, None] * values
         logits = logits + implant_priors.residual(implants, belief)
         lapse = implants["lapse"][..., None, None]
-        aware = torch.log1p(-lapse) + torch.log_softmax(logits, -1)
+        aware = torch.log1p(-lapse) + log_softmax_of_few(logits)
         return torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
 
     def log_likelihoods(self, implants: Implants, table: ViewTable) -> Tensor:

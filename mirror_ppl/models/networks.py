@@ -38,6 +38,15 @@ class Gaussian(NamedTuple):
     scale: Tensor
 
 
+def log_softmax_of_few(logits: Tensor) -> Tensor:
+    """``logits - log sum exp logits`` ``[..., A]`` of few actions, much quicker than by ``torch``.
+
+    That goes through rows one by one; here all rows go side by side.
+    """
+    side_by_side = logits.flatten(0, -2).T.contiguous().log_softmax(0)
+    return side_by_side.view(-1, *logits.shape[:-1]).movedim(0, -1)
+
+
 class GaussianHead(nn.Module):
     """Mean and scale of a diagonal Gaussian of ``size`` dimensions, from features ``[..., H]``."""
 
