@@ -103,8 +103,8 @@ def test_weights_are_right_whatever_is_proposed(human, table, monkeypatch):
     plain.draw(6000)
     proposed = Sampler(human, table)
     proposed.draw(300)
-    proposed.learn_residual()
-    gaussian = importance._gaussian(proposed.place, proposed.weighted().log_weights, 1.5)
+    proposed.learn_residual(proposed.weighted())
+    gaussian = importance._heavy_tailed(proposed.place, proposed.weighted().log_weights, 1.5)
     for _ in range(3):
         proposed.propose(gaussian, 400)
     assert proposed._log_residual.shape == (2, 1500)
@@ -130,8 +130,8 @@ def test_proposed_residuals_are_of_the_gaussian_and_some_of_the_prior(human, tab
     torch.manual_seed(0)
     sampler = Sampler(human, table)
     sampler.draw(100)
-    sampler.learn_residual()
-    gaussian = importance._gaussian(sampler.place, sampler.weighted().log_weights, 1.5)
+    sampler.learn_residual(sampler.weighted())
+    gaussian = importance._heavy_tailed(sampler.place, sampler.weighted().log_weights, 1.5)
     torch.manual_seed(1)
     sampler.propose(gaussian, 200)
     prior, proposed = sampler._log_residual[:, 100:]
@@ -146,13 +146,22 @@ def test_the_residual_is_proposed_only_where_scalars_are_not_enough(human, table
     learned = []
     learn = Sampler.learn_residual
     monkeypatch.setattr(
-        Sampler, "learn_residual", lambda self: (learned.append(len(self.place)), learn(self))
+        Sampler,
+        "learn_residual",
+        lambda self, found: (learned.append(len(self.place)), learn(self, found)),
     )
+    monkeypatch.setattr(importance, "FEW", 0.0)
     torch.manual_seed(0)
     sample_exactly(human, table, ImportanceOptions(proposals=256, enough=100))
     assert not learned
-    sample_exactly(human, table, ImportanceOptions(proposals=256, enough=1e6, stages=4))
+    options = ImportanceOptions(proposals=256, enough=1e6, stages=4)
+    sample_exactly(human, table, options)
     assert learned == [256 * 3]
+    # At once where few draws have all the weight.
+    learned.clear()
+    monkeypatch.setattr(importance, "FEW", 1e6)
+    sample_exactly(human, table, options)
+    assert learned == [256]
 
 
 def test_residuals_count_as_they_were_drawn(human, table, monkeypatch):
@@ -161,9 +170,9 @@ def test_residuals_count_as_they_were_drawn(human, table, monkeypatch):
     torch.manual_seed(0)
     sampler = Sampler(human, table)
     sampler.draw(100)
-    gaussian = importance._gaussian(sampler.place, torch.full((100,), -math.log(100.0)), 1.5)
+    gaussian = importance._heavy_tailed(sampler.place, torch.full((100,), -math.log(100.0)), 1.5)
     sampler.propose(gaussian, 60)
-    sampler.learn_residual()
+    sampler.learn_residual(sampler.weighted())
     sampler.propose(gaussian, 40)
     prior, proposed = sampler._log_residual.double().exp()
     scalars = sampler._log_prior[0].double().exp()

@@ -12,10 +12,10 @@ from torch.distributions import MultivariateNormal
 from mirror_ppl.domains import get_domain
 from mirror_ppl.inference import importance
 from mirror_ppl.inference import sampler as sampler_module
-from mirror_ppl.inference.hierarchical_proposal import RelativeGaussian, dependent_sites
+from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.sampler import Sampler, places, scalar_sites
+from mirror_ppl.inference.sampler import Sampler, Weighted, places, scalar_sites
 from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.self_model import SelfModel
@@ -117,7 +117,7 @@ def test_draws_before_something_was_learned_count_as_they_were_drawn(toy, table)
     sampler = Sampler(toy, table)
     sampler.draw(2000)
     place, weights = sampler.place, sampler.weighted().log_weights
-    gaussian = importance._gaussian(place, weights, 1.5)
+    gaussian = importance._heavy_tailed(place, weights, 1.5)
     sampler.propose(gaussian, 2000)
     sampler.learn_discrete(sampler.weighted())
     sampler.propose(gaussian, 500)
@@ -126,6 +126,48 @@ def test_draws_before_something_was_learned_count_as_they_were_drawn(toy, table)
     expected = truth["habit"]
     error = (expected * (1 - expected) / found.effective) ** 0.5
     assert abs(share - expected) < 4.5 * error
+
+
+def weighted(log_weights):
+    weights = torch.log_softmax(torch.as_tensor(log_weights).double(), 0)
+    return Weighted({}, None, weights[:, None], weights, 0.0)
+
+
+def test_weights_are_toned_down_until_enough_draws_count():
+    torch.manual_seed(0)
+    sharp = weighted(20 * torch.randn(1000))
+    assert sharp.effective < 3
+    found = sharp.toned_down(64.0)
+    assert found.effective == pytest.approx(64, rel=0.01)
+    # A power of them: log weights are in line.
+    slope = (found.log_weights[1:] - found.log_weights[0]) / (
+        sharp.log_weights[1:] - sharp.log_weights[0]
+    )
+    torch.testing.assert_close(slope, slope[0].expand_as(slope))
+    assert 0 < slope[0] < 1
+    # Of few draws a quarter, and what is flat enough stays as it is.
+    assert weighted([0.0, -50.0] * 10).toned_down(64.0).effective >= 5
+    flat = weighted(torch.randn(1000))
+    assert flat.toned_down(64.0) is flat
+    # Draws that cannot be stay so.
+    impossible = torch.full((100,), -torch.inf)
+    impossible[:2] = torch.tensor([0.0, -1000.0])
+    found = weighted(impossible).toned_down(64.0)
+    assert found.effective == pytest.approx(2, rel=0.01)
+    assert (found.log_weights[2:] == -torch.inf).all()
+
+
+def test_what_is_proposed_has_heavy_tails_and_these_moments():
+    torch.manual_seed(0)
+    place = torch.randn(400, 2) @ torch.tensor([[1.0, 0.5], [0.0, 2.0]]) + 3
+    even = torch.full((400,), -math.log(400.0)).double()
+    proposal = importance._heavy_tailed(place, even, 1.2)
+    torch.testing.assert_close(proposal.loc, place.mean(0))
+    covariance = 1.2 * place.T.cov(correction=0) + torch.diag(1e-3 * place.var(0) + 1e-8)
+    torch.testing.assert_close(proposal.scale_tril @ proposal.scale_tril.T, covariance)
+    far = place.mean(0) + torch.tensor([[100.0, 0.0]])
+    gaussian = MultivariateNormal(place.mean(0), covariance)
+    assert float(proposal.log_prob(far) - gaussian.log_prob(far)) > 100
 
 
 def test_what_hangs_on_others_is_found(toy):
@@ -140,7 +182,7 @@ def test_a_relative_gaussian_is_the_density_of_what_it_draws(toy):
     drawn = draw_prior(toy, 1, 400, 0)
     place = places(sites, drawn)
     torch.manual_seed(0)
-    proposal = RelativeGaussian(
+    proposal = RelativeProposal(
         toy,
         sites,
         ("in_sight",),
@@ -155,7 +197,7 @@ def test_a_relative_gaussian_is_the_density_of_what_it_draws(toy):
     scale = 2 / (2 * log_even.exp() + 1).sqrt()
     columns = found.clone()
     columns[:, names.index("in_sight")] = rate / scale
-    expected = proposal.gaussian.log_prob(columns) - scale.log()
+    expected = proposal.density.log_prob(columns) - scale.log()
     torch.testing.assert_close(proposal.log_prob(found), expected, rtol=1e-4, atol=1e-4)
 
 
@@ -284,7 +326,7 @@ def test_discrete_sites_count_as_they_were_drawn(toy, table, monkeypatch):
     torch.manual_seed(0)
     sampler = Sampler(toy, table)
     sampler.draw(100)
-    gaussian = importance._gaussian(sampler.place, torch.full((100,), -math.log(100.0)), 1.5)
+    gaussian = importance._heavy_tailed(sampler.place, torch.full((100,), -math.log(100.0)), 1.5)
     sampler.propose(gaussian, 60)
     sampler.learn_discrete(sampler.weighted())
     sampler.propose(gaussian, 40)

@@ -15,9 +15,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from pyro.distributions import TorchDistribution
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
-from torch.distributions import MultivariateNormal
 
 from mirror_ppl.inference.prior import sample_sites, values_of
 from mirror_ppl.models.human import HumanModel
@@ -66,15 +66,15 @@ def _differs(fn: Any, site: Any) -> bool | None:
     return not bool((moments == moments[:, :1]).all())
 
 
-class RelativeGaussian:
-    """A Gaussian over scalar sites, those that hang on others relative to their prior.
+class RelativeProposal:
+    """A density over scalar sites, those that hang on others relative to their prior.
 
     Args:
         human: the model of people.
         sites: the D scalar sites, with the map from unconstrained space.
         dependent: those that hang on others.
         place: draws in unconstrained space ``[S, D]``.
-        fit: from draws ``[S, D]``, those that depend relative, to the Gaussian of these.
+        fit: from draws ``[S, D]``, those that depend relative, to the density of these.
     """
 
     def __init__(
@@ -83,16 +83,16 @@ class RelativeGaussian:
         sites: Mapping[str, Any],
         dependent: tuple[str, ...],
         place: Tensor,
-        fit: Callable[[Tensor], MultivariateNormal],
+        fit: Callable[[Tensor], TorchDistribution],
     ) -> None:
         self.human, self.sites, self.dependent = human, sites, dependent
         relative, _ = self._relative(place)
-        self.gaussian = fit(relative)
+        self.density = fit(relative)
 
     def sample(self, sample_shape: torch.Size) -> Tensor:
         """Draws ``[S, D]`` in unconstrained space."""
         (number,) = sample_shape
-        relative = self.gaussian.sample(sample_shape)
+        relative = self.density.sample(sample_shape)
         placed = _Placed(self, relative)
         with torch.random.fork_rng(devices=[]):
             sample_sites(self.human, 1, number, handler=placed)
@@ -101,7 +101,7 @@ class RelativeGaussian:
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density ``[S]`` in unconstrained space."""
         relative, log_scale = self._relative(value)
-        return self.gaussian.log_prob(relative) - log_scale
+        return self.density.log_prob(relative) - log_scale
 
     @torch.no_grad()
     def _relative(self, place: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,7 +130,7 @@ class _Placed(Messenger):
         place: of each site in unconstrained space ``[S]``.
     """
 
-    def __init__(self, proposal: RelativeGaussian, relative: Tensor) -> None:
+    def __init__(self, proposal: RelativeProposal, relative: Tensor) -> None:
         super().__init__()
         self.proposal = proposal
         self.place: dict[str, Tensor] = {}

@@ -10,16 +10,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from pyro.distributions import MultivariateStudentT
 from torch import Tensor
-from torch.distributions import MultivariateNormal
 
-from mirror_ppl.inference.hierarchical_proposal import RelativeGaussian, dependent_sites
+from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
 from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted, places
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
 PLAIN_STAGES = 2
-"""Stages that propose scalar sites alone, which is enough where a residual hardly matters."""
+"""Stages after which the residual is proposed, too, where it hardly matters."""
+LEARNED_FROM = 64.0
+"""Effective draws from which it is learned what to propose, at least: moments of fewer say little,
+and what is proposed by them might never get to where else somebody could be. If there are not so
+many, weights are toned down until there are."""
+FEW = 16.0
+"""Effective draws, or fewer, with which the residual is proposed at once."""
+TAILS = 8.0
+"""Degrees of freedom of what is proposed. In unconstrained space priors of probabilities fall off
+as an exponential, which a Gaussian would miss."""
 PRUNING_DRAWS = 64
 """Draws from the prior after which combinations of discrete sites are given up."""
 
@@ -32,7 +41,8 @@ class ImportanceOptions:
         proposals: draws of each stage.
         enough: effective draws at which no stage is added.
         stages: the largest number of stages.
-        wider: factor on the covariance of what is proposed after the first stage.
+        wider: factor on the covariance of what is proposed after the first stage, by which its
+            scale is set.
         prune_margin: nats below the best by which a combination of discrete sites, under each of
             the first draws, is given up.
     """
@@ -40,7 +50,7 @@ class ImportanceOptions:
     proposals: int = 512
     enough: float = 400.0
     stages: int = 8
-    wider: float = 1.5
+    wider: float = 1.2
     prune_margin: float = 12.0
 
     def __post_init__(self) -> None:
@@ -58,10 +68,12 @@ def sample_exactly(
 ) -> Weighted:
     """Weighted draws of one person by adaptive importance sampling.
 
-    The first stage draws from the prior; each that follows draws the scalar sites from a Gaussian,
-    in unconstrained space, that has the moments of the weighted draws so far, and discrete sites of
-    the policy by how probable they are so far. If that is not enough after a few stages, those that
-    follow propose the residual of the policy, too.
+    The first stage draws from the prior; each that follows draws the scalar sites from a Student t
+    distribution, in unconstrained space, that has the moments of the weighted draws so far, and
+    discrete sites of the policy by how probable they are so far. Where that is not enough, stages
+    propose the residual of the policy, too. As long as few draws have all the weight, weights are
+    toned down before anything is learned from them (Koblents and Miguez, *A population Monte Carlo
+    scheme with transformed weights*, 2015).
 
     Args:
         human: the model of people.
@@ -76,18 +88,19 @@ def sample_exactly(
         if not sampler.sites:
             return NoScalars()
 
-        def fit(some: Tensor) -> MultivariateNormal:
-            return _gaussian(some, log_weights, options.wider)
+        def fit(some: Tensor) -> MultivariateStudentT:
+            return _heavy_tailed(some, log_weights, options.wider)
 
         if not dependent:
             return fit(place)
-        return RelativeGaussian(human, sampler.sites, dependent, place, fit)
+        return RelativeProposal(human, sampler.sites, dependent, place, fit)
 
     few = min(PRUNING_DRAWS, options.proposals)
     sampler.draw(few)
     sampler.prune(options.prune_margin)
     if near is not None and sampler.sites:
         found = places(sampler.sites, near.policy)
+        near = near.toned_down(LEARNED_FROM)
         sampler.propose(near_to(found, near.log_weights), options.proposals)
     elif options.proposals > few:
         sampler.draw(options.proposals - few)
@@ -95,18 +108,21 @@ def sample_exactly(
         found = sampler.weighted()
         if found.effective >= options.enough:
             return found
-        if stage == PLAIN_STAGES:
-            sampler.learn_residual()
+        few = found.effective <= FEW
+        found = found.toned_down(LEARNED_FROM)
+        if not sampler.proposes_residual and (few or stage >= PLAIN_STAGES):
+            sampler.learn_residual(found)
         sampler.learn_discrete(found)
         sampler.propose(near_to(sampler.place, found.log_weights), options.proposals)
     return sampler.weighted()
 
 
-def _gaussian(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateNormal:
+def _heavy_tailed(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateStudentT:
     weights = log_weights.exp().to(place)[:, None]
     mean = (weights * place).sum(0)
     centred = place - mean
     covariance = wider * (weights * centred).T @ centred
     # Where few draws have all the weight, their spread says nothing.
     floor = 1e-3 * place.var(0) + 1e-8
-    return MultivariateNormal(mean, covariance + torch.diag(floor))
+    spread = torch.linalg.cholesky(covariance + torch.diag(floor))
+    return MultivariateStudentT(place.new_tensor(TAILS), mean, spread)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import torch
@@ -37,8 +37,10 @@ from mirror_ppl.models.view_table import ViewTable
 ANYHOW = 0.1
 """Share of what is proposed that is not by what was learned, of the residual and of discrete sites.
 """
-LEARNED_FROM = 64
+RESIDUAL_DRAWS = 64
 """Draws by which it is learned where to look for the residual."""
+HALVINGS = 20
+"""Steps of the search for the power to which weights are raised."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,24 @@ class Weighted:
     def effective(self) -> float:
         """Effective number of draws."""
         return float(1 / self.log_weights.exp().square().sum())
+
+    def toned_down(self, effective: float) -> Weighted:
+        """The same with weights to a power, 1 if possible, at which so many draws are effective.
+
+        But at most a quarter of all draws.
+        """
+        effective = min(effective, len(self.log_weights) / 4)
+        if self.effective >= effective:
+            return self
+        low, high = 2.0**-HALVINGS, 1.0
+        for _ in range(HALVINGS):
+            power = (low + high) / 2
+            weights = torch.softmax(power * self.log_weights, 0)
+            if float(1 / weights.square().sum()) >= effective:
+                low = power
+            else:
+                high = power
+        return replace(self, log_weights=torch.log_softmax(low * self.log_weights, 0))
 
     def sample(self, number: int, values: Mapping[str, Tensor]) -> Draws:
         """Joint draws ``[number, 1, 1, ...]`` of all sites from the global random state.
@@ -198,15 +218,19 @@ class Sampler:
             alive[0, self.alike.members] = True
             self.table = restricted(self.table, alive)
 
-    def learn_residual(self) -> None:
-        """From now on propose the residual, too, by what is known so far.
+    @property
+    def proposes_residual(self) -> bool:
+        """Whether the residual is proposed."""
+        return self._residual is not None
+
+    def learn_residual(self, found: Weighted) -> None:
+        """From now on propose the residual, too, by these weights of all draws so far.
 
         A share of :data:`ANYHOW` of what is proposed has a residual from the prior all the same.
         """
-        found = self.weighted()
         if SITE not in found.policy or not self.table.real.any():
             return
-        best = found.log_weights.topk(min(LEARNED_FROM, len(found.log_weights))).indices
+        best = found.log_weights.topk(min(RESIDUAL_DRAWS, len(found.log_weights))).indices
         counts = expected_counts(
             self.human,
             self.table,
