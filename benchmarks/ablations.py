@@ -6,15 +6,17 @@ Each row gives up one choice. Shown are held-out NLL in nats an action, net retu
 the communicator ``mirror``, of ten people a seed with 20 rounds each, and how far the package is
 ahead in the same people.
 
-- ``relaxed``: sight thresholds on a continuous scale by mean-field guides (``benchmarks.relaxed``),
-  where beliefs are the encoder's means, reparameterized draws, or draws without gradients.
+- ``relaxed``: sight thresholds on a continuous scale by a mean-field guide, where beliefs are the
+  encoder's means, reparameterized draws, or draws without gradients (``benchmarks._relaxed``).
 - ``plug-in``: one draw for each person in the place of all, the one whose predictions of the rounds
   that were learned from are nearest to the mean of all.
-- ``no item dropout``: a self-model that saw everything in every round of its training.
+- ``no item dropout``: a self-model in whose training no items were dropped at random; limited sight
+  stays. ``full views``: one that saw everything in every round.
 - ``action shifted``: a self-model whose transition is of the action one step earlier.
 
-The two self-models are trained into the folder first, unless they are there; ``retrained`` is the
-package's own training, with the same seed, to compare them with.
+These self-models are trained into the folder first, unless they are there. They are compared with
+``retrained``, which is the package's own training with the same seed; all others with ``package``.
+``svi`` has the package's thresholds and the mean-field guide that ``relaxed`` has, too.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from benchmarks.relaxed import Latents, relaxed_draws
+from benchmarks._relaxed import Latents, relaxed_draws
 from mirror_ppl.console import Progress
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
@@ -82,7 +84,8 @@ class ShiftedTransition(SelfModel):
 
 TRAINED: Mapping[str, tuple[type[SelfModel], dict[str, Any]]] = {
     "retrained": (SelfModel, {}),
-    "no item dropout": (SelfModel, {"kinds": (1.0, 0.0, 0.0)}),
+    "no item dropout": (SelfModel, {"kinds": (0.2, 0.0, 0.8)}),
+    "full views": (SelfModel, {"kinds": (1.0, 0.0, 0.0)}),
     "action shifted": (ShiftedTransition, {}),
 }
 RELAXED: Mapping[str, Latents] = {
@@ -90,7 +93,8 @@ RELAXED: Mapping[str, Latents] = {
     "relaxed, rsample": "rsample",
     "relaxed, sample": "sample",
 }
-CHOICES = (PACKAGE, "plug-in", *RELAXED, *TRAINED)
+REFERENCE = "retrained"
+CHOICES = (PACKAGE, "plug-in", "svi", *RELAXED, *TRAINED)
 
 
 def main(options: Options) -> None:
@@ -102,7 +106,8 @@ def main(options: Options) -> None:
         raise SystemExit(f"no such choice: {', '.join(sorted(unknown))}; known: {CHOICES}")
     nll: dict[str, list[float]] = {}
     net: dict[str, list[float]] = {}
-    for name in dict.fromkeys([PACKAGE, *chosen]):
+    partners = [PACKAGE, *([REFERENCE] if {*TRAINED} & {*chosen} else [])]
+    for name in dict.fromkeys([*partners, *chosen]):
         human = human_of(name, options)
         for seed in options.seeds:
             group = Group(DOMAIN, SETTING, "paper", options.people, seed)
@@ -119,10 +124,11 @@ def main(options: Options) -> None:
 
 
 def against(values: dict[str, list[float]], name: str, sign: int) -> str:
-    """How far the package is ahead, with its 90% interval."""
+    """How far what it is compared with is ahead, with its 90% interval."""
     if name == PACKAGE:
         return f"{'':<24}"
-    ahead = paired(sign * np.array(values[PACKAGE]), sign * np.array(values[name])).ahead
+    partner = REFERENCE if name in TRAINED and name != REFERENCE else PACKAGE
+    ahead = paired(sign * np.array(values[partner]), sign * np.array(values[name])).ahead
     return f"{f'({ahead.mean:+.3f} [{ahead.low:+.3f}, {ahead.high:+.3f}])':<24}"
 
 
@@ -155,7 +161,8 @@ def learned(name: str, human: HumanModel, group: Group) -> Posterior:
     train = group.recordings().select_rounds(slice(TRAINING))
     if name in RELAXED:
         return Posterior(human, relaxed_draws(human, train, RELAXED[name], DRAWS, group.seed))
-    draws = infer(human, train, InferenceOptions("exact", DRAWS), group.seed).draws
+    guide = "svi" if name == "svi" else "exact"
+    draws = infer(human, train, InferenceOptions(guide, DRAWS), group.seed).draws
     if name == "plug-in":
         each = predict_rounds(human, train, draws)  # [S, P, B, T, A]
         mean = predictive(each)

@@ -107,7 +107,7 @@ def main(options: Options) -> None:
     Raises:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
-    from mirror_ppl.evaluation.assistance import COMMUNICATORS, PlannerOptions
+    from mirror_ppl.evaluation.assistance import COMMUNICATORS, RATES_FROM, PlannerOptions
     from mirror_ppl.evaluation.assistance_cells import Pairing, run_cells
     from mirror_ppl.evaluation.assistance_summary import compare, summarize_assistance
     from mirror_ppl.files import prepare_output_folder, write_whole
@@ -161,7 +161,9 @@ def main(options: Options) -> None:
         prepare_output_folder(path.parent)
     kept = options.json or options.log
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
-    with Progress("assist", number * len(chosen)) as progress:
+    # Rates of random messages are those of a planner, which plays then, too.
+    playing = len({*chosen} | ({RATES_FROM} if "random" in chosen else set()))
+    with Progress("assist", number * playing) as progress:
         played = run_cells(pairing, chosen, number, options.jobs, parts, progress.update)
     horizon = pairing.domain.horizon
     summary = summarize_assistance(played, horizon, options.seed)

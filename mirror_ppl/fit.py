@@ -12,6 +12,7 @@ from mirror_ppl.console import Stages, run, usable_device
 from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.fit"
+DOMAIN = "driving"
 FEW = 20
 """Effective draws below which a pooled posterior is coarse."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
@@ -27,8 +28,9 @@ class Options:
 
     demos: Path | None = None
     """Recordings in the format of docs/demonstrations.md."""
-    domain: str = "driving"
-    """The world of the shipped recordings: driving, search_rescue or bomb_defusal."""
+    domain: str | None = None
+    """The world of the shipped recordings: driving (unless given), search_rescue or bomb_defusal.
+    """
     setting: str | None = None
     """The setting of the shipped recordings: clear or fog in driving, clear or smoke in
     search_rescue, labelled or unlabelled in bomb_defusal. Default: the one in which people see
@@ -185,11 +187,17 @@ def _recordings(options: Options):
     from mirror_ppl.people import PEOPLE
 
     if options.demos is not None:
-        return load_demonstrations(options.demos)
-    settings = get_domain(options.domain).settings
+        recorded = load_demonstrations(options.demos)
+        if options.domain not in (None, recorded.domain):
+            raise OptionError(
+                f"--domain is {options.domain}, but --demos is of {recorded.domain}; leave one out"
+            )
+        return recorded
+    domain = options.domain or DOMAIN
+    settings = get_domain(domain).settings
     setting = require_known(options.setting or settings[-1], "setting", settings)
-    require_known(options.population, "population", PEOPLE[options.domain].populations)
-    name = f"{options.domain}_{setting}_{options.population}.nc"
+    require_known(options.population, "population", PEOPLE[domain].populations)
+    name = f"{domain}_{setting}_{options.population}.nc"
     return load_demonstrations(asset_path(name))
 
 
@@ -242,6 +250,8 @@ def _show(summary: dict[str, Any], unit: str) -> None:
         )
     _show_open([person["identifiability"] for person in people if "identifiability" in person])
     tested = [person["test"] for person in people if person["test"]]
+    if not tested:
+        print("No rounds were held out, so that predictions are not judged (--train-rounds)")
     if tested:
         nll = sum(test["nll"] for test in tested) / len(tested)
         line = f"Held-out actions: {nll:.3f} nats an action on average"

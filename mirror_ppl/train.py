@@ -37,7 +37,8 @@ class Options:
     """Of a self-model: phases of acting and learning; 2 to try it out. Default: what makes a good
     one, of driving 40, of search_rescue 400 and of bomb_defusal 200."""
     steps: int | None = None
-    """Of a self-model: gradient steps of a phase. Default: of driving 300, of the others 40."""
+    """Of a self-model: gradient steps of a phase. Default: of driving 300,
+    of search_rescue 40, of bomb_defusal 30."""
     learning_rate: float | None = None
     """Of a self-model: learning rate at the start; it falls to a hundredth. Default: of driving
     0.001, of the others 0.002."""

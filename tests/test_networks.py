@@ -22,6 +22,7 @@ from mirror_ppl.models.networks import (
     QNetwork,
     Reward,
     Transition,
+    log_softmax_of_few,
 )
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.sizes import Sizes
@@ -395,3 +396,19 @@ def test_experience_uses_the_same_indices(courses):
                 if name in ITEMS:
                     seen = one.rounds.visible[name]
                     assert torch.equal(outcome.visible[name][row, step], seen[row, step + 1])
+
+
+@pytest.mark.parametrize("shape", [(3,), (4, 2), (2, 3, 1, 5), (0, 3), (2, 0, 4)])
+def test_log_softmax_of_few_is_that_of_torch(shape, generator):
+    logits = 5 * torch.randn(shape, generator=generator).double()
+    logits.requires_grad_()
+    found = log_softmax_of_few(logits)
+    assert found.shape == logits.shape
+    torch.testing.assert_close(found, logits.log_softmax(-1))
+    weights = torch.randn(shape, generator=generator).double()
+    (own,) = torch.autograd.grad((found * weights).sum(), logits)
+    (expected,) = torch.autograd.grad((logits.log_softmax(-1) * weights).sum(), logits)
+    torch.testing.assert_close(own, expected)
+    # Of expanded inputs, too.
+    wide = logits.detach().expand(2, *shape)
+    torch.testing.assert_close(log_softmax_of_few(wide), wide.log_softmax(-1))

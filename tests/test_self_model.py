@@ -389,8 +389,9 @@ def test_checkpoint_of_another_run_is_refused(tmp_path):
         ("batch", -1, "batch must be at least 1, not -1"),
         ("epsilon", 1.5, r"epsilon must lie in \[0, 1\], not 1.5"),
         ("discount", -0.1, r"discount must lie in \[0, 1\], not -0.1"),
-        ("kinds", (1.0, -0.1, 0.1), r"kinds must not be negative, .* not \(1.0, -0.1, 0.1\)"),
-        ("kinds", (0.0, 0.0, 0.0), "kinds must not be negative, nor all of them 0"),
+        ("kinds", (1.0, -0.1, 0.1), r"kinds must be 3 numbers, .* not \(1.0, -0.1, 0.1\)"),
+        ("kinds", (0.0, 0.0, 0.0), "not negative and not all 0"),
+        ("kinds", (0.2, 0.2, 0.2, 0.4), "kinds must be 3 numbers"),
     ],
 )
 def test_impossible_options_are_refused(name, value, message):

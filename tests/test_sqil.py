@@ -8,11 +8,12 @@ from example_rounds import alternate, anything, avoid, ragged, rounds_of, untrai
 
 from mirror_ppl.baselines import SoftQOptions, fit_soft_q, held_out_nll, input_size
 from mirror_ppl.baselines.inputs import StepInputs
-from mirror_ppl.baselines.sqil import mean_error, squared_errors
+from mirror_ppl.baselines.sqil import _told_rates, mean_error, soft_q_loss, squared_errors
 from mirror_ppl.data import concatenate
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import SWITCH
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
+from mirror_ppl.people import simulate
 
 BRIEF = SoftQOptions(epochs=6, sampled=3)
 
@@ -79,6 +80,48 @@ def test_played_rounds_are_of_the_domain_and_of_the_networks(name):
         expected, rate = chances[place][real].detach(), (actions[place][real] == 0).float()
         error = (expected * (1 - expected)).sum().sqrt() / len(rate)
         assert abs(float(rate.mean() - expected.mean())) < 4.5 * float(error) + 1e-6
+
+
+def test_rounds_that_are_played_are_told_as_much_as_recorded_ones():
+    domain = get_domain("driving")
+    networks = untrained(domain, ("a", "b"))
+    recorded = simulate("driving", "fog", "paper", 2, 40, seed=0, told=0.1)
+    rates = _told_rates(recorded)
+    # Of 40 rounds of 15 steps some thousand items can be told.
+    assert ((rates - 0.1).abs() < 4.5 * (0.1 * 0.9 / 1000) ** 0.5).all()
+    assert (_told_rates(simulate("driving", "fog", "paper", 2, 3, seed=0)) == 0).all()
+
+    def play(told):
+        generators = [torch.Generator().manual_seed(seed) for seed in (5, 6)]
+        return networks.play("fog", 40, generators, told)
+
+    silent, _ = play(None)
+    told, actions = play(torch.tensor([0.0, 0.5]))
+    heard = (told.steps - silent.steps)[:, :, 0].abs().sum((1, 2))
+    assert heard[0] == 0 and heard[1] > 0
+    assert actions.shape == (2, 40, domain.horizon)
+
+
+def test_recorded_and_played_rounds_are_learned_from_as_each_by_itself(generator):
+    """Of other lengths and numbers; people are several."""
+    domain = get_domain("driving")
+    networks, target = (untrained(domain, ("a", "b"), seed=seed) for seed in (0, 1))
+    with torch.no_grad():
+        for one in (networks, target):
+            one.weights["input"].normal_(generator=generator)
+    size, parts = (input_size(domain),), []
+    for shape in ((2, 3, 5), (2, 4, 7)):
+        inputs = StepInputs.of(torch.randint(2, shape + size, generator=generator).float())
+        actions = torch.randint(-1, 2, shape, generator=generator)
+        actions[:, :, 0] = 1
+        parts.append((inputs, actions.cummin(-1).values))
+    options = SoftQOptions(reward=3.0, discount=0.5, sampled_weight=0.25)
+    found = soft_q_loss(networks, target, *parts, options)
+    each = [
+        mean_error(squared_errors(networks, target, *part, torch.tensor([[reward]]), 0.5), part[1])
+        for part, reward in zip(parts, (3.0, 0.0), strict=True)
+    ]
+    torch.testing.assert_close(found, each[0] + 0.25 * each[1], rtol=1e-4, atol=1e-4)
 
 
 def test_a_person_s_network_is_their_own(generator):

@@ -113,7 +113,11 @@ class SoftQ(RecurrentNetworks):
 
     @torch.no_grad()
     def play(
-        self, setting: str, rounds: int, generators: Sequence[torch.Generator]
+        self,
+        setting: str,
+        rounds: int,
+        generators: Sequence[torch.Generator],
+        told: Tensor | None = None,
     ) -> tuple[StepInputs, Tensor]:
         """Rounds as the networks themselves play them.
 
@@ -121,6 +125,7 @@ class SoftQ(RecurrentNetworks):
             setting: what they see is as in this one.
             rounds: B, of each of P people.
             generators: one for each of them.
+            told: chance ``[P]`` that an item that can be communicated is told, at each step.
 
         Returns:
             Inputs, and actions ``[P, B, T]``, -1 after the end.
@@ -134,8 +139,12 @@ class SoftQ(RecurrentNetworks):
         for _ in range(domain.horizon):
             observation = domain.observe(state)
             seen = self.visible(setting, observation)
-            nothing = {name: torch.zeros_like(mask) for name, mask in seen.items()}
-            inputs.append(network_inputs(domain, observation, seen, nothing, last))
+            heard = {name: torch.zeros_like(mask) for name, mask in seen.items()}
+            if told is not None and told.any():
+                for name, may in domain.communicable(observation).items():
+                    luck = [torch.rand(may.shape[1:], generator=own) for own in generators]
+                    heard[name] = may & (torch.stack(luck) < told[:, None, None])
+            inputs.append(network_inputs(domain, observation, seen, heard, last))
             hidden = self.step(hidden, inputs[-1])
             chances = self.act(hidden).exp()
             last = torch.stack(
@@ -180,6 +189,38 @@ def mean_error(errors: Tensor, actions: Tensor) -> Tensor:
     return errors.sum((1, 2)) / (actions >= 0).sum((1, 2)).clamp(min=1)
 
 
+def soft_q_loss(
+    networks: SoftQ,
+    target: SoftQ,
+    recorded: tuple[StepInputs, Tensor],
+    played: tuple[StepInputs, Tensor],
+    options: SoftQOptions,
+) -> Tensor:
+    """``delta^2`` of recorded rounds and that of played ones, weighted, ``[P]``.
+
+    Args:
+        networks: what is trained.
+        target: whose values are looked ahead to.
+        recorded: inputs, and actions ``[P, B, T]``, -1 in padding.
+        played: the same of rounds that the networks played.
+        options: settings.
+    """
+    # All in one pass, which costs little more than that of either.
+    inputs = recorded[0].beside(played[0])
+    steps = inputs.place.shape[-1]
+    own, other = (
+        pad(actions, [0, steps - actions.shape[-1]], value=-1) for _, actions in (recorded, played)
+    )
+    number = own.shape[1]
+    reward = torch.full((number + other.shape[1], 1), SAMPLED, device=own.device)
+    reward[:number] = options.reward
+    errors = squared_errors(
+        networks, target, inputs, torch.cat([own, other], 1), reward, options.discount
+    )
+    sampled_error = mean_error(errors[:, number:], other)
+    return mean_error(errors[:, :number], own) + options.sampled_weight * sampled_error
+
+
 def fit_soft_q(
     train: Demonstrations,
     validation: Demonstrations,
@@ -213,6 +254,7 @@ def fit_soft_q(
     networks = SoftQ(domain, train.people, options.sight, weights).to(train.actions.device)
     target = copy.deepcopy(networks).requires_grad_(False)
     sampled: list[tuple[StepInputs, Tensor]] = []
+    told = _told_rates(train)
 
     def loss(step: int, inputs: StepInputs, actions: Tensor) -> Tensor:
         if step:
@@ -220,28 +262,28 @@ def fit_soft_q(
                 for slow, fast in zip(target.parameters(), networks.parameters(), strict=True):
                     slow.lerp_(fast, options.target_rate)
         if step % options.sample_every == 0:
-            sampled.append(networks.play(train.setting, options.sampled, generators))
+            sampled.append(networks.play(train.setting, options.sampled, generators, told))
             del sampled[: -options.kept]
-        # All in one pass, which costs little more than that of either.
-        played, own = sampled[step % len(sampled)]
-        steps = max(actions.shape[-1], own.shape[-1])
-        acted = [pad(part, [0, steps - part.shape[-1]], value=-1) for part in (actions, own)]
-        number = actions.shape[1]
-        reward = torch.full((number + own.shape[1], 1), SAMPLED, device=actions.device)
-        reward[:number] = options.reward
-        together = inputs.beside(played)
-        errors = squared_errors(
-            networks, target, together, torch.cat(acted, 1), reward, options.discount
-        )
-        own_error = mean_error(errors[:, number:], acted[1])
-        return mean_error(errors[:, :number], acted[0]) + options.sampled_weight * own_error
+        played = sampled[step % len(sampled)]
+        return soft_q_loss(networks, target, (inputs, actions), played, options)
 
     train_each(networks, (train, validation), loss, options, generators, report)
     return networks.requires_grad_(False)
 
 
+def _told_rates(train: Demonstrations) -> Tensor:
+    """How often what can be communicated was told to each person, ``[P]``."""
+    real = (train.actions >= 0)[..., None]
+    told = could = torch.zeros(train.num_people, device=real.device)
+    for name, may in get_domain(train.domain).communicable(train.observation()).items():
+        may = may[:, :, : real.shape[2]] & real
+        told = told + (may & train.told[name]).sum((1, 2, 3))
+        could = could + may.sum((1, 2, 3))
+    return told / could.clamp(min=1)
+
+
 def _usual_value(options: SoftQOptions, actions: int) -> float:
-    """The value of all actions alike, where this is what makes the loss least.
+    """The value at which a step's error is 0 on average if all actions and steps are alike.
 
     Networks that begin there have to learn differences only; else the first steps, which move all
     values alike, leave most units dead.

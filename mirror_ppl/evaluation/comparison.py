@@ -307,7 +307,11 @@ def _source(file: FitFile) -> dict[str, str]:
 def _check_same(first: FitFile, other: FitFile) -> None:
     expected, given = _source(first), _source(other)
     # Short values say in few words what the command that recorded says in many.
-    names = sorted({*expected, *given}, key=lambda name: (len(expected.get(name, "")), name))
+    # Where domains differ all else does, too.
+    names = sorted(
+        {*expected, *given},
+        key=lambda name: (name != "domain", len(expected.get(name, "")), name),
+    )
     different = f"{other.path}: is of other recordings than {first.path}:"
     for name in names:
         if given.get(name) != expected.get(name):

@@ -29,7 +29,7 @@ from mirror_ppl.inference.experience import Experience, drive, experience
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
-from mirror_ppl.models.views import KIND_PROBABILITIES, draw_views
+from mirror_ppl.models.views import KIND_PROBABILITIES, KINDS, draw_views
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,10 @@ class SelfModelOptions:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not (self.learning_rate > 0 and isfinite(self.learning_rate)):
             raise ValueError(f"learning_rate must be a positive number, not {self.learning_rate}")
-        if min(self.kinds) < 0 or not sum(self.kinds) > 0:
-            raise ValueError(f"kinds must not be negative, nor all of them 0, not {self.kinds}")
+        if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:
+            raise ValueError(
+                f"kinds must be {len(KINDS)} numbers, not negative and not all 0, not {self.kinds}"
+            )
         for name in ("beta", "beta_decay", "epsilon", "epsilon_decay", "epsilon_floor", "discount"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")

@@ -43,8 +43,8 @@ def log_softmax_of_few(logits: Tensor) -> Tensor:
 
     That goes through rows one by one; here all rows go side by side.
     """
-    side_by_side = logits.flatten(0, -2).T.contiguous().log_softmax(0)
-    return side_by_side.view(-1, *logits.shape[:-1]).movedim(0, -1)
+    side_by_side = logits.reshape(-1, logits.shape[-1]).T.contiguous().log_softmax(0)
+    return side_by_side.view(logits.shape[-1], *logits.shape[:-1]).movedim(0, -1)
 
 
 class GaussianHead(nn.Module):

@@ -9,14 +9,23 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility, by_eye
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.models.self_model import SelfModel
 
 
 class OneRadius(HumanModel):
     """Sees equally far in every direction: ``sight_radius`` instead of directional thresholds."""
 
     RADIUS = implant_priors.SIGHT + "radius"
+
+    def __init__(self, self_model: SelfModel) -> None:
+        super().__init__(self_model)
+        if len(self.domain.reach_bins) <= 1:
+            raise HumanModelError(
+                f"one-radius: in {self.domain.name} it does not count how far away things are"
+            )
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the radius, what is taken for granted, and how people decide."""

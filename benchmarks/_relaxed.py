@@ -1,8 +1,9 @@
 """Sight thresholds on a continuous scale, inferred by gradients: what this package does not do.
 
 A human model of drivers in which a car is seen to the degree ``sigmoid((reach - distance) / s)``
-and what is taken for granted is so by a weight, fitted by a mean-field guide. Beliefs are the
-encoder's means, or draws of it: reparameterized, or without gradients as in the released code.
+and what is taken for granted is so by a weight, fitted by a mean-field guide. A car that is seen
+twice is known to the degree of the lesser sight. Beliefs are the encoder's means, or draws of it:
+reparameterized, or without gradients as in the released code.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_
 Latents = Literal["mean", "rsample", "sample"]
 SOFTNESS = 0.5
 """Cells over which sight fades, a half of what cars are apart at least."""
-LEARNING_RATE = 0.05
-STEPS = 400
+LEARNING_RATE = 0.03
+STEPS = 3000
 
 
 def relaxed_draws(
@@ -33,7 +34,8 @@ def relaxed_draws(
 ) -> dict[str, Tensor]:
     """Posterior draws ``[S, P, 1, ...]`` of the package's own sites, of drivers.
 
-    Thresholds are rounded down to the package's bins, weights to 0 or 1.
+    Thresholds count as the package's bin that they are in, weights as 0 or 1, and beliefs of those
+    who predict are means, whatever they were fitted with.
 
     Args:
         human: the model whose networks and sites these are.
@@ -48,18 +50,18 @@ def relaxed_draws(
         guide = AutoNormal(relaxed.model, init_loc_fn=init_to_median, init_scale=0.3)
         guide()
         optimizer = torch.optim.Adam(guide.parameters(), LEARNING_RATE)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
         loss = Trace_ELBO()
         for _ in range(STEPS):
             optimizer.zero_grad()
             loss.differentiable_loss(relaxed.model, guide).backward()
             optimizer.step()
+            schedule.step()
         with torch.no_grad():
             found = [guide() for _ in range(draws)]
     together = {name: torch.stack([one[name] for one in found]) for name in found[0]}
-    bins = torch.tensor(human.domain.reach_bins)
     for site in sight_sites(human.domain):
-        place = torch.searchsorted(bins, together[site].contiguous(), right=True) - 1
-        together[site] = place.clamp(min=0)
+        together[site] = together[site].long().clamp(max=len(human.domain.reach_bins) - 1)
     for site in assumption_sites(human.domain):
         together[site] = together[site].round().long()
     return together
@@ -82,10 +84,10 @@ class _Relaxed:
         human, domain = self.human, self.human.domain
         people = len(self.acted)
         like = next(human.parameters())
-        farthest = max(domain.reach_bins)
+        bins = len(domain.reach_bins)
         with pyro.plate("person", people, dim=-2):
             implants = {
-                site: pyro.sample(site, dist.Uniform(like.new_zeros(()), farthest))
+                site: pyro.sample(site, dist.Uniform(like.new_zeros(()), float(bins)))
                 for site in sight_sites(domain)
             }
             for site in assumption_sites(domain):
@@ -100,7 +102,12 @@ class _Relaxed:
     def _perceive(self, implants: dict[str, Tensor]) -> View:
         """Views whose masks are weights ``[P, B, T, K]``."""
         domain = self.human.domain
-        reach = torch.stack([implants[site] for site in sight_sites(domain)], -1)  # [P, 1, D]
+        # Numbers of bins, of which the whole part is the bin: cells lie in between.
+        number = torch.stack([implants[site] for site in sight_sites(domain)], -1)  # [P, 1, D]
+        bins = torch.tensor(domain.reach_bins).to(number)
+        edges = torch.cat([bins, bins[-1:] + 1])
+        lower = number.detach().long().clamp(max=len(bins) - 1)
+        reach = edges[lower] + (number - lower) * (edges[lower + 1] - edges[lower])
 
         def degree(observation: Observation) -> Tensor:
             direction, distance = domain.distance(observation)
@@ -112,6 +119,7 @@ class _Relaxed:
             return {"visual": seen, "verbal": torch.zeros_like(seen)}
 
         knowledge, views = domain.nothing_known(1), []
+        placed = known_by_sight = reach.new_zeros(())
         for step in range(self.acted.shape[-1]):
             now = {
                 name: value[..., step, :] if name == "ego" else value[..., step, :, :]
@@ -119,9 +127,15 @@ class _Relaxed:
             }
             seen = sees(now)
             knowledge = domain.learn(knowledge, now, seen, sees)
-            known = domain.known(knowledge)
-            visible = {name: mask.to(reach) for name, mask in known.items()}
-            visible["visual"] = torch.maximum(visible["visual"], degree(now))
+            sight = degree(now)
+            known_by_sight = torch.maximum(known_by_sight, torch.minimum(placed, sight))
+            placed = torch.maximum(placed, sight)
+            visible = {}
+            for name, mask in domain.known(knowledge).items():
+                # What follows from not seeing has no degrees.
+                inferred = mask & (known_by_sight <= 0.5)  # noqa: PLR2004
+                visible[name] = torch.where(inferred, 1.0, known_by_sight)
+            visible["visual"] = torch.maximum(visible["visual"], sight)
             items, imagined = domain.assume(knowledge, now)
             taken = {name: torch.zeros_like(weight) for name, weight in visible.items()}
             for site, about in zip(assumption_sites(domain), items.values(), strict=True):
