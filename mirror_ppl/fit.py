@@ -281,7 +281,9 @@ def _show_open(people: list[dict[str, Any]]) -> None:
     print(line)
 
 
-def _cell(implant: dict[str, float | None]) -> str:
+def _cell(implant: dict[str, Any]) -> str:
+    if "most_probable" in implant:
+        return f"{implant['most_probable']} ({implant['probability']:.2f})"
     text = f"{_number(implant['median'])} [{_number(implant['q05'])}, {_number(implant['q95'])}]"
     return text if implant["truth"] is None else f"{text} {_number(implant['truth'])}"
 

@@ -10,12 +10,14 @@ from pyro import poutine
 
 from mirror_ppl.communication import Person, RoundSoFar
 from mirror_ppl.communication.minds import Looks, StepwiseBeliefs
+from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
-from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES, read_panel
+from mirror_ppl.domains.bomb_panel import BUTTONS, OLD_RULES, RULES, read_panel
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.summary import summarize
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.attention import Proposal, site_probabilities
@@ -23,6 +25,7 @@ from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate
 
 WORLD = BombDefusal()
@@ -384,3 +387,24 @@ class Kind(torch.nn.Module):
 
     def forward(self, belief):
         return type("Decoded", (), {"mean": belief[..., 5, None, None]})
+
+
+def test_of_rules_the_most_probable_one_is_told():
+    human = Searcher(load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")[0])
+    names = human.value_names["rule_type_b"]
+    assert len(names) == len(set(names)) == len(human.exchanges)
+    # What is pressed for the robot's second button by the rule of that name.
+    pressed = human.exchanges[9][:, 1].argmax()
+    assert names[9].split()[1] == BUTTONS[pressed]
+    assert names[0] == f"{' '.join(BUTTONS)} (as the robot)"
+    recorded = load_demonstrations(asset_path("bomb_defusal_unlabelled_paper.nc"))
+    train = recorded.select_people([0]).select_rounds([0])
+    draws = {
+        "rule_type_b": torch.tensor([[9], [9], [9], [2]]),
+        "lapse": torch.tensor([[0.1], [0.2], [0.3], [0.4]]),
+    }
+    (person,) = summarize(draws, train, None, {}, human.value_names)
+    assert person["implants"]["rule_type_b"] == {
+        "most_probable": names[9], "probability": 0.75, "truth": None
+    }  # fmt: skip
+    assert person["implants"]["lapse"]["median"] == pytest.approx(0.2)

@@ -205,8 +205,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     newcomer = {}
     if posterior.population is not None:
         newcomer = add_population(data, Pooling(human), posterior.population, attributes, seed)
-        newcomer = {"newcomer": summarize_newcomer(newcomer)}
-    found = summarize(in_units(domain, drawn), train, test, log_probabilities)
+        newcomer = {"newcomer": summarize_newcomer(newcomer, human.value_names)}
+    found = summarize(in_units(domain, drawn), train, test, log_probabilities, human.value_names)
     if posterior.pareto_k is not None:
         for person, value in zip(found, posterior.pareto_k.tolist(), strict=True):
             person["pareto_k"] = value if isfinite(value) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ def summarize(
     train: Demonstrations,
     test: Demonstrations | None,
     log_probabilities: Mapping[str, Tensor],
+    value_names: Mapping[str, Sequence[str]] | None = None,
 ) -> list[dict[str, Any]]:
     """One entry a person: ``id``, ``rounds``, ``implants`` and ``test``.
 
@@ -27,12 +28,14 @@ def summarize(
         train: rounds that were learned from.
         test: held-out rounds, if there are any.
         log_probabilities: of actions ``[S, P, B, T, A]``, ``"test"`` being those of ``test``.
+        value_names: see `HumanModel.value_names`.
 
     Returns:
         ``implants``: by name ``median``, ``q05``, ``q95`` and ``truth`` (``None`` where unknown);
-        quantiles are values that were drawn. ``test``: ``nll`` in nats an action, ``accuracy`` and
-        ``floor``, the person's own entropy (``None`` where unknown); ``None`` without held-out
-        rounds.
+        quantiles are values that were drawn. Of implants whose values have names ``most_probable``
+        and its ``probability`` instead of quantiles. ``test``: ``nll`` in nats an action,
+        ``accuracy`` and ``floor``, the person's own entropy (``None`` where unknown); ``None``
+        without held-out rounds.
     """
     scalars = {name: value for name, value in draws.items() if value.dim() == 2}  # noqa: PLR2004
     held_out = None if test is None else score(log_probabilities["test"], test)
@@ -41,7 +44,8 @@ def summarize(
             "id": name,
             "rounds": int(train.round_counts[person]),
             "implants": {
-                site: _quantiles(value[:, person]) | {"truth": _truth(train, site, person)}
+                site: _told(site, value[:, person], value_names or {})
+                | {"truth": _truth(train, site, person)}
                 for site, value in scalars.items()
             },
             "test": None if held_out is None else held_out[person],
@@ -50,9 +54,15 @@ def summarize(
     ]
 
 
-def summarize_newcomer(draws: Mapping[str, Tensor]) -> dict[str, dict[str, float]]:
-    """Quantiles of each implant of somebody new that is one number, of draws ``[S, ...]``."""
-    return {site: _quantiles(value) for site, value in draws.items() if value.dim() == 1}
+def summarize_newcomer(
+    draws: Mapping[str, Tensor], value_names: Mapping[str, Sequence[str]] | None = None
+) -> dict[str, dict[str, Any]]:
+    """The same of each implant of somebody new that is one number, of draws ``[S, ...]``."""
+    return {
+        site: _told(site, value, value_names or {})
+        for site, value in draws.items()
+        if value.dim() == 1
+    }
 
 
 def predictive(log_probabilities: Tensor) -> Tensor:
@@ -84,6 +94,17 @@ def score(log_probabilities: Tensor, rounds: Demonstrations) -> list[dict[str, A
             }
         )
     return results
+
+
+def _told(site: str, values: Tensor, value_names: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """What is told of a site, of draws ``[S]``."""
+    if site not in value_names:
+        return _quantiles(values)
+    often = torch.bincount(values.long(), minlength=len(value_names[site])) / len(values)
+    return {
+        "most_probable": value_names[site][int(often.argmax())],
+        "probability": float(often.max()),
+    }
 
 
 def _quantiles(values: Tensor) -> dict[str, float]:

@@ -155,6 +155,14 @@ class HumanModel(nn.Module):
         return self.self_model.domain
 
     @property
+    def value_names(self) -> Mapping[str, Sequence[str]]:
+        """Names of the values 0, 1 and so on of sites of the prior whose values have no order.
+
+        Of these the most probable value is told, and of all others quantiles.
+        """
+        return {}
+
+    @property
     def belief_size(self) -> int:
         """Z, the size of beliefs."""
         return self.self_model.latent

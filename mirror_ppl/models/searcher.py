@@ -91,6 +91,13 @@ class Searcher(HumanModel):
         assert isinstance(world, BombDefusal)
         return world
 
+    @property
+    def value_names(self) -> dict[str, list[str]]:
+        """Of each rule: what they press where the robot would press each of the buttons in turn."""
+        same, *others = (" ".join(pressed) for pressed in permutations(BUTTONS))
+        names = [f"{same} (as the robot)", *others]
+        return {RULE + kind: names for kind in self.kinds}
+
     def _prior_of_rules(self) -> Tensor:
         number = len(self.exchanges)
         prior = self.exchanges.new_full((len(KINDS), number), (1 - SAME) / (number - 1))
