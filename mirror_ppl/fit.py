@@ -252,7 +252,7 @@ def _show(summary: dict[str, Any], unit: str) -> None:
     tested = [person["test"] for person in people if person["test"]]
     if not tested:
         print("No rounds were held out, so that predictions are not judged (--train-rounds)")
-    if tested:
+    else:
         nll = sum(test["nll"] for test in tested) / len(tested)
         line = f"Held-out actions: {nll:.3f} nats an action on average"
         floors = [test["floor"] for test in tested if test["floor"] is not None]

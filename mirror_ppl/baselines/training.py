@@ -51,7 +51,7 @@ class TrainingOptions:
     patience: int = 10
 
     BY_DOMAIN: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """What is other than the defaults in a domain, where a search found it to be better."""
+    """What is other than the defaults in a domain."""
     COUNTS = ("hidden", "epochs", "batch", "check_every", "patience")
     """Settings that have to be at least 1."""
 
