@@ -34,7 +34,7 @@ from torch import Tensor
 from benchmarks._relaxed import Latents, relaxed_draws
 from mirror_ppl.console import Progress
 from mirror_ppl.domains import get_domain
-from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
+from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learners import TEST, TRAINING, Group, Posterior
 from mirror_ppl.evaluation.study_summary import paired
 from mirror_ppl.inference.fitting import predict_rounds
@@ -46,7 +46,6 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, save_self_model
-from mirror_ppl.people import draw_starts, simulated_people
 
 DOMAIN, SETTING = "driving", "fog"
 DRAWS = 200
@@ -176,15 +175,8 @@ def learned(name: str, human: HumanModel, group: Group) -> Posterior:
 
 def net_returns(posterior: Posterior, group: Group, played: int) -> list[float]:
     """Net return of a round of each person, whom ``mirror`` speaks to."""
-    domain = get_domain(DOMAIN)
-    everybody = simulated_people(DOMAIN, SETTING, group.population, group.people, group.seed)
-    starts = draw_starts(
-        group.people, played, group.seed, "assist", SETTING, domain=domain, fates=everybody.fates
-    )
     options, found = PlannerOptions.of(DOMAIN), []
-    for number in range(group.people):
-        own = starts.select(slice(number, number + 1))
-        listener = Listener(domain, SETTING, everybody.select([number]), own)
+    for number, listener in enumerate(group.listeners(played)):
         listener = replace(listener, person=posterior.person(number, PLANNED_WITH))
         say = speaker("mirror", listener, options, group.seed + number)
         found.append(float(play(listener, say).net.mean()))

@@ -20,9 +20,9 @@ PROGRAM = "python -m mirror_ppl.evaluate"
 DESCRIPTION = """Compare MIRROR with its parts and its rivals on simulated people. prediction: how
 well each predicts held-out actions, by the number of rounds that it learned from. assistance: the
 net return of people who are spoken to by communicators that plan with each. relevance: which share
-of what those tell is relevant. Writes a table of every person (CSV), a summary (JSON) and a figure.
-A run that is stopped goes on where it was when the same command is given again; the exit status is
-1 if something failed."""
+of what those tell is relevant. Writes rows of every person (CSV), tables to read (Markdown), a
+summary (JSON) and a figure. A run that is stopped goes on where it was when the same command is
+given again; the exit status is 1 if something failed."""
 FAILED = 1
 TOLD = 0.03
 """Of an item at a step, in rounds from which it is learned how to help."""
@@ -94,8 +94,9 @@ def main(options: Options) -> int:
         MirrorError: what was asked for cannot be done; no results are written then.
     """
     from mirror_ppl.evaluation.study import assist, identities, predict
-    from mirror_ppl.evaluation.study_report import REPORTS, write_table
+    from mirror_ppl.evaluation.study_report import REPORTS
     from mirror_ppl.evaluation.sweep import run_cells
+    from mirror_ppl.evaluation.tables import write_page, write_rows
     from mirror_ppl.files import prepare_output_folder, write_whole
 
     cells = _cells(options)
@@ -116,13 +117,19 @@ def main(options: Options) -> int:
     failed = [outcome for outcome in outcomes if outcome.error is not None]
     if rows:
         path = folder / f"{options.study}.csv"
-        write_whole(path, lambda temporary: write_table(temporary, rows))
-        summary, picture = REPORTS[options.study](rows)
-        content = _origin(options) | summary | _effort(outcomes)
+        write_whole(path, lambda temporary: write_rows(temporary, rows))
+        report = REPORTS[options.study](rows)
+        report.show()
+        write_whole(
+            path.with_suffix(".md"),
+            lambda temporary: write_page(temporary, report.sentences, report.tables),
+        )
+        content = _origin(options) | report.data | _effort(outcomes)
         text = json.dumps(content, indent=1, default=_plain) + "\n"
         write_whole(folder / f"{options.study}.json", lambda temporary: temporary.write_text(text))
-        picture.save(folder / f"{options.study}.png")
+        report.picture.save(folder / f"{options.study}.png")
         print(f"{path}: a row for each person, model and number of rounds")
+        print(f"{path.with_suffix('.md')}: the tables above")
         print(f"{path.with_suffix('.json')}: means, differences and intervals")
         print(f"{path.with_suffix('.png')}: the same as a picture")
     for outcome in failed:

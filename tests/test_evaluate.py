@@ -169,6 +169,11 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     own = [float(row["nll"]) for row in rows if (row["model"], row["rounds"]) == ("bc", "2")]
     (entry,) = (one for one in content["nll"] if (one["model"], one["rounds"]) == ("bc", 2))
     assert entry["measured"]["mean"] == pytest.approx(sum(own) / 2)
+    page = (tmp_path / "prediction.md").read_text()
+    means = {
+        one["rounds"]: one["measured"]["mean"] for one in content["nll"] if one["model"] == "bc"
+    }
+    assert f"| bc | {means[1]:.3f} | {means[2]:.3f} |" in page
     assert content["failed"] == {}
     assert set(content["seconds"]) == {f"{name} in driving, fog, seed 0" for name in QUICK}
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
@@ -209,7 +214,7 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
     assert set(content) == {"driving: collision_course", "driving: closing"}
     files = {path.name for path in tmp_path.iterdir()} - {"parts"}
     for name in ("assistance", "relevance"):
-        files -= {f"{name}.csv", f"{name}.json", f"{name}.png"}
+        files -= {f"{name}.{kind}" for kind in ("csv", "md", "json", "png")}
     assert not files
 
 
@@ -297,7 +302,7 @@ def test_relevance_has_a_panel_for_each_place(monkeypatch):
         | {f"{n}_{m}": 1 for n in ("collision_course", "closing") for m in ("visual", "verbal")}
         for setting in ("clear", "fog")
     ]
-    _, picture = REPORTS["relevance"](rows)
+    picture = REPORTS["relevance"](rows).picture
     assert [ax.get_title() for ax in picture.axes] == ["driving clear paper", "driving fog paper"]
     assert [len(ax.patches) for ax in picture.axes] == [2, 2]
 

@@ -27,6 +27,7 @@ from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.oracle import Oracle
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
+from mirror_ppl.people import draw_starts, simulated_people
 from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.driving import Drivers
 from mirror_ppl.people.populations import derived_generator
@@ -160,6 +161,38 @@ class Listener:
     driver: SimulatedPeople
     start: Start
     person: Person | None = None
+
+
+def listeners(
+    domain: Domain,
+    setting: str,
+    population: str,
+    people: int,
+    people_seed: int,
+    rounds: int,
+    seed: int,
+) -> list[Listener]:
+    """Simulated people, and rounds that are the same whoever speaks to them.
+
+    Args:
+        domain: the world.
+        setting: its setting.
+        population: which people.
+        people: how many.
+        people_seed: of the people.
+        rounds: of each of them.
+        seed: of how the rounds begin and of all luck in them.
+    """
+    everybody = simulated_people(domain.name, setting, population, people, people_seed)
+    starts = draw_starts(
+        people, rounds, seed, "assist", setting, domain=domain, fates=everybody.fates
+    )
+    return [
+        Listener(
+            domain, setting, everybody.select([number]), starts.select(slice(number, number + 1))
+        )
+        for number in range(people)
+    ]
 
 
 def speaker(

@@ -11,7 +11,7 @@ import json
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -27,6 +27,7 @@ from mirror_ppl.evaluation.assistance import (
     Listener,
     PlannerOptions,
     Played,
+    listeners,
     play,
     speaker,
 )
@@ -36,7 +37,6 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import draw_starts, simulated_people
 
 
 @dataclass(frozen=True)
@@ -95,26 +95,21 @@ class Pairing:
 
     def listener(self, number: int, inferred: bool = True) -> Listener:
         """The person of that number, with their rounds, and what was inferred of them."""
-        domain = self.domain
-        driver = simulated_people(
-            domain.name, self.setting, self.population, self.people, self.people_seed
-        ).select([number])
-        starts = draw_starts(
+        listener = listeners(
+            self.domain,
+            self.setting,
+            self.population,
             self.people,
+            self.people_seed,
             self.rounds,
             self.seed,
-            "assist",
-            self.setting,
-            domain=domain,
-            fates=driver.fates,
-        )
+        )[number]
+        if not inferred:
+            return listener
         own = slice(number, number + 1)
-        start = starts.select(own)
-        person = None
-        if inferred:
-            draws = self.file.draws(self.human, self.draws)
-            person = Person(self.human, {site: value[:, own] for site, value in draws.items()})
-        return Listener(domain, self.setting, driver, start, person)
+        draws = self.file.draws(self.human, self.draws)
+        person = Person(self.human, {site: value[:, own] for site, value in draws.items()})
+        return replace(listener, person=person)
 
     def play(self, number: int, name: str, rates: dict[str, float] | None) -> Played:
         """Rounds of the person of that number with one communicator."""

@@ -27,8 +27,10 @@ from mirror_ppl.baselines import (
 from mirror_ppl.baselines.inputs import Sight
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.evaluation.assistance import Listener, listeners
 from mirror_ppl.inference.fitting import predict_rounds
 from mirror_ppl.inference.guide_file import network_for
 from mirror_ppl.inference.guides import InferenceOptions, infer
@@ -83,6 +85,18 @@ class Group:
             rounds,
             self.seed,
             told=self.told,
+        )
+
+    def listeners(self, rounds: int) -> list[Listener]:
+        """These people, and other rounds of theirs in which they can be spoken to."""
+        return listeners(
+            get_domain(self.domain),
+            self.setting,
+            self.population,
+            self.people,
+            self.seed,
+            rounds,
+            self.seed,
         )
 
     @property

@@ -15,7 +15,7 @@ import torch
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, UnknownNameError
-from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
+from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learners import (
     LEARNERS,
     PLANNABLE,
@@ -28,7 +28,6 @@ from mirror_ppl.evaluation.sweep import Rows
 from mirror_ppl.inference.guide_file import shipped_guide
 from mirror_ppl.inference.summary import score
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
-from mirror_ppl.people import draw_starts, simulated_people
 
 CODE = (
     *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
@@ -122,26 +121,11 @@ def assist(cell: Assistance) -> Rows:
     rounds ``items`` of each modality, and how many were relevant by each notion. The rounds are the
     same for all communicators, and others than those that were learned from.
     """
-    group, domain = cell.group, get_domain(cell.group.domain)
-    everybody = simulated_people(
-        group.domain, group.setting, group.population, group.people, group.seed
-    )
-    starts = draw_starts(
-        group.people,
-        cell.played,
-        group.seed,
-        "assist",
-        group.setting,
-        domain=domain,
-        fates=everybody.fates,
-    )
-    learned = None
+    group, learned = cell.group, None
     if cell.model not in REFERENCES:
         learned = cast(Plannable, learn(cell.model, group, cell.rounds, group.seed))
     options, rows = PlannerOptions.of(group.domain), []
-    for number in range(group.people):
-        start = starts.select(slice(number, number + 1))
-        listener = Listener(domain, group.setting, everybody.select([number]), start)
+    for number, listener in enumerate(group.listeners(cell.played)):
         if learned is not None:
             listener = replace(listener, person=learned.person(number, cell.draws))
         for objective in OBJECTIVES.get(cell.model, (cell.model,)):

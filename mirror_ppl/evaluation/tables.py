@@ -1,0 +1,75 @@
+"""Tables of text, for a terminal and for a page."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mirror_ppl.evaluation.sweep import Rows
+
+WIDTH = 110
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table to be read.
+
+    Attributes:
+        title: what is in it.
+        caption: what entries mean.
+        heads: of its columns; all but the first have numbers.
+        rows: entries, which may have several lines.
+    """
+
+    title: str
+    caption: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def show(self) -> None:
+        """Print it."""
+        table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for place, head in enumerate(self.heads):
+            table.add_column(head, justify="right" if place else "left")
+        for row in self.rows:
+            table.add_row(*map(Text, row))
+        console = Console()
+        if not console.is_terminal:
+            console = Console(width=WIDTH)
+        # Not by the table, which would make them as narrow as it is.
+        console.print(self.title, style="italic", highlight=False)
+        console.print(table, end="")
+        console.print(f"({self.caption})\n", style="dim", highlight=False)
+
+    @property
+    def markdown(self) -> str:
+        """The same for a page."""
+        lines = [
+            self.heads,
+            ("---", *("---:" for _ in self.heads[1:])),
+            *(tuple(entry.replace("\n", "<br>") for entry in row) for row in self.rows),
+        ]
+        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        return f"**{self.title}**\n\n{table}\n\n{self.caption[:1].upper()}{self.caption[1:]}.\n"
+
+
+def write_rows(path: Path, rows: Rows) -> None:
+    """As comma-separated values; columns that a row lacks stay empty."""
+    columns = dict.fromkeys(name for row in rows for name in row)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(columns))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_page(path: Path, sentences: Sequence[str], tables: Sequence[TextTable]) -> None:
+    """As Markdown."""
+    parts = ["\n".join(f"- {one}" for one in sentences) + "\n"] if sentences else []
+    path.write_text("\n".join([*parts, *(table.markdown for table in tables)]))
