@@ -19,8 +19,9 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation
-from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
+from mirror_ppl.models.view import View
 
 Latents = Literal["mean", "rsample", "sample"]
 SOFTNESS = 0.5

@@ -15,7 +15,7 @@ from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import CAR_LANES, CARS, ROAD_END, DrivingState
 from mirror_ppl.evaluation.self_model import _exact_values, fixed_views
 from mirror_ppl.inference.experience import experience, follow, roll_out, supposed
-from mirror_ppl.models.views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES, draw_views
+from mirror_ppl.models.training_views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES, draw_views
 from mirror_ppl.people.driving import Memory, remember
 
 DRIVING = get_domain("driving")

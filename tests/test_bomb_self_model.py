@@ -16,7 +16,7 @@ from mirror_ppl.inference.self_model_training import (
 )
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import PAPER, SIZES
-from mirror_ppl.models.views import draw_views
+from mirror_ppl.models.training_views import draw_views
 from mirror_ppl.models.weights import load_self_model
 from mirror_ppl.train import Options, main
 

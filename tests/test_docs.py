@@ -28,7 +28,7 @@ from mirror_ppl.inference.self_model_training import SelfModelOptions
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import PLATES, FitOptions, continuous_guide
 from mirror_ppl.inference.views import Screening, build_view_table
-from mirror_ppl.models import HumanModel, views
+from mirror_ppl.models import HumanModel, training_views
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -185,15 +185,15 @@ def test_options_and_communicators_of_assist_are_told_as_they_are():
 
 def test_views_of_training_are_told_with_their_shares():
     rows = {row[0]: row for row in table_of(page("docs/self_model.md"), "View")}
-    assert SelfModelOptions().kinds == views.KIND_PROBABILITIES
+    assert SelfModelOptions().kinds == training_views.KIND_PROBABILITIES
     assert "`SelfModelOptions.kinds`" in page("docs/self_model.md")
     assert {name: row[1] for name, row in rows.items()} == {
         kind: f"{share:.0%}"
-        for kind, share in zip(views.KINDS, views.KIND_PROBABILITIES, strict=True)
+        for kind, share in zip(training_views.KINDS, training_views.KIND_PROBABILITIES, strict=True)
     }
-    told = [f"{views.ALIKE_PROBABILITY:.0%}", f"{views.TOLD_PROBABILITY:.0%}"]
+    told = [f"{training_views.ALIKE_PROBABILITY:.0%}", f"{training_views.TOLD_PROBABILITY:.0%}"]
     assert re.findall(r"in (\d+%)", rows["sight"][2]) == told
-    share = f"in {views.ASSUMPTION_PROBABILITY:.0%}"
+    share = f"in {training_views.ASSUMPTION_PROBABILITY:.0%}"
     for name in ("docs/self_model.md", "docs/decisions.md"):
         # Once for each assumption.
         assert page(name).lower().count(share) == 2, name

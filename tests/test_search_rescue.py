@@ -24,7 +24,7 @@ from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import check_contract
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.views import draw_views
+from mirror_ppl.models.training_views import draw_views
 
 WORLD: Domain = SearchRescue()
 UP, DOWN, LEFT, RIGHT = range(4)

@@ -31,7 +31,7 @@ from mirror_ppl.inference.self_model_training import (
 )
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
-from mirror_ppl.models.views import draw_views
+from mirror_ppl.models.training_views import draw_views
 from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
 
 DRIVING = get_domain("driving")

@@ -24,12 +24,12 @@ from mirror_ppl.inference.views import (
 )
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
-from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
-from mirror_ppl.models.views import (
+from mirror_ppl.models.training_views import (
     KIND_PROBABILITIES,
     TOLD_PROBABILITY,
     draw_views,
 )
+from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")

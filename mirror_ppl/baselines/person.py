@@ -24,9 +24,10 @@ from mirror_ppl.baselines.inputs import network_inputs
 from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.models.human import HumanModel, Implants, View
+from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.view import View
 
 NETWORK = "network"
 """Name of the only site: which network it is, of one."""

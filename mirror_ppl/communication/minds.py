@@ -25,9 +25,10 @@ from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility, map_state
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.attention import AttentionValues, Proposal
-from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.models.view import View
 
 COUNTED = 3
 """Up to how many items of a message have to be cheaper than others that tell the same."""

@@ -2,8 +2,8 @@
 
 In full view the yardstick is the exact planner that knows everything. In partial view it is the
 exact planner of the world as somebody with that view believes it to be who remembers everything
-and makes every assumption (see `mirror_ppl.models.views`). Where these leave something open, the
-return of somebody who assumes nothing is all there is to compare.
+and makes every assumption (see `mirror_ppl.models.training_views`). Where these leave something
+open, the return of somebody who assumes nothing is all there is to compare.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mirror_ppl.inference.experience import (
     supposed,
 )
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.views import ViewPlan
+from mirror_ppl.models.training_views import ViewPlan
 
 CLEAR_DECISION = 0.2
 """Difference of action values, in units of reward, above which a decision counts as clear."""

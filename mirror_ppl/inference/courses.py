@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mirror_ppl.distinct import distinct_rows, random_keys
 from mirror_ppl.domains import Observation
-from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.view import View
 
 CHUNK = 4096
 """What is computed at once; bounds memory."""

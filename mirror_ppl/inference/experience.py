@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, total_reward
 from mirror_ppl.models.self_model import Rounds, SelfModel
-from mirror_ppl.models.views import ViewPlan
+from mirror_ppl.models.training_views import ViewPlan
 
 
 @dataclass(frozen=True)

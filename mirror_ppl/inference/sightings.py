@@ -29,11 +29,12 @@ from mirror_ppl.inference.combinations import (
     perceived_sites,
     require_own_attention,
 )
-from mirror_ppl.inference.courses import CHUNK, beliefs_and_values
+from mirror_ppl.inference.courses import CHUNK
 from mirror_ppl.inference.prior import draw_prior
+from mirror_ppl.inference.round_views import RoundViews, round_views
 from mirror_ppl.models.attention import KEPT, VALUES, AttentionValues, Proposal
 from mirror_ppl.models.chain import Chain
-from mirror_ppl.models.human import HumanModel, View
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, log_likelihoods
 
 PROPOSING_WAYS = 64
@@ -66,73 +67,6 @@ class Screening:
         for name, least in (("margin", 0), ("ways", 1), ("resolution", 0), ("alike", 1)):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class RoundViews:
-    """V distinct views of one round, and the moments that they share; see :class:`ViewTable`.
-
-    Attributes:
-        moments: ``[V, T]``.
-        belief: ``[N, T', Z]``.
-        values: ``[N, T', A]``.
-        acted: ``[N, T']``.
-        sights: the view under each value of attention, ``[U, G]``; ``None`` if a sight is a view.
-        rounds: of each sight ``[U]``, if there is more than one round.
-        chain: attention that is summed out exactly, of one person; views are of its spans.
-    """
-
-    moments: Tensor
-    belief: Tensor
-    values: Tensor
-    acted: Tensor
-    sights: Tensor | None = None
-    rounds: Tensor | None = None
-    chain: Chain | None = None
-
-    def __len__(self) -> int:
-        """The number of sights U."""
-        if self.chain is not None:
-            return self.chain.sights
-        return len(self.moments if self.sights is None else self.sights)
-
-    def lengthened(self, steps: int) -> RoundViews:
-        """The same with padding at the end, as part of a table of longer rounds."""
-        more = steps - self.moments.shape[1]
-        if not more:
-            return self
-        moments, length = self.moments, self.belief.shape[1]
-        if length > 1:  # whole rounds, which get longer
-            real = moments != NO_VIEW
-            moments = torch.where(real, moments // length * steps + moments % length, NO_VIEW)
-        grown = more if length > 1 else 0
-        return replace(
-            self,
-            moments=pad(moments, [0, more], value=NO_VIEW),
-            belief=pad(self.belief, [0, 0, 0, grown]),
-            values=pad(self.values, [0, 0, 0, grown]),
-            acted=pad(self.acted, [0, grown]),
-        )
-
-    def kept(self, sights: Tensor) -> RoundViews:
-        """Only some sights, and the views and moments that they have."""
-        if self.chain is not None:
-            chain, views = self.chain.kept(sights)
-            return replace(replace(self, chain=None).kept(views), chain=chain)
-        if self.sights is not None:
-            views, place = torch.unique(self.sights[sights], return_inverse=True)
-            rounds = None if self.rounds is None else self.rounds[sights]
-            alone = replace(self, sights=None, rounds=None)
-            return replace(alone.kept(views), sights=place, rounds=rounds)
-        moments = self.moments[sights]
-        real = moments != NO_VIEW
-        length = self.belief.shape[1]
-        used, place = torch.unique(moments[real] // length, return_inverse=True)
-        moments = moments.clone()
-        moments[real] = place * length + moments[real] % length
-        if not len(used):  # of padding alone; act() is asked about something all the same
-            used = used.new_zeros(1)
-        return RoundViews(moments, self.belief[used], self.values[used], self.acted[used])
 
 
 class Sightings:
@@ -226,7 +160,7 @@ class Sightings:
             candidates |= {name: value.repeat(number) for name, value in attended.values.items()}
             number = number * each
         view = self.human.perceive(candidates, observation, told)
-        part, which = _views(self.human, view, observation, actions, real, number)
+        part, which = round_views(self.human, view, observation, actions, real, number)
         if self.screening is not None and self.screening.resolution > 0:
             part, place = self._merged(part, self.screening)
             which = place[which]
@@ -438,31 +372,6 @@ class Sightings:
             pyro.plate("person", 1, dim=-2),
         ):
             yield number
-
-
-def _views(
-    human: HumanModel,
-    view: View,
-    observation: Observation,
-    actions: Tensor,
-    real: Tensor,
-    combinations: int,
-) -> tuple[RoundViews, Tensor]:
-    """Distinct views of one round, and which of them each combination has."""
-    view = view.map(lambda part: part.expand(combinations, *part.shape[1:]))
-    numbers = view.numbers() * real
-    first, inverse = distinct_rows(numbers)
-    some = view.map(lambda part: part[first])
-    belief, values, node = beliefs_and_values(human, some, numbers[first], observation, actions)
-    acted = actions.expand(node.shape)
-    if human.stepwise:
-        at = acted.new_zeros(len(belief)).scatter(0, node.flatten(), acted.flatten())
-        part = RoundViews(node, belief[:, None], values[:, None], at[:, None])
-    else:
-        moments = torch.arange(node.numel(), device=node.device).view(node.shape)
-        part = RoundViews(moments, belief[node], values[node], acted)
-    moments = torch.where(real, part.moments, NO_VIEW)
-    return replace(part, moments=moments), inverse
 
 
 def _number_of(values: Mapping[str, Tensor]) -> int:

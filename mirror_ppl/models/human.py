@@ -23,8 +23,7 @@ lapses. Reasons and measurements stand in ``docs/decisions.md``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -34,12 +33,12 @@ from pyro import poutine
 from torch import Tensor, nn
 
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.distinct import as_whole_numbers, random_keys
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.chain import Span
 from mirror_ppl.models.networks import Gaussian, log_softmax_of_few
 from mirror_ppl.models.self_model import Rounds, SelfModel
+from mirror_ppl.models.view import View
 from mirror_ppl.models.view_table import RecordedActions, ViewTable
 
 Implants = Mapping[str, Tensor]
@@ -47,78 +46,6 @@ SPARE = 6
 """Dimensions that draws and enumeration may take to the left of people and rounds."""
 SPARED = 3
 """Dimensions of people, rounds and values of their attention."""
-
-
-@dataclass(frozen=True)
-class View:
-    """What enters a person's belief: masks ``[..., K]`` for each modality, and what they imagine.
-
-    Attributes:
-        visible: seen, told or remembered.
-        taken: neither, but taken for granted; empty if nothing is.
-        imagined: the observation ``[..., K, F]`` in which the taken items are as they take them.
-        still: where nothing came up since the step before ``[...]``, so that the belief stays as
-            it is; ``None`` if something always does.
-    """
-
-    visible: Visibility
-    taken: Visibility = field(default_factory=dict)
-    imagined: Observation = field(default_factory=dict)
-    still: Tensor | None = None
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> View:
-        """A view of each mask and each imagined item changed alike, along leading dimensions."""
-        return View(
-            {name: function(mask) for name, mask in self.visible.items()},
-            {name: function(mask) for name, mask in self.taken.items()},
-            {name: function(value) for name, value in self.imagined.items()},
-            None if self.still is None else function(self.still),
-        )
-
-    @classmethod
-    def stack(cls, steps: Sequence[View]) -> View:
-        """A view of a round ``[..., T, K]`` of those of its steps."""
-
-        def stacked(parts: Sequence[dict[str, Tensor]], behind: int) -> dict[str, Tensor]:
-            return {
-                name: torch.stack(
-                    torch.broadcast_tensors(*(part[name] for part in parts)),
-                    -2 if name == "ego" else -1 - behind,
-                )
-                for name in parts[0]
-            }
-
-        still = [step.still for step in steps if step.still is not None]
-        return cls(
-            stacked([step.visible for step in steps], 1),
-            stacked([step.taken for step in steps], 1),
-            stacked([step.imagined for step in steps], 2),
-            torch.stack(torch.broadcast_tensors(*still), -1) if still else None,
-        )
-
-    def numbers(self) -> Tensor:
-        """Everything that counts as one whole number ``[...]``, equal where views are equal."""
-        masks = {**self.visible, **{f"{name}, taken": mask for name, mask in self.taken.items()}}
-        if self.still is not None:
-            masks["still"] = self.still[..., None]
-        sizes = [mask.shape[-1] for mask in masks.values()]
-        sizes += [self.imagined[name].shape[-2:].numel() for name in self.taken]
-        device = next(iter(masks.values())).device
-        (*keys,) = random_keys(sum(sizes), device, kind=1).split(sizes)
-        total = torch.zeros((), dtype=torch.long, device=device)
-        for mask in masks.values():
-            # Sums of few keys of 48 bits are exact in 64-bit floats, which multiply faster.
-            total = total + (mask.double() @ (keys.pop(0) >> 14).double()).long()
-        for name, mask in self.taken.items():
-            imagined = self.imagined[name]
-            key = keys.pop(0).view(imagined.shape[-2:])
-            # Few items are taken for granted, and only those count.
-            place = mask.nonzero(as_tuple=True)
-            value = as_whole_numbers(imagined.expand(*mask.shape, -1)[place])
-            value = (value * key[place[-1]]).sum(-1)
-            each = torch.zeros(mask.shape[:-1], dtype=torch.long, device=device)
-            total = total + each.index_put(place[:-1], value, accumulate=True)
-        return total
 
 
 class HumanModel(nn.Module):

@@ -7,9 +7,10 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
-from mirror_ppl.models.human import HumanModel, Implants, View
+from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.variants import NoImplants
+from mirror_ppl.models.view import View
 
 
 class PerceptualSearcher(Searcher):

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Observation, Visibility
-from mirror_ppl.models.human import HumanModel, Implants, View
+from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.models.view import View
 
 RATES = {"in_sight": (2.0, 2.0), "otherwise": (1.0, 4.0)}
 """Priors of the rates of the second action, by site."""
