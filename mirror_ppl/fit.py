@@ -6,15 +6,12 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Any
 
 from mirror_ppl.console import Stages, run, usable_device
 from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.fit"
 DOMAIN = "driving"
-FEW = 20
-"""Effective draws below which a pooled posterior is coarse."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
@@ -97,6 +94,7 @@ def main(options: Options) -> None:
     began = monotonic()
     demonstrations = _recordings(options)
     from mirror_ppl.domains import get_domain
+    from mirror_ppl.evaluation.fit_report import show_fit
     from mirror_ppl.files import prepare_output_folder, write_whole
     from mirror_ppl.inference.export import add_identifiability, save_inference_data
     from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
@@ -172,7 +170,7 @@ def main(options: Options) -> None:
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
     for file in folder.glob("fit.checkpoint*"):
         file.unlink()
-    _show(summary, get_domain(demonstrations.domain).reach_unit)
+    show_fit(summary, get_domain(demonstrations.domain).reach_unit)
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
     for name, (_, shows) in pictures.items():
@@ -199,99 +197,6 @@ def _recordings(options: Options):
     require_known(options.population, "population", PEOPLE[domain].populations)
     name = f"{domain}_{setting}_{options.population}.nc"
     return load_demonstrations(asset_path(name))
-
-
-def _show(summary: dict[str, Any], unit: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from mirror_ppl.inference.ranks import HIGH_PARETO_K
-
-    people = summary["people"]
-    table = Table(
-        title=f"What each person sees ({unit}) and how they decide: {summary['domain']}, "
-        f"{summary['setting']}",
-        caption="median [90% interval] truth; NLL in nats an action, floor: their own entropy",
-        title_justify="left",
-        caption_justify="left",
-    )
-    table.add_column("person")
-    names = list(people[0]["implants"])
-    for name in names:
-        table.add_column(name.replace("sight_", "").replace("_", " "), justify="right")
-    for name in ("NLL", "floor", "accuracy"):
-        table.add_column(name, justify="right")
-    for person in people:
-        cells = [_cell(person["implants"][name]) for name in names]
-        test = person["test"] or {}
-        scores = [_number(test.get(name), 3) for name in ("nll", "floor", "accuracy")]
-        table.add_row(f"{person['id']}", *cells, *scores)
-    if "newcomer" in summary:
-        table.add_section()
-        cells = [_cell(summary["newcomer"][name] | {"truth": None}) for name in names]
-        table.add_row("newcomer", *cells, "-", "-", "-")
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=40 + 18 * len(names))
-    console.print(table)
-    doubtful = [
-        person["id"] for person in people if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
-    ]
-    if doubtful:
-        print(
-            f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
-            f"{HIGH_PARETO_K}): another --guide may do better"
-        )
-    few = [person["id"] for person in people if person.get("effective_draws", FEW) < FEW]
-    if few:
-        print(
-            f"In the population, fewer than {FEW} draws count of {', '.join(few)}: it is at odds "
-            "with what they did, or far from the prior; their posterior is coarse"
-        )
-    _show_open([person["identifiability"] for person in people if "identifiability" in person])
-    tested = [person["test"] for person in people if person["test"]]
-    if not tested:
-        print("No rounds were held out, so that predictions are not judged (--train-rounds)")
-    else:
-        nll = sum(test["nll"] for test in tested) / len(tested)
-        line = f"Held-out actions: {nll:.3f} nats an action on average"
-        floors = [test["floor"] for test in tested if test["floor"] is not None]
-        if floors:
-            line += f", {nll - sum(floors) / len(floors):.3f} above the people's own entropy"
-        print(line)
-
-
-def _show_open(people: list[dict[str, Any]]) -> None:
-    """What is open about sight, and which rounds would tell most."""
-    if not people:
-        return
-    entropy, hanging = (
-        sum(person[part]["together"] for person in people) / len(people)
-        for part in ("open", "hangs_on_policy")
-    )
-    line = f"Open about what they see: {entropy:.2f} nats on average, "
-    line += f"of which {hanging:.2f} hang on how they decide"
-    expected = {
-        name: sum(person["scenarios"][name]["expected"] for person in people) / len(people)
-        for name in people[0]["scenarios"]
-    }
-    if expected:
-        best = max(expected, key=lambda name: expected[name])
-        line += f'; a round more of "{best}" would tell most, {expected[best]:.2f}'
-    print(line)
-
-
-def _cell(implant: dict[str, Any]) -> str:
-    if "most_probable" in implant:
-        return f"{implant['most_probable']} ({implant['probability']:.2f})"
-    text = f"{_number(implant['median'])} [{_number(implant['q05'])}, {_number(implant['q95'])}]"
-    return text if implant["truth"] is None else f"{text} {_number(implant['truth'])}"
-
-
-def _number(value: float | None, digits: int = 2) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.0f}" if float(value).is_integer() else f"{value:.{digits}f}"
 
 
 if __name__ == "__main__":

@@ -1,0 +1,139 @@
+"""What `python -m mirror_ppl.fit` prints of people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from mirror_ppl.inference.ranks import HIGH_PARETO_K
+
+FEW = 20
+"""Effective draws below which a pooled posterior is coarse."""
+WIDTH = 184
+"""Characters, where nobody says how many there are."""
+BORDER = 3
+"""Characters between columns."""
+
+
+def show_fit(summary: dict[str, Any], unit: str) -> None:
+    """Print what was found.
+
+    Args:
+        summary: as it is in `summary.json`.
+        unit: of what people see.
+    """
+    _show_people(
+        summary,
+        f"What each person sees ({unit}) and how they decide: {summary['domain']}, "
+        f"{summary['setting']}",
+        "median [90% interval] truth; NLL in nats an action, floor: their own entropy",
+    )
+    people = summary["people"]
+    doubtful = [
+        person["id"] for person in people if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
+    ]
+    if doubtful:
+        print(
+            f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
+            f"{HIGH_PARETO_K}): another --guide may do better"
+        )
+    few = [person["id"] for person in people if person.get("effective_draws", FEW) < FEW]
+    if few:
+        print(
+            f"In the population, fewer than {FEW} draws count of {', '.join(few)}: it is at odds "
+            "with what they did, or far from the prior; their posterior is coarse"
+        )
+    _show_open([person["identifiability"] for person in people if "identifiability" in person])
+    tested = [person["test"] for person in people if person["test"]]
+    if not tested:
+        print("No rounds were held out, so that predictions are not judged (--train-rounds)")
+    else:
+        nll = sum(test["nll"] for test in tested) / len(tested)
+        line = f"Held-out actions: {nll:.3f} nats an action on average"
+        floors = [test["floor"] for test in tested if test["floor"] is not None]
+        if floors:
+            line += f", {nll - sum(floors) / len(floors):.3f} above the people's own entropy"
+        print(line)
+
+
+def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
+    """One table, or several below each other if it would be too wide."""
+    people, newcomer = summary["people"], summary.get("newcomer")
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
+    columns = []
+    for name in people[0]["implants"]:
+        cells = [_cell(person["implants"][name]) for person in people]
+        if newcomer is not None:
+            cells.append(_cell(newcomer[name] | {"truth": None}))
+        columns.append([name.replace("sight_", "").replace("_", " "), *cells])
+    for name in ("NLL", "floor", "accuracy"):
+        cells = [_number((person["test"] or {}).get(name.lower(), None), 3) for person in people]
+        columns.append([name, *cells, *(["-"] if newcomer is not None else [])])
+    who = ["person", *(person["id"] for person in people)]
+    if newcomer is not None:
+        who.append("newcomer")
+    # Not by tables, which would make them as narrow as they are.
+    console.print(title, style="italic", highlight=False)
+    for block in _side_by_side(who, columns, console.width):
+        table = Table()
+        for number, column in enumerate([who, *block]):
+            table.add_column(column[0], justify="right" if number else "left")
+        for number, row in enumerate(zip(who, *block, strict=True)):
+            if number:
+                table.add_row(*row, end_section=number == len(people))
+        console.print(table)
+    console.print(f"({caption})", style="dim", markup=False, highlight=False)
+
+
+def _side_by_side(
+    who: Sequence[str], columns: Sequence[Sequence[str]], width: int
+) -> list[list[Sequence[str]]]:
+    """Columns in as few blocks as fit, each beside the names."""
+    blocks: list[list[Sequence[str]]] = []
+    left = 0
+    for column in columns:
+        needed = max(map(len, column)) + BORDER
+        if not blocks or left < needed:
+            blocks.append([])
+            left = width - max(map(len, who)) - BORDER - 1
+        blocks[-1].append(column)
+        left -= needed
+    return blocks
+
+
+def _show_open(people: list[dict[str, Any]]) -> None:
+    """What is open about sight, and which rounds would tell most."""
+    if not people:
+        return
+    entropy, hanging = (
+        sum(person[part]["together"] for person in people) / len(people)
+        for part in ("open", "hangs_on_policy")
+    )
+    line = f"Open about what they see: {entropy:.2f} nats on average, "
+    line += f"of which {hanging:.2f} hang on how they decide"
+    expected = {
+        name: sum(person["scenarios"][name]["expected"] for person in people) / len(people)
+        for name in people[0]["scenarios"]
+    }
+    if expected:
+        best = max(expected, key=lambda name: expected[name])
+        line += f'; a round more of "{best}" would tell most, {expected[best]:.2f}'
+    print(line)
+
+
+def _cell(implant: dict[str, Any]) -> str:
+    if "most_probable" in implant:
+        return f"{implant['most_probable']} ({implant['probability']:.2f})"
+    text = f"{_number(implant['median'])} [{_number(implant['q05'])}, {_number(implant['q95'])}]"
+    return text if implant["truth"] is None else f"{text} {_number(implant['truth'])}"
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.{digits}f}"

@@ -1,0 +1,53 @@
+"""What a fit prints: one table where it fits, several below each other where it does not."""
+
+from __future__ import annotations
+
+import pytest
+
+from mirror_ppl.evaluation import fit_report
+from mirror_ppl.evaluation.fit_report import show_fit
+
+SITES = ("sight_radius", "consistency", "rule_type_a")
+
+
+def person(number):
+    implants = {
+        name: {"median": place + 0.5, "q05": 0.0, "q95": 3.0, "truth": None}
+        for place, name in enumerate(SITES[:2])
+    }
+    implants["rule_type_a"] = {"most_probable": "left first", "probability": 0.75}
+    test = {"nll": 0.25, "floor": 0.125, "accuracy": 0.5} if number == 1 else None
+    return {"id": f"person-0{number}", "implants": implants, "test": test}
+
+
+def shown(capsys, **changes):
+    summary = {"domain": "driving", "setting": "fog", "people": [person(1), person(2)]}
+    show_fit(summary | changes, "cells")
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("width", "tables"), [(184, 1), (60, 2), (35, 5)])
+def test_columns_stand_below_each_other_where_there_is_no_room(width, tables, capsys, monkeypatch):
+    monkeypatch.setattr(fit_report, "WIDTH", width)
+    out = shown(capsys)
+    assert out.count("person-01") == out.count("┏") == tables
+    for text in ("radius", "0.50 [0, 3]", "1.50 [0, 3]", "left first (0.75)", "0.125"):
+        assert text in out
+    assert out.count("consistency") == 1
+    assert all(len(line) <= width for line in out.splitlines() if "│" in line)
+
+
+def test_a_newcomer_stands_below_people(capsys):
+    implants = person(1)["implants"]
+    implants["consistency"] = {"median": 9.5, "q05": 9.0, "q95": 10.0}
+    implants["sight_radius"] = {"median": 2.0, "q05": 1.0, "q95": 3.0}
+    out = shown(capsys, newcomer=implants)
+    (line,) = (line for line in out.splitlines() if "newcomer" in line)
+    assert "9.50 [9, 10]" in line
+    assert "newcomer" not in shown(capsys)
+
+
+def test_what_was_not_held_out_is_not_judged(capsys):
+    summary = {"people": [person(2)]}
+    assert "No rounds were held out" in shown(capsys, **summary)
+    assert "0.250 nats an action on average, 0.125 above" in shown(capsys)
