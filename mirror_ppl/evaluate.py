@@ -47,8 +47,8 @@ class Options:
     models: tuple[str, ...] = ()
     """What is compared; by default everything that fits the study: mirror, mirror-amortized,
     mirror-svi, mirror-population, perceptual-only, policy-only, no-implants, bc,
-    bc-everything, sqil, sqil-everything, logistic, or of assistance and relevance mirror (which
-    also plans as mirror-kl), bc, sqil, none, all, oracle."""
+    bc-everything, sqil, sqil-everything, logistic (and mirror-nuts, if asked for), or of
+    assistance and relevance mirror (which also plans as mirror-kl), bc, sqil, none, all, oracle."""
     rounds: tuple[int, ...] = (1, 2, 5, 10, 20)
     """Numbers of rounds that are learned from, from 1 to 20; the most only, for relevance."""
     played: int = 5

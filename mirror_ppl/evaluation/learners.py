@@ -249,6 +249,7 @@ LEARNERS: dict[str, Learn] = {
     "mirror": _mirror(),
     "mirror-amortized": _mirror(guide="amortized"),
     "mirror-svi": _mirror(guide="svi"),
+    "mirror-nuts": _mirror(guide="nuts"),
     "mirror-population": _mirror(from_others=True),
     "perceptual-only": _mirror("perceptual-only"),
     "policy-only": _mirror("policy-only"),
@@ -260,9 +261,11 @@ LEARNERS: dict[str, Learn] = {
     "logistic": _logistic,
 }
 """Everything that can be compared, in the order in which it is shown. Guides are `exact` but for
-``mirror-amortized`` and ``mirror-svi``; ``mirror-population`` has a prior learned from others.
+those of other names; ``mirror-population`` has a prior learned from others.
 Rivals are told what the setting lets people see, which MIRROR has to find out, but for those that
 read ``everything``, as the human model is given it."""
+SLOW = ("mirror-nuts",)
+"""Of these what is compared on request only: a chain of each person takes minutes."""
 PLANNABLE = ("mirror", "bc", "sqil")
 """Of these what drives a communicator in the comparison of assistance."""
 

@@ -19,6 +19,7 @@ from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learners import (
     LEARNERS,
     PLANNABLE,
+    SLOW,
     TEST,
     Group,
     Plannable,
@@ -156,7 +157,7 @@ def prediction_cells(
 
     Args:
         group: the people.
-        models: learners; all that can learn there unless given.
+        models: learners; all that can learn there unless given, but for slow ones.
         rounds: numbers of rounds that are learned from.
 
     Raises:
@@ -167,7 +168,7 @@ def prediction_cells(
     if "mirror-amortized" in chosen and not guide:
         raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
     if not chosen:
-        left_out = () if guide else ("mirror-amortized",)
+        left_out = SLOW if guide else (*SLOW, "mirror-amortized")
         # Who reads everything is somebody else only where something is hidden.
         ends = (EVERYTHING,) if _shows_everything(group) else ()
         chosen = [name for name in LEARNERS if name not in left_out and not name.endswith(ends)]

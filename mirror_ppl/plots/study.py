@@ -16,6 +16,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
     "mirror": (BLUE, "-", "o"),
     "mirror-amortized": (SKY, "-", "s"),
     "mirror-svi": (SKY, "--", "D"),
+    "mirror-nuts": (SKY, ":", "p"),
     "mirror-population": (BLUE, "--", "P"),
     "mirror-kl": (SKY, "-", "s"),
     "perceptual-only": (PURPLE, "-", "v"),
