@@ -264,8 +264,9 @@ LEARNERS: dict[str, Learn] = {
 those of other names; ``mirror-population`` has a prior learned from others.
 Rivals are told what the setting lets people see, which MIRROR has to find out, but for those that
 read ``everything``, as the human model is given it."""
-SLOW = ("mirror-nuts",)
-"""Of these what is compared on request only: a chain of each person takes minutes."""
+SLOW = {"mirror-nuts": (), "mirror-svi": ("bomb_defusal",)}
+"""Of these what is compared on request only, in some domains or, if none is named, in all: a chain
+of each person takes minutes, and `svi` sums over all rules of a bomb at each of its steps."""
 PLANNABLE = ("mirror", "bc", "sqil")
 """Of these what drives a communicator in the comparison of assistance."""
 
