@@ -6,7 +6,7 @@ import pytest
 import torch
 from running import command
 
-from mirror_ppl import assist, fit
+from mirror_ppl import assist, fit, simulate
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.combinations import perceived_sites
@@ -107,8 +107,9 @@ def test_variants_are_special_cases(self_model, rounds):
 def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
     """Of the smallest, which has nothing discrete, of one that attends, and of one radius."""
     monkeypatch.chdir(tmp_path)
+    assert command(simulate, "--people", 3, "--rounds", 2, "--out", "people.nc") == 0
     for name in ("no-implants", "per-item", "one-radius"):
-        given = "--human-model", name
+        given = "--human-model", name, "--demos", "people.nc"
         status = command(
             fit, *given, "--guide", guide, "--train-rounds", 1, "--draws", 8, "--steps", 2,
             "--explore", 0, "--out", name,
@@ -121,6 +122,7 @@ def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
         status = command(
             assist, "--posterior", f"{name}/posterior.nc", "--human-model", name, "--rounds", 1,
             "--communicator", "none", "mirror", "--jobs", 1, "--draws", 8,
+            "--people", 1,
         )  # fmt: skip
         assert status == 0
 
