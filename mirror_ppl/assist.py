@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mirror_ppl.console import Progress, run
+from mirror_ppl.console import Progress, console_for_tables, run
 from mirror_ppl.errors import (
     HumanModelError,
     OptionError,
@@ -261,7 +261,6 @@ def _people(options: Options):
 
 def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, rounds: int) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
     from mirror_ppl.domains import get_domain
@@ -315,18 +314,21 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
             ),
             f"{entry['milliseconds']:.1f}",
         )
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=100)
+    console = console_for_tables(100)
     console.print(worth)
     console.print(said)
+    if rounds == 1:
+        print("Of one round of each person there are no errors and intervals; --rounds gives more")
 
 
-def _interval(value: dict[str, float] | None, scale: float, form: str, unit: str = "") -> str:
+def _interval(
+    value: dict[str, float | None] | None, scale: float, form: str, unit: str = ""
+) -> str:
     if value is None:
         return "-"
-    mean, low, high = (format(scale * value[name], form) for name in ("mean", "low", "high"))
-    return f"{mean}{unit} [{low}, {high}]"
+    known = (value[name] for name in ("mean", "low", "high"))
+    mean, *ends = (format(scale * number, form) for number in known if number is not None)
+    return f"{mean}{unit} [{', '.join(ends)}]" if ends else f"{mean}{unit}"
 
 
 if __name__ == "__main__":

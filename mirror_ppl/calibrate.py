@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mirror_ppl.console import Progress, run
+from mirror_ppl.console import Progress, console_for_tables, run
 from mirror_ppl.errors import OptionError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -151,7 +151,6 @@ def _infer(
 
 def _show(calibration: Calibration, guide: str) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(
@@ -179,10 +178,7 @@ def _show(calibration: Calibration, guide: str) -> None:
             f"{row['sharpness']:.2f}",
             "-" if weights != weights else f"{100 * weights:.0f}%",
         )
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDTH)
-    console.print(table)
+    console_for_tables(WIDTH).print(table)
     rate = calibration.failure_rate
     verdict = f"rejected for {len(rejected)}" if rejected else "not rejected for any"
     if calibration.people < FEW_PEOPLE:

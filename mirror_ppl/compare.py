@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from mirror_ppl.console import run
+from mirror_ppl.console import console_for_tables, run
 from mirror_ppl.errors import OptionError
 
 if TYPE_CHECKING:
@@ -93,7 +93,6 @@ def _outputs(options: Options) -> list[Path]:
 
 def _show(comparison: Comparison) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -132,10 +131,7 @@ def _show(comparison: Comparison) -> None:
             *([] if score.doubtful is None else [f"{score.doubtful} of {score.rounds}"]),
             f"{model.weight:.2f}",
         )
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDTH)
-    console.print(table)
+    console_for_tables(WIDTH).print(table)
 
 
 if __name__ == "__main__":

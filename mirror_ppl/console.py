@@ -100,6 +100,14 @@ def usable_device(name: str) -> str:
     return name
 
 
+def console_for_tables(width: int) -> "Console":
+    """A console as wide as the terminal, or as told where there is none."""
+    from rich.console import Console
+
+    console = Console()
+    return console if console.is_terminal else Console(width=width)
+
+
 class Progress:
     """Shows on stderr how far long work has come; a context manager.
 

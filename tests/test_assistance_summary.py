@@ -81,6 +81,18 @@ def test_the_way_to_the_oracle_goes_from_none_to_the_oracle():
         assert interval["low"] < interval["mean"] < interval["high"]
 
 
+def test_one_round_of_each_has_no_interval():
+    single = {
+        name: [rounds_of(part.task[:1], part.cost[:1]) for part in parts]
+        for name, parts in PLAYED.items()
+    }
+    entry = summarize_assistance(single, 5)["some"]
+    for name in ("over_none", "way_to_oracle"):
+        assert (entry[name]["low"], entry[name]["high"]) == (None, None)
+    difference = compare(single, "some", "none")
+    assert difference == {"mean": entry["over_none"]["mean"], "low": None, "high": None}
+
+
 def test_ways_are_left_out_where_there_is_nowhere_to_go():
     summary = summarize_assistance({name: PLAYED[name] for name in ("some", "none")}, 5)
     assert all("way_to_oracle" not in entry for entry in summary.values())

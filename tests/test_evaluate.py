@@ -77,6 +77,23 @@ def test_everybody_learns_everywhere(name, domain):
     assert mean_nll(found, test.actions).item() < math.log(len(actions))
 
 
+@pytest.mark.parametrize(
+    ("name", "guide"),
+    [("mirror", "exact"), ("mirror-amortized", "amortized")]
+    + [(f"mirror-{guide}", guide) for guide in ("svi", "nuts")],
+)
+def test_mirror_is_inferred_by_the_guide_of_its_name(name, guide, monkeypatch):
+    asked = []
+
+    def noted(human, rounds, options, *args, **others):
+        asked.append(options.guide)
+        return Inferred({})
+
+    monkeypatch.setattr("mirror_ppl.evaluation.learners.infer", noted)
+    learn(name, FOG, 1, 0)
+    assert asked == [guide]
+
+
 def test_a_population_is_learned_from_others(monkeypatch):
     """Of the same setting and number, and the same for all seeds; then it is everybody's prior."""
     asked = []

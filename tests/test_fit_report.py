@@ -47,6 +47,40 @@ def test_a_newcomer_stands_below_people(capsys):
     assert "newcomer" not in shown(capsys)
 
 
+def test_what_is_not_to_be_trusted_is_told(capsys):
+    doubtful = [person(1) | {"pareto_k": 0.8}, person(2) | {"pareto_k": 0.6}]
+    assert "not to be relied on for person-01 (Pareto k above 0.7)" in shown(
+        capsys, people=doubtful
+    )
+    few = [person(1) | {"effective_draws": 30}, person(2) | {"effective_draws": 19}]
+    assert "fewer than 20 draws count of person-02" in shown(capsys, people=few)
+    assert "relied on" not in shown(capsys)
+
+
+def test_what_is_open_is_told_and_which_rounds_would_tell(capsys):
+    def opened(entropy, expected):
+        return {
+            "open": {"together": entropy},
+            "hangs_on_policy": {"together": 0.5},
+            "scenarios": {"one car": {"expected": 0.1}, "two cars": {"expected": expected}},
+        }
+
+    people = [
+        person(1) | {"identifiability": opened(1.0, 0.0)},
+        person(2) | {"identifiability": opened(2.0, 0.4)},
+    ]
+    out = shown(capsys, people=people)
+    assert "Open about what they see: 1.50 nats on average, of which 0.50 hang on" in out
+    assert 'a round more of "two cars" would tell most, 0.20' in out
+
+
+def test_people_who_notice_things_have_no_reach(capsys):
+    some = person(1)
+    some["implants"] = {"notices_terminal 1": some["implants"]["consistency"]}
+    assert "What each person notices (probability at a step) and" in shown(capsys, people=[some])
+    assert "What each person sees (cells) and" in shown(capsys)
+
+
 def test_what_was_not_held_out_is_not_judged(capsys):
     summary = {"people": [person(2)]}
     assert "No rounds were held out" in shown(capsys, **summary)

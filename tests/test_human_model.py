@@ -575,6 +575,7 @@ def test_models_own_methods_are_called(tmp_path, human, recordings):
     [
         ("mine.py", r'"mine\.py" is not of the form path/to/file\.py:Class'),
         ("mine.py:My-Class", "is not of the form"),
+        ("miror", 'perhaps you meant "mirror"'),
         ("nowhere.py:Mine", r"nowhere\.py: there is no such file"),
         (".:Mine", "there is no such file"),
         ("mine.txt:Mine", "not a Python file"),

@@ -188,7 +188,10 @@ def test_a_damaged_file(path, damage):
 
 def test_a_netcdf_file_that_is_no_posterior():
     recordings = asset_path("driving_fog_paper.nc")
-    with pytest.raises(PosteriorError, match=r"driving_fog_paper.nc: cannot be read as a post"):
+    with pytest.raises(
+        PosteriorError,
+        match=r"driving_fog_paper.nc: cannot be read as a posterior \(it holds none; python",
+    ):
         load_posterior(recordings)
 
 

@@ -29,7 +29,8 @@ def summarize_assistance(
         a step; ``relevant``, the share of relevant items by notion, over all items and by modality
         (``None`` where none were communicated); ``milliseconds`` a decision; ``over_none`` and
         ``way_to_oracle``, each a mean with a 90% interval of the paired bootstrap over the rounds
-        of each person, where those communicators are among them.
+        of each person (``low`` and ``high`` are ``None`` if there is one round of each), where
+        those communicators are among them.
     """
     net = {name: np.stack([one.net for one in people]) for name, people in played.items()}
     people, rounds = next(iter(net.values())).shape
@@ -58,7 +59,7 @@ def summarize_assistance(
         }
         if "none" in net:
             entry["over_none"] = _interval(
-                float((net[name] - net["none"]).mean()), means[name] - means["none"]
+                float((net[name] - net["none"]).mean()), means[name] - means["none"], rounds
             )
         if "none" in net and "oracle" in net:
             way = net["oracle"].mean() - net["none"].mean()
@@ -67,6 +68,7 @@ def summarize_assistance(
                 entry["way_to_oracle"] = _interval(
                     float((net[name].mean() - net["none"].mean()) / way),
                     (means[name] - means["none"]) / ways,
+                    rounds,
                 )
         summary[name] = entry
     return summary
@@ -74,20 +76,22 @@ def summarize_assistance(
 
 def compare(
     played: Mapping[str, Sequence[Played]], one: str, other: str, seed: int = 0
-) -> dict[str, float]:
+) -> dict[str, float | None]:
     """By how much one communicator's net return is above another's, with its interval."""
     difference = np.stack([a.net - b.net for a, b in zip(played[one], played[other], strict=True)])
     people, rounds = difference.shape
     drawn = np.random.default_rng(seed).integers(rounds, size=(RESAMPLES, people, rounds))
     means = np.take_along_axis(difference[None], drawn, 2).mean((1, 2))
-    return _interval(float(difference.mean()), means)
+    return _interval(float(difference.mean()), means, rounds)
 
 
 def _mean(parts: Sequence[Played], name: str) -> float:
     return float(np.mean([getattr(part, name) for part in parts]))
 
 
-def _interval(mean: float, resampled: np.ndarray) -> dict[str, float]:
+def _interval(mean: float, resampled: np.ndarray, rounds: int) -> dict[str, float | None]:
+    if rounds == 1:  # which cannot be drawn in two ways
+        return {"mean": mean, "low": None, "high": None}
     low, high = np.quantile(resampled, LEVELS)
     return {"mean": mean, "low": float(low), "high": float(high)}
 

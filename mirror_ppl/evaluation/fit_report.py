@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
+from mirror_ppl.console import console_for_tables
 from mirror_ppl.inference.ranks import HIGH_PARETO_K
+from mirror_ppl.models.implants import NOTICES
 
 FEW = 20
 """Effective draws below which a pooled posterior is coarse."""
@@ -25,11 +26,14 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         summary: as it is in `summary.json`.
         unit: of what people see.
     """
+    sites = summary["people"][0]["implants"]
+    what = f"sees ({unit})"
+    if any(name.startswith(NOTICES) for name in sites):
+        what = "notices (probability at a step)"
     _show_people(
         summary,
-        f"What each person sees ({unit}) and how they decide: {summary['domain']}, "
-        f"{summary['setting']}",
-        "median [90% interval] truth; NLL in nats an action, floor: their own entropy",
+        f"What each person {what} and how they decide: {summary['domain']}, {summary['setting']}",
+        "median [90% interval] truth, if known; NLL in nats an action, floor: their own entropy",
     )
     people = summary["people"]
     doubtful = [
@@ -62,9 +66,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
 def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
     """One table, or several below each other if it would be too wide."""
     people, newcomer = summary["people"], summary.get("newcomer")
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=WIDTH)
+    console = console_for_tables(WIDTH)
     columns = []
     for name in people[0]["implants"]:
         cells = [_cell(person["implants"][name]) for person in people]
@@ -78,7 +80,7 @@ def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
     if newcomer is not None:
         who.append("newcomer")
     # Not by tables, which would make them as narrow as they are.
-    console.print(title, style="italic", highlight=False)
+    console.print(title, style="italic", markup=False, highlight=False)
     for block in _side_by_side(who, columns, console.width):
         table = Table()
         for number, column in enumerate([who, *block]):

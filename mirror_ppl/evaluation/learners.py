@@ -27,7 +27,7 @@ from mirror_ppl.baselines import (
 from mirror_ppl.baselines.inputs import Sight
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains import get_domain
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, listeners
@@ -264,9 +264,9 @@ LEARNERS: dict[str, Learn] = {
 those of other names; ``mirror-population`` has a prior learned from others.
 Rivals are told what the setting lets people see, which MIRROR has to find out, but for those that
 read ``everything``, as the human model is given it."""
-SLOW = {"mirror-nuts": (), "mirror-svi": ("bomb_defusal",)}
-"""Of these what is compared on request only, in some domains or, if none is named, in all: a chain
-of each person takes minutes, and `svi` sums over all rules of a bomb at each of its steps."""
+SLOW = {"mirror-nuts": DOMAINS, "mirror-svi": ("bomb_defusal",)}
+"""Of these what is compared on request only, and where: a chain of each person takes minutes, and
+`svi` sums over all rules of a bomb at each of its steps."""
 PLANNABLE = ("mirror", "bc", "sqil")
 """Of these what drives a communicator in the comparison of assistance."""
 

@@ -168,7 +168,7 @@ def prediction_cells(
     if "mirror-amortized" in chosen and not guide:
         raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
     if not chosen:
-        left_out = {name for name, where in SLOW.items() if not where or group.domain in where}
+        left_out = {name for name, where in SLOW.items() if group.domain in where}
         if not guide:
             left_out.add("mirror-amortized")
         # Who reads everything is somebody else only where something is hidden.

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mirror_ppl.console import console_for_tables
 from mirror_ppl.evaluation.sweep import Rows
 
 WIDTH = 110
@@ -40,13 +40,11 @@ class TextTable:
             table.add_column(head, justify="right" if place else "left")
         for row in self.rows:
             table.add_row(*map(Text, row))
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=WIDTH)
+        console = console_for_tables(WIDTH)
         # Not by the table, which would make them as narrow as it is.
-        console.print(self.title, style="italic", highlight=False)
+        console.print(self.title, style="italic", markup=False, highlight=False)
         console.print(table, end="")
-        console.print(f"({self.caption})\n", style="dim", highlight=False)
+        console.print(f"({self.caption})\n", style="dim", markup=False, highlight=False)
 
     @property
     def markdown(self) -> str:
@@ -54,7 +52,10 @@ class TextTable:
         lines = [
             self.heads,
             ("---", *("---:" for _ in self.heads[1:])),
-            *(tuple(entry.replace("\n", "<br>") for entry in row) for row in self.rows),
+            *(
+                tuple(entry.replace("|", "\\|").replace("\n", "<br>") for entry in row)
+                for row in self.rows
+            ),
         ]
         table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
         return f"**{self.title}**\n\n{table}\n\n{self.caption[:1].upper()}{self.caption[1:]}.\n"

@@ -115,6 +115,11 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
         raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
     try:
         data = az.from_netcdf(str(path))
+        if "posterior" not in data.groups():
+            raise PosteriorError(
+                f"{path}: cannot be read as a posterior (it holds none; "
+                "python -m mirror_ppl.fit makes one of recordings)"
+            )
         group = data["posterior"]
         attributes = {str(name): str(value) for name, value in group.attrs.items()}
         people = tuple(map(str, group["person"].values))
@@ -122,6 +127,8 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
             str(name): value.transpose("chain", "draw", "person", ...).values
             for name, value in group.data_vars.items()
         }
+    except PosteriorError:
+        raise
     except Exception as error:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     own = attributes.get("domain", "unknown")

@@ -6,6 +6,7 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 import pyro
@@ -51,9 +52,10 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
         return OWN.get(self_model.domain.name, {}).get(name, VARIANTS[name])(self_model)
     path_text, colon, name = specification.rpartition(":")
     if not colon or not name.isidentifier():
+        close = get_close_matches(specification.lower(), VARIANTS, n=1)
         raise HumanModelError(
             f'"{specification}" is not of the form path/to/file.py:Class, and none of '
-            f"{', '.join(VARIANTS)}"
+            f"{', '.join(VARIANTS)}" + "".join(f'; perhaps you meant "{name}"' for name in close)
         )
     path = Path(path_text)
     if not path.is_file():
