@@ -118,9 +118,12 @@ def test_processes_beside_each_other_find_the_same(tmp_path):
 
 
 def test_a_cluster_that_is_not_there_is_told(tmp_path):
+    from dask.base import get_scheduler
+
     with pytest.raises(OptionError) as error:
         run_cells(CELLS, square, tmp_path, same, scheduler="not an address")
     assert str(error.value).startswith("--scheduler not an address cannot be reached: ")
+    assert get_scheduler() is None  # or whatever is written next asks that cluster for its lock
 
 
 CLUSTER = """

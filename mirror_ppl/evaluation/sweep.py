@@ -159,12 +159,20 @@ def _cluster(address: str) -> ExitStack:
 
     try:
         from distributed import Client
+        from distributed.comm import connect
+        from distributed.utils import LoopRunner
     except ImportError as error:
         raise OptionError(
             "--scheduler needs Dask: pip install 'mirror_ppl[cluster]', here and on the workers"
         ) from error
+
+    async def reach() -> None:
+        await (await connect(address, timeout=10)).close()
+
     with ExitStack() as stack:
         try:
+            # A client that cannot connect would stay behind as what xarray asks for its locks.
+            LoopRunner().run_sync(reach)
             client = stack.enter_context(Client(address, timeout="10s"))
         except (OSError, ValueError) as error:
             raise OptionError(f"--scheduler {address} cannot be reached: {error}") from error
