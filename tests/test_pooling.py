@@ -8,8 +8,16 @@ from torch.distributions import Beta, Normal
 
 from mirror_ppl.inference.calibration import prior_people
 from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.pooling import Pooling, Population
+from mirror_ppl.inference.pooling import (
+    CONCENTRATION_WIDTH,
+    SPREAD,
+    SPREAD_WIDTH,
+    Pooling,
+    Population,
+)
+from mirror_ppl.inference.population_sampler import ContinuousSites, DiscreteSite, HyperPriors
 from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.toy import RATES, ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -78,6 +86,62 @@ def test_the_program_weighs_people_by_the_mean_of_ratios(pooling, draws):
     trace.compute_log_prob()
     expected = (density - log_prior).exp().mean(-1).log()
     torch.testing.assert_close(trace.nodes["rounds"]["log_prob"], expected)
+
+
+def test_the_sampler_s_densities_are_those_of_the_program(pooling, draws):
+    """By Bayes' rule, whatever the population: its joint density is what is drawn, site by site."""
+    one = {name: value[:1] for name, value in draws.items()}  # it is known what people are like
+    known, place, log_prior = pooling.read(one)
+    values = torch.stack([place[name][:, 0] for name in RATES], -1)
+    values = ((values - pooling.centre) / pooling.width).double()
+    priors = HyperPriors(pooling.prior_chances, CONCENTRATION_WIDTH, SPREAD, SPREAD_WIDTH)
+    continuous = ContinuousSites(3, priors, values)
+    discrete = DiscreteSite(3, pooling.prior_chances["reach"].double(), CONCENTRATION_WIDTH)
+    count = known["reach"][:, 0].sum(0).double()
+    generator, offsets = torch.Generator().manual_seed(0), []
+    for _ in range(20):
+        cells = torch.randint(200, 440, (3,), generator=generator).tolist()
+        logs = continuous.grid[cells[:2]]
+        mean = torch.randn(2, generator=generator).double()
+        chances = torch.rand(7, generator=generator).double() + 0.05
+        chances = chances / chances.sum()
+        concentration = discrete.grid[cells[2]].exp()
+        population = {"reach_concentration": concentration, "reach_chances": chances}
+        for column, name in enumerate(RATES):
+            centre, width = pooling.centre[column], pooling.width[column]
+            population[f"{name}_mean"] = centre + width * mean[column]
+            population[f"{name}_spread"] = width * logs[column].exp()
+        population = {name: value.float() for name, value in population.items()}
+        conditioned = pyro.condition(pooling.program, data=population)
+        trace = pyro.poutine.trace(conditioned).get_trace(known, place, log_prior)
+        joint = float(trace.log_prob_sum())
+        own = continuous.log_densities(values)[[0, 1], cells[:2]] - logs  # of spreads, not logs
+        own = own + continuous.mean(values, logs.exp()).log_prob(mean)
+        other = discrete.log_densities(count)[cells[2]] - concentration.log()
+        other = other + discrete.chances(count, concentration).log_prob(chances)
+        offsets.append(joint - float(own.sum() + other))
+    assert max(offsets) - min(offsets) < 2e-3 * max(map(abs, offsets))
+
+
+def test_sites_that_hang_on_others_keep_their_prior():
+    """How soon each terminal is noticed follows how quick somebody is, in a population, too."""
+    human = load_human_model(None, load_self_model(shipped_weights("bomb_defusal"))[0])
+    pooling = Pooling(human)
+    assert list(pooling.sites) == ["quickness", "evenness", "consistency", "lapse"]
+    # Which rules hold is known of the world, and better by the day; it is not about people.
+    assert list(pooling.supports) == ["reads_type"]
+    number = 2000
+    mean = {
+        name: place.expand(1) for name, place in zip(pooling.sites, pooling.centre, strict=True)
+    }
+    spread = {name: torch.full((1,), 0.01) for name in pooling.sites}
+    mean["quickness"] = torch.tensor([0.05]).logit()
+    chances = {name: prior[None] for name, prior in pooling.prior_chances.items()}
+    new = pooling.newcomers(Population(chances, mean, spread).spaced(number), 1, 0)
+    quickness, notices = new["quickness"], new["notices_terminal 3"]
+    assert quickness.mean() == pytest.approx(0.05, abs=0.002)
+    # Beta with this mean, and a concentration of about 100 or more.
+    assert notices.mean() == pytest.approx(0.05, abs=4.5 * 0.03 / number**0.5)
 
 
 def test_people_are_drawn_by_their_weights(pooling, draws):

@@ -1,5 +1,8 @@
 """How images and speech are read: convolutions, codes, and what masks hide."""
 
+import sys
+import types
+
 import pytest
 import torch
 from torch import nn
@@ -192,9 +195,46 @@ def test_the_autoencoder_brings_back_what_it_was_given():
 
 
 def test_gpt2_says_what_it_needs(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "transformers", None)
+    monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(AssetError, match="needs the package transformers and the weights"):
         speech.gpt2(["victim in top-right"])
+
+
+def test_gpt2_is_the_mean_of_its_last_states(monkeypatch):
+    """Where the package and the weights are there: a stand-in with a state for each word."""
+
+    def tokenizer(sentence, return_tensors):
+        assert return_tensors == "pt"
+        return {"words": torch.tensor([[float(len(word)) for word in sentence.split()]])}
+
+    class Network(torch.nn.Module):
+        def forward(self, words):
+            assert not self.training
+            states = torch.stack([words, words**2], -1)
+            return types.SimpleNamespace(last_hidden_state=states)
+
+    def stored(found):
+        def load(name, local_files_only):
+            assert (name, local_files_only) == ("gpt2", True)
+            return found
+
+        return types.SimpleNamespace(from_pretrained=load)
+
+    package = types.SimpleNamespace(
+        AutoTokenizer=stored(tokenizer), AutoModel=stored(Network().train())
+    )
+    monkeypatch.setitem(sys.modules, "transformers", package)
+    found = speech.gpt2(["to be", "victim"])
+    assert torch.equal(found, torch.tensor([[2.0, 4.0], [6.0, 36.0]]))
+    assert not found.requires_grad
+    codes = speech.utterance_codes(VERBAL, 2, speech.gpt2)
+    assert codes.shape == (len(VERBAL.items), len(VERBAL.utterances[0]), 2)
+    assert codes.abs().max() <= 1
+
+
+def test_an_utterance_is_a_string():
+    with pytest.raises(TypeError, match="an utterance is a string, not 3"):
+        VERBAL.understand(3)
 
 
 @pytest.mark.parametrize(

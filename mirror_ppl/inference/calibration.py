@@ -130,7 +130,7 @@ def calibrate(
         UnknownNameError: there is no such setting.
         ValueError: ``infer`` or a summary returned something else than it should.
     """
-    require_known(setting, "setting", human.domain.settings)
+    require_known(setting, "setting", human.domain.settings, human.domain.name)
     trial = _Trial(human, options, setting, seed)
     begins = range(0, options.people, options.batch)
     report("calibrate", 0, options.people, "people")

@@ -15,6 +15,7 @@ from mirror_ppl.errors import AssetError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, reference_places
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import fingerprint, read_tensors
 
@@ -74,9 +75,12 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
         ("human_model", type(human).__name__),
         ("self_model", fingerprint(human.self_model)),
     ):
-        if metadata.get(name) != own:
+        found = metadata.get(name)
+        if found != own:
+            if name == "human_model":
+                found, own = model_name(str(found)), model_name(own)
             raise AssetError(
-                f"{path}: is for {name.replace('_', ' ')} {metadata.get(name)}, not {own}; "
+                f"{path}: is for {name.replace('_', ' ')} {found}, not {own}; "
                 "train a guide for it, or use --guide exact"
             )
     try:
@@ -104,8 +108,9 @@ def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGu
         try:
             path = shipped_guide(human.domain.name, own[0] if own else FIRST)
         except AssetError as error:
+            name = model_name(type(human).__name__)
             raise AssetError(
-                f"no guide ships for {type(human).__name__} in {human.domain.name}: train one with "
+                f"no guide ships for {name} in {human.domain.name}: train one with "
                 "python -m mirror_ppl.train --what guide and name it with --guide-file, or use "
                 "--guide exact"
             ) from error

@@ -28,7 +28,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.inference.combinations import log_priors, perceived_sites
+from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, combination_values, log_joints
 from mirror_ppl.inference.pooling import Pooling, Population
 from mirror_ppl.inference.sightings import Screening, Sightings
@@ -38,6 +38,8 @@ from mirror_ppl.inference.views import build_view_table, rounds_of
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import combination_number
 
+NEGLIGIBLE = 0.005
+"""Nats below which nothing is open; they are told as 0.00."""
 POLICIES = 48
 """Posterior draws of how a person decides."""
 COMBINATIONS = 128
@@ -73,6 +75,12 @@ class Identifiability:
     all_shared: Tensor
     information: Tensor
     information_error: Tensor
+
+    @property
+    def nothing(self) -> bool:
+        """Whether of nobody anything is open, or could be told, that is worth telling."""
+        told = torch.cat([self.all_entropy.flatten(), self.information.flatten()])
+        return bool((told < NEGLIGIBLE).all())
 
     def of(self, person: int, scenarios: Sequence[str]) -> dict[str, Any]:
         """What is open about one person, as ``summary.json`` has it."""
@@ -125,9 +133,7 @@ def identify(
     held, people = next(iter(draws.values())).shape[:2]
     chosen = torch.linspace(0, held - 1, min(held, POLICIES)).round().long()
     found: list[tuple[Tensor, ...]] = []
-    supports: Mapping[str, Tensor] = {}
-    if population is not None:
-        population, supports = population.spaced(held), Pooling(human).supports
+    pooling = None if population is None else Pooling(human)
     for person in range(people):
         report("identify", person, people, "people")
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
@@ -143,13 +149,13 @@ def identify(
         policy = {name: value[chosen] for name, value in own.items() if name not in sizes}
         joint = log_joints(human, table, policy, candidates)[:, 0]
         grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
-        if population is not None:
+        if population is not None and pooling is not None:
             # On average: which population it is says nothing of how this person decides.
             chances = {
                 site: value.mean(0, keepdim=True).expand(len(chosen), *value.shape[1:])
                 for site, value in population.chances.items()
             }
-            joint = joint + _instead_of_prior(human, grid, policy, chances, supports)
+            joint = joint + _instead_of_prior(grid, chances, pooling)
         weights = torch.log_softmax(joint, -1)  # [S, C]
         told = (weights.new_zeros(0),) * 2
         if rounds:
@@ -172,21 +178,21 @@ def identify(
 
 
 def _instead_of_prior(
-    human: HumanModel,
-    grid: Mapping[str, Tensor],
-    policy: Mapping[str, Tensor],
-    chances: Mapping[str, Tensor],
-    supports: Mapping[str, Tensor],
+    grid: Mapping[str, Tensor], chances: Mapping[str, Tensor], pooling: Pooling
 ) -> Tensor:
-    """Log ratio ``[S, C]`` of the prior of combinations in populations to the model's own."""
-    own = log_priors(human, grid, policy, 1)[:, 0]
-    total = torch.zeros_like(own)
-    for site, value in grid.items():
-        same = value[:, None] == supports[site]
-        own_chance = chances[site].log()[:, same.long().argmax(-1)]
-        # A value that the prior rules out has no chance.
-        total = total + torch.where(same.any(-1), own_chance, -torch.inf)
-    return total - own
+    """Log ratio ``[S, C]`` of the prior of combinations in populations to the model's own.
+
+    Sites that a population says nothing of keep their prior.
+    """
+    total = torch.zeros(())
+    for site, support in pooling.supports.items():
+        if site in grid:
+            same = grid[site][:, None] == support
+            ratio = (chances[site] / pooling.prior_chances[site]).log()
+            # A value that the prior rules out has no chance.
+            ratio = torch.where(same.any(-1), ratio[:, same.long().argmax(-1)], -torch.inf)
+            total = total + ratio
+    return total
 
 
 def _open(weights: Tensor, grid: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
-
 import pyro
 import torch
 from pyro.infer import MCMC, NUTS
@@ -37,7 +34,21 @@ def sample_nuts(
         HumanModelError: actions depend on what is seen otherwise than through beliefs.
     """
     require_acting_on_beliefs(human, table)
-    policy = run_chain(human.model, (table,), number, seed, "sample", report, PLATES)
+    total, done = WARMUP + number, 0
+
+    def count(*_: object) -> None:
+        nonlocal done
+        done += 1
+        report("sample", min(done, total), total, "")
+
+    with torch.random.fork_rng(devices=[]), pyro.validation_enabled(False):
+        torch.manual_seed(seed)
+        kernel = NUTS(
+            human.model, max_plate_nesting=PLATES, init_strategy=init_to_median, max_tree_depth=6
+        )
+        chain = MCMC(kernel, number, WARMUP, hook_fn=count, disable_progbar=True)
+        chain.run(table)
+        policy = chain.get_samples()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         joints = log_joints(human, table, policy)
@@ -45,40 +56,3 @@ def sample_nuts(
     drawn = {name: torch.cat([one[name] for one in discrete]) for name in discrete[0]}
     values = {**policy, **drawn}
     return {name: values[name] for name in sample_sites(human, 1)}
-
-
-def run_chain(
-    program: Callable[..., None],
-    arguments: Sequence[Any],
-    number: int,
-    seed: int,
-    name: str,
-    report: Report,
-    plates: int | None = None,
-) -> Draws:
-    """Draws ``[S, ...]`` of a program's continuous sites, by NUTS; discrete ones are enumerated.
-
-    Args:
-        program: in Pyro.
-        arguments: what it is given.
-        number: of draws S; as many as ``WARMUP`` are thrown away before.
-        seed: of everything random.
-        name: under which steps are reported.
-        report: told of steps.
-        plates: how deep plates are nested, if there is anything to enumerate.
-    """
-    total, done = WARMUP + number, 0
-
-    def count(*_: object) -> None:
-        nonlocal done
-        done += 1
-        report(name, min(done, total), total, "")
-
-    with torch.random.fork_rng(devices=[]), pyro.validation_enabled(False):
-        torch.manual_seed(seed)
-        kernel = NUTS(
-            program, max_plate_nesting=plates, init_strategy=init_to_median, max_tree_depth=6
-        )
-        chain = MCMC(kernel, number, WARMUP, hook_fn=count, disable_progbar=True)
-        chain.run(*arguments)
-        return chain.get_samples()

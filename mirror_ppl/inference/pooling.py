@@ -1,7 +1,9 @@
 """Partial pooling: people are alike, and how alike is inferred with them.
 
 The population is a Pyro program above the human model. Every site of one number a person gets
-hyper-parameters; the others (weights of the residual) keep their prior::
+hyper-parameters, unless its prior hangs on other sites already (how soon each terminal is noticed,
+given how quick somebody is) or is knowledge of the world (`HumanModel.of_the_world`); the others,
+and weights of the residual, keep their prior::
 
     concentration_d ~ LogNormal(log(n_d), 1)      discrete site d, of n_d values: large where
     chances_d  ~ Dirichlet(concentration_d p_d)     people differ as much as its prior p_d says
@@ -16,8 +18,9 @@ human model's own prior. So with S draws of those posteriors, up to a constant::
     p(actions_p | population) = mean over s of  p(psi_p^s | population) / p(psi_p^s | own prior)
 
 (Hogg, Myers and Bovy, *Inferring the eccentricity distribution*, 2010). The population is inferred
-by Hamiltonian Monte Carlo, and people are drawn anew by the same weights. Somebody without rounds
-has draws of the prior, weights that only tell of the population, and so its predictive: round zero.
+by Gibbs sampling (:mod:`mirror_ppl.inference.population_sampler`), and people are drawn anew by the
+same weights. Somebody without rounds has draws of the prior, weights that only tell of the
+population, and so its predictive: round zero.
 """
 
 from __future__ import annotations
@@ -25,13 +28,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from mirror_ppl.inference.nuts import run_chain
+from mirror_ppl.inference.population_sampler import (
+    HyperPriors,
+    PeoplesDraws,
+    sample_population,
+)
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.sampler import places, scalar_sites
 from mirror_ppl.inference.svi import Report, silent
@@ -46,8 +54,9 @@ LEAST_CHANCE = 1e-6
 """Of a value of a discrete site, below which the prior rules it out."""
 CONCENTRATION_WIDTH = 1.0
 """Standard deviation of the logarithm of the concentration of chances."""
-SPREAD_WIDTH = 0.5
-"""Standard deviation of the logarithm of how much people differ, before anybody is seen."""
+SPREAD, SPREAD_WIDTH = 0.5, 0.5
+"""How much people differ before anybody is seen: its median, in widths of the human model's prior,
+and the standard deviation of its logarithm."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +106,15 @@ class Pooling:
 
     def __init__(self, human: HumanModel) -> None:
         self.human = human
-        self.sites = scalar_sites(human)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             nodes = sample_sites(human, 1, PRIOR_DRAWS)
+        nodes = {
+            name: node
+            for name, node in nodes.items()
+            if name not in human.of_the_world and not _has_parents(node)
+        }
+        self.sites = {name: site for name, site in scalar_sites(human).items() if name in nodes}
         drawn = places(self.sites, values_of(nodes), PRIOR_DRAWS)
         self.centre, self.width = drawn.mean(0), drawn.std(0)
         self.supports, self.prior_chances = {}, {}
@@ -131,7 +145,7 @@ class Pooling:
         mean, spread = {}, {}
         for name, centre, width in zip(self.sites, self.centre, self.width, strict=True):
             mean[name] = pyro.sample(f"{name}_mean", dist.Normal(centre, width))
-            half = dist.LogNormal((width / 2).log(), torch.full_like(width, SPREAD_WIDTH))
+            half = dist.LogNormal((SPREAD * width).log(), torch.full_like(width, SPREAD_WIDTH))
             spread[name] = pyro.sample(f"{name}_spread", half)
         ratio = self.log_density(chances, mean, spread, known, place) - log_prior
         with pyro.plate("person", len(log_prior)):
@@ -193,12 +207,20 @@ class Pooling:
         held, people = next(iter(draws.values())).shape[:2]
         used = min(held, MOST_DRAWS, max(LEAST_DRAWS, ALL_DRAWS // people))
         some = torch.linspace(0, held - 1, used).round().long()
-        what = self.read({name: value[some] for name, value in draws.items()})
-        found = run_chain(self.program, what, number, seed, "population", report)
+        known, place, log_prior = self.read({name: value[some] for name, value in draws.items()})
+        own = torch.stack([place[name] for name in self.sites], -1)
+        chances, mean, spread = sample_population(
+            PeoplesDraws(known, (own - self.centre) / self.width, log_prior),
+            HyperPriors(self.prior_chances, CONCENTRATION_WIDTH, SPREAD, SPREAD_WIDTH),
+            number,
+            seed,
+            lambda done, total: report("population", done, total, ""),
+        )
+        mean, spread = self.centre + self.width * mean, self.width * spread
         return Population(
-            {name: found[f"{name}_chances"] for name in self.supports},
-            {name: found[f"{name}_mean"] for name in self.sites},
-            {name: found[f"{name}_spread"] for name in self.sites},
+            chances,
+            dict(zip(self.sites, mean.unbind(-1), strict=True)),
+            dict(zip(self.sites, spread.unbind(-1), strict=True)),
         )
 
     @torch.no_grad()
@@ -242,3 +264,10 @@ class Pooling:
                 normal = dist.Normal(population.mean[name], population.spread[name])
                 given[name] = site(normal.sample(torch.Size([people])).T)[..., None]
             return values_of(sample_sites(self.human, people, number, given))
+
+
+def _has_parents(node: Mapping[str, Any]) -> bool:
+    """Whether a site's prior ``[S, 1, 1]`` differs from draw to draw of the others."""
+    prior, first = node["fn"], node["value"][:1]
+    log_density = prior.log_prob(first.expand(prior.shape()))
+    return bool((log_density - log_density[:1]).abs().max() > 1e-6)

@@ -15,6 +15,7 @@ from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.export import az, is_reach
 from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.weights import fingerprint
 
 
@@ -85,15 +86,18 @@ def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -
     """Make sure that a file is of this human model.
 
     Raises:
-        PosteriorError: it is of another human model, self-model or version of the domain.
+        PosteriorError: it is of another domain or version of it, human model or self-model.
     """
     for name, mine in (
+        ("domain", human.domain.name),
         ("domain_version", human.domain.version),
         ("human_model", type(human).__name__),
         ("self_model", fingerprint(human.self_model)),
     ):
         own = attributes.get(name)
         if own != mine:
+            if name == "human_model":
+                own, mine = (model_name(str(one)) for one in (own, mine))
             raise PosteriorError(
                 f"{path}: is of {name.replace('_', ' ')} {own}, not {mine}; fit again, or "
                 "give what it was fitted with"
@@ -115,11 +119,14 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
         raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
     try:
         data = az.from_netcdf(str(path))
-        if "posterior" not in data.groups():
-            raise PosteriorError(
-                f"{path}: cannot be read as a posterior (it holds none; "
-                "python -m mirror_ppl.fit makes one of recordings)"
-            )
+    except Exception as error:
+        raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
+    if "posterior" not in data.groups():
+        raise PosteriorError(
+            f"{path}: cannot be read as a posterior (it holds none; "
+            "python -m mirror_ppl.fit makes one of recordings)"
+        )
+    try:
         group = data["posterior"]
         attributes = {str(name): str(value) for name, value in group.attrs.items()}
         people = tuple(map(str, group["person"].values))
@@ -127,8 +134,6 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
             str(name): value.transpose("chain", "draw", "person", ...).values
             for name, value in group.data_vars.items()
         }
-    except PosteriorError:
-        raise
     except Exception as error:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     own = attributes.get("domain", "unknown")

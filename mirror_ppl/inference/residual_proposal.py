@@ -101,7 +101,7 @@ def _laplace(
     for some in torch.arange(len(features)).split(DRAWS):
         best, curvature = _mode(without[some], features[some], counts, scale)
         weights.append(best)
-        precision.append(curvature)
+        precision.append((curvature + curvature.mT) / 2)  # else symmetric but for rounding
     return MultivariateNormal(torch.cat(weights), precision_matrix=torch.cat(precision))
 
 

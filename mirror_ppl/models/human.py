@@ -62,9 +62,12 @@ class HumanModel(nn.Module):
             step alone, so that planning need not go through the whole round again. A class that
             overrides ``perceive``, ``believe`` or ``act`` counts as one that cannot, unless it says
             ``stepwise = True``.
+        of_the_world: sites whose prior :meth:`learn_world` changes. They are about the world, and a
+            population of people says nothing of them.
     """
 
     stepwise = True
+    of_the_world: tuple[str, ...] = ()
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()

@@ -36,6 +36,15 @@ OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
 """What names in ``VARIANTS`` stand for in domains that need another model than `HumanModel`."""
 
 
+def model_name(class_name: str) -> str:
+    """What commands call a human model of that class; of somebody's own the name of the class."""
+    for variants in (VARIANTS, *OWN.values()):
+        for name, kind in variants.items():
+            if kind.__name__ == class_name:
+                return name
+    return class_name
+
+
 def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
     """Make a human model.
 

@@ -73,6 +73,7 @@ class Searcher(HumanModel):
 
     stepwise = True
     kinds = tuple(kind.lower().replace(" ", "_") for kind in KINDS)
+    of_the_world = tuple(RULE + kind.lower().replace(" ", "_") for kind in KINDS)
     rule_logits: Tensor
     exchanges: Tensor
 

@@ -1,0 +1,213 @@
+"""Draws of a population, given draws of its people: Gibbs sampling of `Pooling.program`.
+
+Two blocks take turns. Given the population, each person has one of their own draws,
+
+    s_p ~ p(psi_p^s | population) / p(psi_p^s | own prior)
+
+and given those, sites do not depend on each other. Of each, how much people differ is drawn with
+the rest integrated out, on a grid; what is left is conjugate::
+
+    n people with values x of mean x' of a continuous site, its prior's mean 0 and width 1
+        spread ~ p(spread) N(x; 0, spread^2 I + 1 1')     mean ~ N(n x' / (n + spread^2), ...)
+    n people of whom k have each value of a discrete site
+        concentration ~ p(concentration) DirichletMultinomial(k; concentration p_d)
+        chances ~ Dirichlet(concentration p_d + k)
+
+This is exact but for the grid, whose cells are a fortieth of the prior's standard deviation and
+which ends eight of these below and above its median.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.distributions import Dirichlet, Normal
+
+WARMUP = 300
+"""Sweeps that are thrown away."""
+THIN = 5
+"""Sweeps for a draw that is kept."""
+CELLS, RANGE = 640, 8.0
+"""Of the grid of a logarithm, from so many standard deviations of its prior below to above it."""
+SMALLEST = 1e-30
+"""Of a chance, whose logarithm is needed."""
+
+
+@dataclass(frozen=True)
+class HyperPriors:
+    """Priors of how much people differ.
+
+    Attributes:
+        chances: by discrete site, of its values ``[n]`` in the human model's prior.
+        concentration_width: standard deviation of the logarithm of a concentration, whose median
+            is the number of values.
+        spread: median of how much people differ in a continuous site, in widths of its prior.
+        spread_width: standard deviation of its logarithm.
+    """
+
+    chances: dict[str, Tensor]
+    concentration_width: float
+    spread: float
+    spread_width: float
+
+
+@dataclass(frozen=True)
+class PeoplesDraws:
+    """Draws of each person under the human model's own prior.
+
+    Attributes:
+        known: by discrete site, which of its values each draw has, one-hot ``[P, S, n]``.
+        place: continuous sites less the mean of their prior, in its widths, ``[P, S, C]``.
+        log_prior: of all of it under the human model, ``[P, S]``.
+    """
+
+    known: dict[str, Tensor]
+    place: Tensor
+    log_prior: Tensor
+
+
+@torch.no_grad()
+def sample_population(
+    people: PeoplesDraws,
+    priors: HyperPriors,
+    number: int,
+    seed: int,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """Draws of the population: chances ``[N, n]`` by site, means and spreads ``[N, C]``.
+
+    Args:
+        people: what is known of them.
+        priors: of how much they differ.
+        number: of draws N.
+        seed: of everything random.
+        report: told of sweeps.
+    """
+    place = people.place.double()
+    known = [people.known[name].double() for name in priors.chances]
+    # A draw's log-density is linear in these, [P, S, F].
+    features = torch.cat([place, place.square(), *known], -1)
+    log_prior = people.log_prior.double()
+    sites = {
+        name: DiscreteSite(len(place), prior.double(), priors.concentration_width)
+        for name, prior in priors.chances.items()
+    }
+    which = {name: people.known[name].argmax(-1) for name in sites}
+    continuous = ContinuousSites(len(place), priors, place)
+    everybody = torch.arange(len(place), device=place.device)
+    kept: list[tuple[dict[str, Tensor], Tensor, Tensor]] = []
+    total = WARMUP + THIN * number
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        weights = torch.ones_like(log_prior)
+        for sweep in range(total):
+            own = torch.multinomial(weights, 1)[:, 0]
+            mean, spread = continuous.draw(place[everybody, own])
+            chances = {name: site.draw(which[name][everybody, own]) for name, site in sites.items()}
+            linear = torch.cat(
+                [mean / spread**2, -0.5 / spread**2, *map(torch.log, chances.values())]
+            )
+            weights = torch.softmax(features @ linear - log_prior, -1)
+            if sweep >= WARMUP and (sweep - WARMUP) % THIN == THIN - 1:
+                kept.append((chances, mean, spread))
+            report(sweep + 1, total)
+    return (
+        {name: torch.stack([one[0][name] for one in kept]).to(people.place) for name in sites},
+        torch.stack([one[1] for one in kept]).to(people.place),
+        torch.stack([one[2] for one in kept]).to(people.place),
+    )
+
+
+def _grid(median: Tensor | float, width: float, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Logarithms ``[CELLS]`` of a log-normal in the middle of cells, and their log-densities."""
+    deviations = torch.linspace(-RANGE, RANGE, CELLS, dtype=like.dtype, device=like.device)
+    return torch.as_tensor(median).log() + width * deviations, -0.5 * deviations**2
+
+
+def _from_grid(grid: Tensor, log_density: Tensor) -> Tensor:
+    """A number from each row ``[..., CELLS]``, anywhere in the cell that was drawn."""
+    cell = torch.multinomial(torch.softmax(log_density, -1), 1)[..., 0]
+    inside = torch.rand(cell.shape, dtype=grid.dtype, device=grid.device) - 0.5
+    return (grid[cell] + inside * (grid[1] - grid[0])).exp()
+
+
+class ContinuousSites:
+    """How P people are distributed in C continuous sites, given their values.
+
+    Args:
+        people: P.
+        priors: of how much they differ.
+        like: a tensor of the numbers' kind.
+
+    Attributes:
+        grid: logarithms of spreads, ``[CELLS]``.
+    """
+
+    def __init__(self, people: int, priors: HyperPriors, like: Tensor) -> None:
+        self.people = people
+        self.grid, self.log_prior = _grid(priors.spread, priors.spread_width, like)
+        self.squares = (2 * self.grid).exp()
+
+    def log_densities(self, values: Tensor) -> Tensor:
+        """Of the grid's spreads ``[C, CELLS]``, given values ``[P, C]``; without the mean."""
+        number, centre = self.people, values.mean(0)
+        scatter = (values - centre).square().sum(0)[:, None]
+        across = self.squares + number
+        return self.log_prior - 0.5 * (
+            (number - 1) * self.squares.log()
+            + across.log()
+            + scatter / self.squares
+            + number * centre[:, None].square() / across
+        )
+
+    def mean(self, values: Tensor, spread: Tensor) -> Normal:
+        """Means ``[C]``, given values ``[P, C]`` and spreads ``[C]``."""
+        precision = 1 + self.people / spread**2
+        return Normal(self.people * values.mean(0) / spread**2 / precision, precision.rsqrt())
+
+    def draw(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and spreads ``[C]`` of people with values ``[P, C]``."""
+        spread = _from_grid(self.grid, self.log_densities(values))
+        return self.mean(values, spread).sample(), spread
+
+
+class DiscreteSite:
+    """How P people are distributed over a discrete site's n values.
+
+    Args:
+        people: P.
+        prior: probabilities of the values ``[n]`` under the human model.
+        width: standard deviation of the logarithm of the concentration.
+
+    Attributes:
+        grid: logarithms of concentrations, ``[CELLS]``.
+    """
+
+    def __init__(self, people: int, prior: Tensor, width: float) -> None:
+        self.prior = prior
+        self.grid, log_prior = _grid(float(len(prior)), width, prior)
+        concentration = self.grid.exp()
+        self.alone = concentration[:, None] * prior  # [CELLS, n]
+        self.constant = (
+            log_prior
+            + concentration.lgamma()
+            - (concentration + people).lgamma()
+            - self.alone.lgamma().sum(-1)
+        )
+
+    def log_densities(self, count: Tensor) -> Tensor:
+        """Of the grid's concentrations ``[CELLS]``, given how many have each value ``[n]``."""
+        return self.constant + (self.alone + count).lgamma().sum(-1)
+
+    def chances(self, count: Tensor, concentration: Tensor) -> Dirichlet:
+        """Chances ``[n]`` of values, given how many have each ``[n]``."""
+        return Dirichlet(concentration * self.prior + count)
+
+    def draw(self, value: Tensor) -> Tensor:
+        """Chances ``[n]`` of values where people have these ``[P]``."""
+        count = torch.bincount(value, minlength=len(self.prior)).to(self.prior)
+        concentration = _from_grid(self.grid, self.log_densities(count))
+        return self.chances(count, concentration).sample().clamp(min=SMALLEST)
