@@ -2,11 +2,11 @@
 
     python -m benchmarks.rivals
 
-For each domain, in the setting in which people see least, ten simulated people of other seeds than
-those of the comparisons are learned from 5 and 20 rounds. One setting after another is varied, the
-others being at the best so far, or as they are in the package; printed is the mean NLL of the
-people's validation rounds in nats an action. What is best of a domain is what
-``mirror_ppl.baselines`` has for it. Rounds by which models are compared are not looked at.
+In each domain, whatever people see, ten simulated people of other seeds than those of the
+comparisons are learned from 5 and 20 rounds. One option after another is varied, the others being
+at the best so far, or as they are in the package; printed is the mean NLL of the people's
+validation rounds in nats an action, in each setting of the domain. What has the least mean is what
+``mirror_ppl.baselines`` has for the domain. Rounds by which models are compared are not looked at.
 """
 
 from __future__ import annotations
@@ -34,24 +34,33 @@ from mirror_ppl.people import simulate
 PEOPLE, RECORDED = 10, 30
 TRAINING, VALIDATION = (5, 20), slice(20, 30)
 SEEDS = (100, 101)
+"""Of people."""
+SEED = 100
+"""Of networks."""
 OPTIONS: Mapping[str, Any] = {"bc": BehaviourCloneOptions, "sqil": SoftQOptions}
 GRIDS: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
-    "bc": {"weight_decay": (0.3, 1.0, 3.0, 6.0, 12.0), "learning_rate": (0.01, 0.03)},
+    "bc": {
+        "learning_rate": (0.003, 0.01, 0.03),
+        "weight_decay": (0.1, 0.3, 1.0, 3.0, 6.0, 12.0),
+    },
     "sqil": {
-        "learning_rate": (0.01, 0.02, 0.03),
-        "reward": (2.0, 5.0, 10.0),
+        "learning_rate": (0.003, 0.01, 0.02, 0.03, 0.05),
+        "reward": (2.0, 5.0, 10.0, 20.0),
         "discount": (0.0, 0.5, 0.9),
         "weight_decay": (0.03, 0.1, 0.3, 1.0),
     },
 }
-"""Values of each setting, in the order in which they are varied."""
+"""Values of each option, in the order in which they are varied."""
 
 
-def search(domain: str, model: str, seeds: list[int]) -> None:
-    """Vary one setting after another and print what was best."""
-    setting = get_domain(domain).settings[-1]
-    recorded = {seed: simulate(domain, setting, "paper", PEOPLE, RECORDED, seed) for seed in seeds}
-    print(f"{domain}, {setting}, {model}: nats an action of {TRAINING[0]} and {TRAINING[1]} rounds")
+def search(domain: str, model: str, settings: list[str], seeds: list[int]) -> None:
+    """Vary one option after another and print what was best."""
+    people = [
+        [simulate(domain, setting, "paper", PEOPLE, RECORDED, seed) for seed in seeds]
+        for setting in settings
+    ]
+    where = " and ".join(f"{setting}, {number}" for setting in settings for number in TRAINING)
+    print(f"{domain}, {model}: nats an action of {where} rounds", flush=True)
     best: dict[str, Any] = {}
     done: dict[TrainingOptions, float] = {}
     for name, values in GRIDS[model].items():
@@ -61,7 +70,7 @@ def search(domain: str, model: str, seeds: list[int]) -> None:
             options = OPTIONS[model].of(domain, **tried)
             if options not in done:
                 began = monotonic()
-                means = [_loss(recorded, number, options) for number in TRAINING]
+                means = [_loss(own, number, options) for own in people for number in TRAINING]
                 done[options] = mean(means)
                 text = " ".join(f"{one:.3f}" for one in means)
                 print(f"  {text}  {_text(tried)}  {monotonic() - began:.0f} s", flush=True)
@@ -70,16 +79,16 @@ def search(domain: str, model: str, seeds: list[int]) -> None:
     print(f"  best: {_text(best)}", flush=True)
 
 
-def _loss(recorded: Mapping[int, Demonstrations], number: int, options: TrainingOptions) -> float:
+def _loss(recorded: list[Demonstrations], number: int, options: TrainingOptions) -> float:
     """NLL of validation rounds, with so many rounds to learn from; the mean over seeds."""
     losses = []
-    for seed, rounds in recorded.items():
+    for rounds in recorded:
         train, validation = rounds.select_rounds(slice(number)), rounds.select_rounds(VALIDATION)
         if isinstance(options, SoftQOptions):
-            networks = fit_soft_q(train, validation, options, seed)
+            networks = fit_soft_q(train, validation, options, SEED)
         else:
             assert isinstance(options, BehaviourCloneOptions)
-            networks = fit_behaviour_clone(train, validation, options, seed)
+            networks = fit_behaviour_clone(train, validation, options, SEED)
         losses.append(held_out_nll(networks, validation).mean().item())
     return mean(losses)
 
@@ -95,12 +104,13 @@ def main() -> None:
         "--domains", nargs="+", default=["driving", "search_rescue", "bomb_defusal"]
     )
     parser.add_argument("--models", nargs="+", default=list(GRIDS), choices=list(GRIDS))
+    parser.add_argument("--settings", nargs="+", help="all of each domain unless given")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     options = parser.parse_args()
     torch.set_num_threads(1)
     for domain in options.domains:
         for model in options.models:
-            search(domain, model, options.seeds)
+            search(domain, model, options.settings or [*get_domain(domain).settings], options.seeds)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,9 @@ from mirror_ppl.errors import (
     UnknownNameError,
 )
 
-KL = "mirror-kl"
+FAR_BELOW = -10
+"""Ways from silence to the oracle of which less is told."""
+KL, LEARNED = "mirror-kl", "mirror-self-model"
 PROGRAM = "python -m mirror_ppl.assist"
 DESCRIPTION = """Let communicators speak to the simulated people of a posterior while they drive,
 and print for each what the people gained, what the messages cost and what they were about. All play
@@ -37,7 +39,8 @@ class Options:
     """The setting that the posterior has to be of; that of the posterior unless given."""
     communicator: tuple[str, ...] = ()
     """One or several of mirror, mirror-self-model, mirror-kl, none, all, random, nearest, oracle;
-    all of them unless given. What each is stands in docs/communicator.md."""
+    all of them unless given (but for mirror-self-model where the robot was taught wrong rules).
+    What each is stands in docs/communicator.md."""
     rounds: int = 20
     """Rounds of each person."""
     people: int | None = None
@@ -157,6 +160,12 @@ def main(options: Options) -> None:
             )
         chosen = tuple(name for name in chosen if name != KL)
         print(f"{KL} is left out: {type(pairing.human).__name__} is not stepwise", file=sys.stderr)
+    if not options.communicator and pairing.domain.as_believed is not pairing.domain:
+        chosen = tuple(name for name in chosen if name != LEARNED)
+        print(
+            f"{LEARNED} is left out: the robot was taught wrong in {pairing.domain.name}",
+            file=sys.stderr,
+        )
     for path in outputs:
         prepare_output_folder(path.parent)
     kept = options.json or options.log
@@ -165,8 +174,7 @@ def main(options: Options) -> None:
     playing = len({*chosen} | ({RATES_FROM} if "random" in chosen else set()))
     with Progress("assist", number * playing) as progress:
         played = run_cells(pairing, chosen, number, options.jobs, parts, progress.update)
-    horizon = pairing.domain.horizon
-    summary = summarize_assistance(played, horizon, options.seed)
+    summary = summarize_assistance(played, options.seed)
     results: dict[str, Any] = {
         "command": PROGRAM,
         "options": {
@@ -227,13 +235,13 @@ def _people(options: Options):
     domain = posterior.attributes["domain"]
     settings = get_domain(domain).settings
     if options.setting is not None:
-        require_known(options.setting, "setting", settings)
+        require_known(options.setting, "setting", settings, domain)
     own = posterior.attributes.get("setting", "unknown")
     if options.setting not in (None, own):
         raise PosteriorError(
             f"{options.posterior}: is of people in the setting {own}, not {options.setting}"
         )
-    require_known(own, "setting", settings)
+    require_known(own, "setting", settings, domain)
     source: dict[str, Any] = {
         "population": posterior.attributes.get("recorded_population", options.population),
         "seed": posterior.attributes.get("recorded_seed", options.people_seed),
@@ -302,7 +310,7 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
             f"{entry['cost']:.2f}",
             f"{entry['net']:.2f}{error}",
             _interval(entry.get("over_none"), 1, "+.2f"),
-            _interval(entry.get("way_to_oracle"), 100, ".0f", "%"),
+            _way(entry.get("way_to_oracle")),
         )
         said.add_row(
             name,
@@ -319,6 +327,13 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
     console.print(said)
     if rounds == 1:
         print("Of one round of each person there are no errors and intervals; --rounds gives more")
+
+
+def _way(value: dict[str, float | None] | None) -> str:
+    """How far the way to the oracle; a number that is far below says nothing more."""
+    if value is not None and (value["mean"] or 0) < FAR_BELOW:
+        return f"below {FAR_BELOW:.0%}"
+    return _interval(value, 100, ".0f", "%")
 
 
 def _interval(

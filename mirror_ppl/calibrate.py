@@ -97,7 +97,7 @@ def main(options: Options) -> int:
     if options.guide not in GUIDES:
         raise UnknownNameError.of("guide", options.guide, GUIDES)
     known = get_domain(options.domain).settings
-    setting = require_known(options.setting or known[-1], "setting", known)
+    setting = require_known(options.setting or known[-1], "setting", known, options.domain)
     weights = options.self_model or shipped_weights(options.domain)
     self_model, _ = load_self_model(weights, options.domain)
     human = load_human_model(options.human_model, self_model)

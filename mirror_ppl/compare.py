@@ -33,7 +33,7 @@ class Options:
     """What is predicted: loo (each round learned from, as if it had been left out) or heldout (the
     rounds that were held out)."""
     labels: tuple[str, ...] = ()
-    """What to call the models, in the same order; by their class and folder unless given."""
+    """What to call the models, in the same order; by their name and folder unless given."""
     json: Path | None = None
     """Write the results as data, also those of each person."""
     figure: Path | None = None

@@ -35,16 +35,18 @@ class UnknownNameError(MirrorError):
     # A constructor with other arguments than the message could not be unpickled, and so would break
     # the report of an error that a worker process raised.
     @classmethod
-    def of(cls, kind: str, name: str, known: Iterable[str]) -> Self:
+    def of(cls, kind: str, name: str, known: Iterable[str], where: str = "") -> Self:
         """The exception that says which names there are, and which of them was perhaps meant.
 
         Args:
             kind: what the name stands for, such as "domain".
             name: the name that was given.
             known: the names that would have been right.
+            where: the domain, if it is another in others.
         """
         names = sorted(known)
-        message = f'unknown {kind} "{name}"; known: {", ".join(names) or "none"}'
+        place = f" in {where}" if where else ""
+        message = f'unknown {kind} "{name}"{place}; known: {", ".join(names) or "none"}'
         lowered = {candidate.lower(): candidate for candidate in names}
         for close in get_close_matches(name.lower(), lowered, n=1):
             message += f'; perhaps you meant "{lowered[close]}"'

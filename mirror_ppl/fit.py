@@ -11,7 +11,7 @@ from mirror_ppl.console import Stages, run, usable_device
 from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl.fit"
-DOMAIN = "driving"
+DOMAIN, POPULATION = "driving", "paper"
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
@@ -32,9 +32,9 @@ class Options:
     """The setting of the shipped recordings: clear or fog in driving, clear or smoke in
     search_rescue, labelled or unlabelled in bomb_defusal. Default: the one in which people see
     less."""
-    population: str = "paper"
-    """The people of the shipped recordings: paper (sight limited by the setting alone; in
-    bomb_defusal as quick at every terminal) or diverse (each their own sight)."""
+    population: str | None = None
+    """The people of the shipped recordings: paper (unless given; sight limited by the setting
+    alone, in bomb_defusal as quick at every terminal) or diverse (each their own sight)."""
     out: Path = Path("runs/fit")
     """Folder for the results; made if it is not there."""
     train_rounds: int | None = None
@@ -165,7 +165,8 @@ def main(options: Options) -> None:
     pictures = sight_pictures(result.data)
     for name, (picture, _) in pictures.items():
         picture.save(folder / name)
-    if found is not None:
+    drawn = found is not None and not found.nothing
+    if drawn:
         plot_identifiability(result.data).save(folder / "open.png")
     write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
     for file in folder.glob("fit.checkpoint*"):
@@ -175,7 +176,7 @@ def main(options: Options) -> None:
     print(f"{folder / 'summary.json'}: the numbers above")
     for name, (_, shows) in pictures.items():
         print(f"{folder / name}: {shows}")
-    if found is not None:
+    if drawn:
         print(f"{folder / 'open.png'}: what is open about what they see, and what would tell")
 
 
@@ -186,16 +187,19 @@ def _recordings(options: Options):
 
     if options.demos is not None:
         recorded = load_demonstrations(options.demos)
-        if options.domain not in (None, recorded.domain):
-            raise OptionError(
-                f"--domain is {options.domain}, but --demos is of {recorded.domain}; leave one out"
-            )
+        for name in ("domain", "setting"):
+            given, own = getattr(options, name), getattr(recorded, name)
+            if given not in (None, own):
+                raise OptionError(f"--{name} is {given}, but --demos is of {own}; leave one out")
+        if options.population is not None:
+            raise OptionError("--population is of the shipped recordings; leave it or --demos out")
         return recorded
     domain = options.domain or DOMAIN
     settings = get_domain(domain).settings
-    setting = require_known(options.setting or settings[-1], "setting", settings)
-    require_known(options.population, "population", PEOPLE[domain].populations)
-    name = f"{domain}_{setting}_{options.population}.nc"
+    setting = require_known(options.setting or settings[-1], "setting", settings, domain)
+    population = options.population or POPULATION
+    require_known(population, "population", PEOPLE[domain].populations, domain)
+    name = f"{domain}_{setting}_{population}.nc"
     return load_demonstrations(asset_path(name))
 
 

@@ -119,7 +119,11 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
     from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
 
-    require_known(options.speech, "speech", tuple(EMBEDDINGS))
+    default, *_ = EMBEDDINGS
+    if require_known(options.speech, "speech", tuple(EMBEDDINGS)) != default and not any(
+        modality.utterances for modality in get_domain(options.domain).modalities
+    ):
+        raise OptionError(f"--speech: nothing is put into words in {options.domain}")
     sizes = {"shipped": SIZES, "paper": PAPER}[
         require_known(options.sizes, "sizes", ("shipped", "paper"))
     ][options.domain]
@@ -142,7 +146,12 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
         )
     # It was taught the world as it is believed to be, and lives in the world as it is.
     self_model.domain = get_domain(options.domain)
-    quality = self_model_quality(self_model, discount=settings.discount)
+    with Stages() as stages:
+        quality = self_model_quality(
+            self_model,
+            discount=settings.discount,
+            progress=lambda done, total: stages.report("measure", done, total, "views"),
+        )
     card = _described(options, settings, quality, "measured on 4000 rounds")
     save_self_model(self_model, out, card)
     return card

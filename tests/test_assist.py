@@ -195,7 +195,7 @@ def changed(posterior, path, **attributes):
         ({"domain": "chess"}, 'unknown domain "chess"; known: bomb_defusal, driving'),
         ({"domain_version": "99"}, "is of domain version 99, not"),
         ({"self_model": "0" * 16}, f"is of self model {'0' * 16}, not"),
-        ({"human_model": "LatePerson"}, "is of human model LatePerson, not HumanModel"),
+        ({"human_model": "LatePerson"}, "is of human model LatePerson, not mirror"),
         ({"recorded_population": None}, "does not say which simulated people it is of"),
         ({"recorded_population": "martians"}, 'unknown population "martians"'),
     ],
@@ -294,6 +294,25 @@ def test_a_model_that_is_not_stepwise_is_planned_with_but_has_no_divergence(
     assert "mirror-kl is left out: LatePerson is not stepwise" in capsys.readouterr().err
     played = results_of(tmp_path / "a.json")["communicators"]
     assert tuple(played) == tuple(name for name in COMMUNICATORS if name != "mirror-kl")
+
+
+def test_nobody_plans_in_a_world_that_the_robot_was_taught_wrong_unless_asked_to(tmp_path, capsys):
+    everybody = load_demonstrations(asset_path("bomb_defusal_unlabelled_paper.nc"))
+    one = everybody.select_people([0]).select_rounds([0])
+    save_demonstrations(tmp_path / "one.nc", one)
+    small = ("--train-rounds", "0", "--explore", "0", "--draws", "4", "--out", tmp_path)
+    assert command(fit, "--demos", tmp_path / "one.nc", *small) == 0
+    capsys.readouterr()
+    bomb = ("--posterior", tmp_path / "posterior.nc", "--rounds", "1", "--draws", "4")
+    bomb += ("--horizon", "1", "--patience", "1", "--jobs", "1", "--json", tmp_path / "a.json")
+    assert command(assist, *bomb) == 0
+    told = "mirror-self-model is left out: the robot was taught wrong in bomb_defusal"
+    assert told in capsys.readouterr().err
+    played = results_of(tmp_path / "a.json")["communicators"]
+    assert tuple(played) == tuple(name for name in COMMUNICATORS if name != "mirror-self-model")
+    assert command(assist, *bomb, "--communicator", "mirror-self-model") == 0
+    assert "left out" not in capsys.readouterr().err
+    assert tuple(results_of(tmp_path / "a.json")["communicators"]) == ("mirror-self-model",)
 
 
 def test_what_others_keep_in_the_folder_of_parts_stays(posterior, tmp_path):

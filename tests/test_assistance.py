@@ -91,6 +91,7 @@ def test_rewards_costs_and_collisions_are_those_of_the_scene(played):
     assert played.cost == pytest.approx([0.01 * 4 + 0.03 * 1 + 0.03 * 4, 0])
     assert played.net == pytest.approx([-12.19, -1])
     assert played.mishaps == [1, 0]
+    assert played.steps == 2 * DOMAIN.horizon
     assert played.milliseconds >= 0
 
 

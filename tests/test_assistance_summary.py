@@ -23,6 +23,7 @@ def rounds_of(task, cost, items=0, relevant=0, milliseconds=1.0):
         items={"visual": nothing, "verbal": spoken},
         relevant={"course": {"visual": nothing, "verbal": right}},
         chances={"visual": 10, "verbal": 10},
+        steps=5 * number,
         milliseconds=milliseconds,
     )
 
@@ -39,7 +40,7 @@ PLAYED = {
 
 
 def test_means_are_those_of_rounds():
-    entry = summarize_assistance(PLAYED, 5)["some"]
+    entry = summarize_assistance(PLAYED)["some"]
     assert (entry["task"], entry["cost"], entry["net"]) == (2.5, 0.25, 2.25)
     assert entry["net_by_person"] == [2.5, 2.0]
     assert entry["mishaps"] == 2 / 8
@@ -51,9 +52,9 @@ def test_means_are_those_of_rounds():
 def test_the_standard_error_is_that_of_rounds_within_people():
     # Variances 14/3 and 16/3 of four rounds each; people are given, not drawn.
     expected = math.sqrt((14 / 3 / 4 + 16 / 3 / 4) / 4)
-    assert summarize_assistance(PLAYED, 5)["some"]["net_se"] == pytest.approx(expected)
+    assert summarize_assistance(PLAYED)["some"]["net_se"] == pytest.approx(expected)
     single = {"none": [rounds_of([1.0], [0.0]), rounds_of([9.0], [0.0])]}
-    assert summarize_assistance(single, 5)["none"]["net_se"] is None
+    assert summarize_assistance(single)["none"]["net_se"] is None
 
 
 def test_the_standard_error_is_the_spread_of_means_that_are_drawn_again(rng):
@@ -62,7 +63,7 @@ def test_the_standard_error_is_the_spread_of_means_that_are_drawn_again(rng):
     for _ in range(400):
         task = rng.normal([[0.0], [5.0]], [[1.0], [3.0]], (2, 12))
         parts = [rounds_of(list(row), [0.0] * 12) for row in task]
-        entry = summarize_assistance({"some": parts}, 5)["some"]
+        entry = summarize_assistance({"some": parts})["some"]
         means.append(entry["net"])
         errors.append(entry["net_se"])
     # A standard deviation of 400 draws is known to 1 / sqrt(800) of it; 4 of these.
@@ -70,7 +71,7 @@ def test_the_standard_error_is_the_spread_of_means_that_are_drawn_again(rng):
 
 
 def test_the_way_to_the_oracle_goes_from_none_to_the_oracle():
-    summary = summarize_assistance(PLAYED, 5)
+    summary = summarize_assistance(PLAYED)
     assert summary["none"]["way_to_oracle"] == {"mean": 0.0, "low": 0.0, "high": 0.0}
     assert summary["oracle"]["way_to_oracle"] == {"mean": 1.0, "low": 1.0, "high": 1.0}
     assert summary["none"]["over_none"] == {"mean": 0.0, "low": 0.0, "high": 0.0}
@@ -86,7 +87,7 @@ def test_one_round_of_each_has_no_interval():
         name: [rounds_of(part.task[:1], part.cost[:1]) for part in parts]
         for name, parts in PLAYED.items()
     }
-    entry = summarize_assistance(single, 5)["some"]
+    entry = summarize_assistance(single)["some"]
     for name in ("over_none", "way_to_oracle"):
         assert (entry[name]["low"], entry[name]["high"]) == (None, None)
     difference = compare(single, "some", "none")
@@ -94,25 +95,25 @@ def test_one_round_of_each_has_no_interval():
 
 
 def test_ways_are_left_out_where_there_is_nowhere_to_go():
-    summary = summarize_assistance({name: PLAYED[name] for name in ("some", "none")}, 5)
+    summary = summarize_assistance({name: PLAYED[name] for name in ("some", "none")})
     assert all("way_to_oracle" not in entry for entry in summary.values())
     assert "over_none" in summary["some"]
-    alone = summarize_assistance({"some": PLAYED["some"]}, 5)["some"]
+    alone = summarize_assistance({"some": PLAYED["some"]})["some"]
     assert "over_none" not in alone
     level = {"none": PLAYED["none"], "oracle": PLAYED["none"]}
-    assert all("way_to_oracle" not in entry for entry in summarize_assistance(level, 5).values())
+    assert all("way_to_oracle" not in entry for entry in summarize_assistance(level).values())
 
 
 def test_where_nothing_was_told_there_is_no_share_of_it():
-    entry = summarize_assistance(PLAYED, 5)["none"]
+    entry = summarize_assistance(PLAYED)["none"]
     assert entry["relevant"] == {"course": {"all": None, "visual": None, "verbal": None}}
     assert entry["items"] == {"visual": 0.0, "verbal": 0.0}
 
 
 def test_one_seed_gives_one_summary_that_is_plain_data():
-    summary = summarize_assistance(PLAYED, 5, seed=3)
-    assert summarize_assistance(PLAYED, 5, seed=3) == summary
-    assert summarize_assistance(PLAYED, 5, seed=4) != summary
+    summary = summarize_assistance(PLAYED, seed=3)
+    assert summarize_assistance(PLAYED, seed=3) == summary
+    assert summarize_assistance(PLAYED, seed=4) != summary
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
 
@@ -137,7 +138,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rng):
 
 def test_compare_pairs_the_rounds():
     found = compare(PLAYED, "some", "none")
-    expected = summarize_assistance(PLAYED, 5)["some"]["over_none"]
+    expected = summarize_assistance(PLAYED)["some"]["over_none"]
     assert found["mean"] == expected["mean"] == pytest.approx(1.75)
     assert found["low"] < 1.75 < found["high"]
     back = compare(PLAYED, "none", "some")

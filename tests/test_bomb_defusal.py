@@ -259,7 +259,9 @@ def test_settings_hide_the_type_and_nothing_else():
         visible = WORLD.visibility(setting, observation)
         assert visible["visual"].all()
         assert (visible["verbal"] == heard).all()
-    with pytest.raises(UnknownNameError, match='"fog"; known: labelled, unlabelled'):
+    with pytest.raises(
+        UnknownNameError, match='"fog" in bomb_defusal; known: labelled, unlabelled'
+    ):
         WORLD.visibility("fog", observation)
 
 

@@ -113,7 +113,7 @@ def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
         (("--guide-file", "nowhere.x"), "--guide-file is for --guide amortized"),
         (
             ("--guide", "amortized", "--human-model", "one-radius"),
-            "no guide ships for OneRadius in driving: train one with python -m",
+            "no guide ships for one-radius in driving: train one with python -m",
         ),
         (("--jobs", 0), "--jobs must be at least 1, or -1 for all, not 0"),
         (("--guide", "magic"), 'unknown guide "magic"'),

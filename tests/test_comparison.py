@@ -307,17 +307,17 @@ def test_models_are_called_by_their_class_and_by_their_path_where_that_is_needed
     first, second = model("x/fog/posterior.nc"), model("x/clear/posterior.nc")
     third, plain = model("y/fog/posterior.nc"), model("y/some.nc")
     unknown = model("z/posterior.nc", None)
-    assert labels_of(late, first) == ("LatePerson", "HumanModel")
-    assert labels_of(first, late, second) == ("HumanModel fog", "LatePerson", "HumanModel clear")
+    assert labels_of(late, first) == ("LatePerson", "mirror")
+    assert labels_of(first, late, second) == ("mirror fog", "LatePerson", "mirror clear")
     assert labels_of(first, third, plain) == (
-        "HumanModel x/fog",
-        "HumanModel y/fog",
-        "HumanModel y/some.nc",
+        "mirror x/fog",
+        "mirror y/fog",
+        "mirror y/some.nc",
     )
     # A folder stands for the file in it.
-    assert labels_of(first.parent, second.parent) == ("HumanModel fog", "HumanModel clear")
-    assert labels_of(first, late, first) == ("HumanModel (1)", "LatePerson", "HumanModel (2)")
-    assert labels_of(first, second, first)[::2] == ("HumanModel fog (1)", "HumanModel fog (2)")
+    assert labels_of(first.parent, second.parent) == ("mirror fog", "mirror clear")
+    assert labels_of(first, late, first) == ("mirror (1)", "LatePerson", "mirror (2)")
+    assert labels_of(first, second, first)[::2] == ("mirror fog (1)", "mirror fog (2)")
     assert labels_of(late, unknown) == ("LatePerson", "unknown")
 
 
@@ -370,7 +370,7 @@ def test_results_as_data(paths, values, tmp_path):
     for rank, (entry, model) in enumerate(zip(results["models"], comparison.models, strict=True)):
         assert entry["rank"] == rank + 1
         assert entry["posterior"] == str(paths[rank])
-        assert (entry["human_model"], entry["label"][:10]) == ("HumanModel", "HumanModel")
+        assert (entry["human_model"], entry["label"][:6]) == ("mirror", "mirror")
         assert entry["difference"] == model.total.difference
         assert entry["doubtful"] == 0 and entry["good_k"] < 0.7
         assert [person["id"] for person in entry["people"]] == list(PEOPLE)
@@ -676,7 +676,7 @@ def test_folders_of_fits_are_compared(fits, tmp_path, capsys, by):
     assert command(compare, fits / "0", fits / "1", "--by", by, *outputs) == 0
     out, err = capsys.readouterr()
     assert err == "" and all(len(line) <= 80 for line in out.splitlines() if "a." not in line)
-    assert "HumanModel 0" in out and "HumanModel 1" in out
+    assert "mirror 0" in out and "mirror 1" in out
     results = json.loads((tmp_path / "a.json").read_text())
     models = {entry["label"]: entry for entry in results["models"]}
     assert len(models) == 2
@@ -685,5 +685,5 @@ def test_folders_of_fits_are_compared(fits, tmp_path, capsys, by):
     for seed in (0, 1):
         summary = json.loads((fits / f"{seed}" / "summary.json").read_text())
         expected = [-person["test"]["nll"] for person in summary["people"]]
-        people = models[f"HumanModel {seed}"]["people"]
+        people = models[f"mirror {seed}"]["people"]
         assert [person["elpd"] for person in people] == pytest.approx(expected, abs=1e-5)

@@ -199,7 +199,10 @@ BAD_DATASETS = {
         renamed(domain="boats"),
         'unknown domain "boats"; known: bomb_defusal, driving, search_rescue',
     ),
-    "unknown setting": (renamed(setting="rain"), 'unknown setting "rain"; known: clear, fog'),
+    "unknown setting": (
+        renamed(setting="rain"),
+        'unknown setting "rain" in driving; known: clear, fog',
+    ),
     "no actions": (
         lambda dataset: dataset.drop_vars("action"),
         "the variable action is missing",

@@ -108,14 +108,13 @@ def test_every_command_is_real(where, line):
     module = importlib.import_module(words[2])
     assert words[2].removeprefix("mirror_ppl.") in COMMANDS
     options = vars(tyro.cli(module.Options, args=words[3:]))
-    # Whom to assist is told by the posterior, unless it is said; so is the setting of others.
+    # Whom to assist is told by the posterior, and whom to fit by recordings, unless it is said.
     if module is evaluate:
         assert evaluate._cells(evaluate.Options(**options))
         return
     domain = get_domain(options.get("domain") or "driving")
     assert options.get("setting") in (*domain.settings, None)
-    unsaid = (None,) if module is assist else ()
-    assert options.get("population", "paper") in (*PEOPLE[domain.name].populations, *unsaid)
+    assert options.get("population") in (*PEOPLE[domain.name].populations, None)
     for option in ("card", "human_model"):
         path = str(options.get(option) or "").partition(":")[0]
         assert not path or path in VARIANTS or (ROOT / path).is_file()

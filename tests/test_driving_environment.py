@@ -106,7 +106,7 @@ def test_steps_outside_a_round_are_refused():
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"setting": "snow"}, 'unknown setting "snow"; known: clear, fog'),
+        ({"setting": "snow"}, 'unknown setting "snow" in driving; known: clear, fog'),
         ({"scenario": "left lane squeeze"}, 'perhaps you meant "left lane squeezes"'),
         ({"render_mode": "human"}, 'unknown render mode "human"; known: rgb_array'),
     ],

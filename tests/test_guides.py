@@ -454,7 +454,7 @@ def test_guides_of_something_else_are_refused(toy, network, tmp_path):
     path = tmp_path / "toy.safetensors"
     save_guide(network, toy, path, {})
     other = HumanModel(toy.self_model)
-    with pytest.raises(AssetError, match="is for human model ToyHuman, not HumanModel; train a"):
+    with pytest.raises(AssetError, match="is for human model ToyHuman, not mirror; train a"):
         load_guide(path, other)
 
     class Changed(ToyHuman):

@@ -23,10 +23,10 @@ def made_up(radii, truth=1.5, domain="search_rescue"):
 
 
 def test_probabilities_are_shares_of_draws_that_see_a_portion():
-    """From the hall its own portion is 1 cell away, the corridor's 2, the far corner's 7.8."""
-    seen = sight_probability(made_up([1.5, 1.5, 2.0, 10.0]), "a")
+    """From the hall its own portion is 1.4 cells away, the corridor's 2.2, the far corner's 7.1."""
+    seen = sight_probability(made_up([1.0, 1.5, 2.3, 10.0]), "a")
     assert seen.shape == (9, 9)
-    assert seen[PLACE] == 1.0
+    assert seen[PLACE] == 0.75
     assert seen[4, 1] == pytest.approx(0.5)
     assert seen[0, 8] == pytest.approx(0.25)
     assert (seen[3:6, :3] == seen[4, 1]).all()
@@ -38,11 +38,14 @@ def test_pictures_show_truth_probability_and_samples(tmp_path):
     figure, words = made["sight.png"]
     assert words == "the house as each person sees it"
     titles = [ax.get_title(loc="left") for ax in figure.axes]
-    assert titles[:6] == ["what they see", "probability", *(f"sample {n}" for n in range(1, 5))]
+    samples = [f"sample {n}" for n in range(1, 5)]
+    assert titles[:7] == ["all there is", "what they see", "probability", *samples]
     # Of the second person the truth is not known.
-    assert [bool(ax.images) for ax in figure.axes] == [True] * 6 + [False] + [True] * 5
-    truth, near = figure.axes[0].images[0].get_array(), figure.axes[2].images[0].get_array()
+    assert [bool(ax.images) for ax in figure.axes] == [True] * 8 + [False] + [True] * 5
+    everything, truth, near = (figure.axes[n].images[0].get_array() for n in (0, 1, 3))
     np.testing.assert_array_equal(truth, near)
+    assert everything[4, 1].sum() > 0
+    assert [figure.axes[n].get_xlabel() for n in (3, 5)] == ["1.5 cells", "2 cells"]
     assert truth[7, 1].sum() > 0 and truth[4, 1].sum() == 0
     figure.save(tmp_path / "sight.png")
     assert (tmp_path / "sight.png").read_bytes().startswith(b"\x89PNG")

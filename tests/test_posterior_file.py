@@ -235,7 +235,7 @@ def test_a_file_that_does_not_say_of_which_domain_it_is(tmp_path, draws):
     [
         ("domain_version", "0", "is of domain version 0, not 1"),
         ("domain_version", None, "is of domain version None, not 1"),
-        ("human_model", "Forgetful", "is of human model Forgetful, not HumanModel"),
+        ("human_model", "Forgetful", "is of human model Forgetful, not mirror"),
         ("self_model", "0123", "is of self model 0123, not "),
     ],
 )
@@ -248,11 +248,18 @@ def test_draws_of_another_version_or_model(tmp_path, draws, name, other, told):
     assert str(error.value).endswith("; fit again, or give what it was fitted with")
 
 
+def test_draws_for_another_domain_than_theirs(tmp_path, draws):
+    """Before anything else, as models are called alike in all domains."""
+    path = write(tmp_path / "x.nc", draws, domain="search_rescue", human_model="Searcher")
+    with pytest.raises(PosteriorError, match="is of domain search_rescue, not driving; fit again"):
+        load_posterior(path).draws(human())
+
+
 def test_draws_for_another_model_than_theirs(path):
     class Forgetful(HumanModel):
         pass
 
-    with pytest.raises(PosteriorError, match="is of human model HumanModel, not Forgetful"):
+    with pytest.raises(PosteriorError, match="is of human model mirror, not Forgetful"):
         load_posterior(path).draws(Forgetful(self_model()))
     with pytest.raises(PosteriorError, match="is of self model"):
         load_posterior(path).draws(HumanModel(SelfModel(DOMAIN)))

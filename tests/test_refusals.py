@@ -43,10 +43,18 @@ def test_what_was_told_is_in_the_posterior_file(tmp_path):
         assert not constants["told_verbal"].any()
 
 
-def test_recordings_of_another_domain_than_asked_for_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"domain": "bomb_defusal"}, "--domain is bomb_defusal, but --demos is of driving"),
+        ({"setting": "clear"}, "--setting is clear, but --demos is of fog"),
+        ({"population": "papr"}, "--population is of the shipped recordings; leave it or --demos"),
+    ],
+)
+def test_recordings_of_something_else_than_asked_for_are_refused(tmp_path, asked, message):
     recordings = asset_path("driving_fog_paper.nc")
-    options = fit.Options(demos=recordings, domain="bomb_defusal", out=tmp_path / "fit")
-    with pytest.raises(OptionError, match="--domain is bomb_defusal, but --demos is of driving"):
+    options = fit.Options(demos=recordings, out=tmp_path / "fit", **asked)
+    with pytest.raises(OptionError, match=message):
         fit.main(options)
     assert not (tmp_path / "fit").exists()
 
@@ -66,3 +74,30 @@ def test_one_radius_is_refused_where_distances_do_not_count():
     robot, _ = load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")
     with pytest.raises(HumanModelError, match="one-radius: in bomb_defusal it does not count"):
         load_human_model("one-radius", robot)
+
+
+def test_speech_is_for_worlds_in_which_something_is_put_into_words(tmp_path):
+    options = train.Options(domain="driving", speech="gpt2", out=tmp_path / "own.safetensors")
+    with pytest.raises(OptionError, match="--speech: nothing is put into words in driving"):
+        train.main(options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_supplement_s_sizes_are_trained(tmp_path, monkeypatch, capsys):
+    """Its Q-network takes long to measure, which is told."""
+
+    def quality(self_model, discount, progress):
+        assert self_model.sizes.q_network == 2048
+        progress(1, 2)
+        progress(2, 2)
+        return {"return_full": 1.0}
+
+    monkeypatch.setattr("mirror_ppl.evaluation.self_model.self_model_quality", quality)
+    small = SelfModelOptions(phases=1, rounds=2, steps=1, batch=2, length=4)
+    monkeypatch.setattr(SelfModelOptions, "of", classmethod(lambda *_, **__: small))
+    out = tmp_path / "paper.safetensors"
+    train.main(train.Options(domain="bomb_defusal", sizes="paper", out=out))
+    self_model, card = load_self_model(out, "bomb_defusal")
+    assert self_model.sizes.q_network == 2048
+    assert "--sizes paper" in card["command"] and card["quality"] == {"return_full": 1.0}
+    assert "measure: 2/2 views" in capsys.readouterr().err

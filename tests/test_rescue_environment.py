@@ -91,7 +91,9 @@ def test_a_round_is_cut_off_after_its_steps():
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(UnknownNameError, match='unknown setting "fog"; known: clear, smoke'):
+    with pytest.raises(
+        UnknownNameError, match='unknown setting "fog" in search_rescue; known: clear, smoke'
+    ):
         gymnasium.make(NAME, setting="fog")
     with pytest.raises(UnknownNameError, match='unknown scenario "victim"'):
         gymnasium.make(NAME, scenario="victim")

@@ -60,6 +60,16 @@ def test_the_gaussian_is_at_the_mode_and_as_curved_as_the_likelihood():
         assert error < 0.1
 
 
+def test_rounding_leaves_the_gaussian_a_gaussian():
+    """Sums of many large parts that nearly cancel, in one order on one side of the diagonal."""
+    generator = torch.Generator().manual_seed(0)
+    without = torch.randn(200, 300, 2, generator=generator)
+    features = 10 * torch.randn(200, 300, 9, generator=generator)
+    found = _laplace(without, features, torch.ones(300, 2), torch.tensor(0.1))
+    assert torch.equal(found.precision_matrix, found.precision_matrix.mT)
+    assert found.sample().isfinite().all()
+
+
 def test_expected_counts_are_of_what_was_done(human, played, table):
     """They add up to the actions; where one combination is left they are those that were taken."""
     sampler = Sampler(human, table)

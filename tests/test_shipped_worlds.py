@@ -77,5 +77,5 @@ def test_guides_ship_of_two_human_models_of_driving():
     for name in ("mirror", "per-item"):
         human = VARIANTS[name](model)
         assert isinstance(network_for("amortized", None, human), AmortizedGuide)
-    with pytest.raises(AssetError, match="no guide ships for OneRadius in driving: train one"):
+    with pytest.raises(AssetError, match="no guide ships for one-radius in driving: train one"):
         network_for("amortized", None, VARIANTS["one-radius"](model))

@@ -60,6 +60,12 @@ LONG_ROUNDS: Mapping[str, Any] = {
     "weight_decay": 0.1,
 }
 """Where rounds are long it takes many steps until what networks do is like what people do."""
+RARE_BUTTONS: Mapping[str, Any] = LONG_ROUNDS | {
+    "learning_rate": 0.05,
+    "weight_decay": 1.0,
+    "reward": 10.0,
+}
+"""Where people also do one thing, waiting, at most steps."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,7 @@ class SoftQOptions(TrainingOptions):
     sample_every: int = 10
     kept: int = 5
 
-    BY_DOMAIN = MappingProxyType({"search_rescue": LONG_ROUNDS, "bomb_defusal": LONG_ROUNDS})
+    BY_DOMAIN = MappingProxyType({"search_rescue": LONG_ROUNDS, "bomb_defusal": RARE_BUTTONS})
     COUNTS = (*TrainingOptions.COUNTS, "sampled", "sample_every", "kept")
 
     def __post_init__(self) -> None:

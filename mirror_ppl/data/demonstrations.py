@@ -71,7 +71,7 @@ class Demonstrations:
 
     def __post_init__(self) -> None:
         domain = get_domain(self.domain)
-        require_known(self.setting, "setting", domain.settings)
+        require_known(self.setting, "setting", domain.settings, domain.name)
         modalities = {modality.name: modality for modality in domain.modalities}
         _check_names("observations", self.observations, modalities, all_of_them=True)
         _check_names("told", self.told, modalities, all_of_them=False)

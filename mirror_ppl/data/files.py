@@ -79,7 +79,7 @@ def load_demonstrations(
             valid; one line that names the file and the fault.
     """
     if domain is not None and setting is not None:
-        require_known(setting, "setting", get_domain(domain).settings)
+        require_known(setting, "setting", get_domain(domain).settings, domain)
     elif domain is not None:
         get_domain(domain)
     dataset = _read(Path(path))
@@ -137,7 +137,9 @@ def from_dataset(
             raise DemonstrationsError(f"attribute {name} is {given!r}, expected {expected!r}")
     domain_name = _agreed(dataset, "domain", domain)
     world = get_domain(domain_name)
-    setting = require_known(_agreed(dataset, "setting", setting), "setting", world.settings)
+    setting = require_known(
+        _agreed(dataset, "setting", setting), "setting", world.settings, world.name
+    )
     dataset = _in_order(dataset, schema.dimension_labels(world))
     dimensions = schema.variable_dimensions(world)
     for name in map(str, dataset.data_vars):

@@ -85,7 +85,10 @@ class Modality:
 
         Raises:
             UnknownNameError: it is none of them; lists them.
+            TypeError: it is no string.
         """
+        if not isinstance(utterance, str):
+            raise TypeError(f"an utterance is a string, not {utterance!r}")
         known = [sentence for about in self.utterances for sentence in about]
         alike = {sentence.lower(): place for place, sentence in enumerate(known)}
         heard = " ".join(utterance.lower().split())
@@ -296,14 +299,14 @@ def map_state(function: Callable[..., Tensor], *states: Any) -> Any:
     )
 
 
-def require_known(name: str, kind: str, known: Sequence[str]) -> str:
-    """Return ``name`` if it is one of ``known``.
+def require_known(name: str, kind: str, known: Sequence[str], where: str = "") -> str:
+    """Return ``name`` if it is one of ``known``, in the domain ``where``.
 
     Raises:
         UnknownNameError: listing the known names.
     """
     if name not in known:
-        raise UnknownNameError.of(kind, name, known)
+        raise UnknownNameError.of(kind, name, known, where)
     return name
 
 

@@ -250,7 +250,7 @@ class BombDefusal:
         Raises:
             UnknownNameError: if the setting is neither ``labelled`` nor ``unlabelled``.
         """
-        require_known(setting, "setting", self.settings)
+        require_known(setting, "setting", self.settings, self.name)
         everything = self.communicable(observation)
         if setting == "labelled":
             return everything

@@ -229,7 +229,7 @@ class Driving:
         Raises:
             UnknownNameError: if the setting is neither ``clear`` nor ``fog``.
         """
-        require_known(setting, "setting", self.settings)
+        require_known(setting, "setting", self.settings, self.name)
         ahead = observation["visual"][..., 0]
         if setting == "clear":
             seen = torch.ones_like(ahead, dtype=torch.bool)

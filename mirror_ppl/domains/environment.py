@@ -50,9 +50,11 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         render_mode: str | None = None,
     ) -> None:
         domain = self.domain
-        self.setting = require_known(setting or domain.settings[0], "setting", domain.settings)
+        self.setting = require_known(
+            setting or domain.settings[0], "setting", domain.settings, domain.name
+        )
         if scenario is not None:
-            require_known(scenario, "scenario", domain.scenarios)
+            require_known(scenario, "scenario", domain.scenarios, domain.name)
         self.scenario = scenario
         if render_mode is not None:
             require_known(render_mode, "render mode", RENDER_MODES)

@@ -280,7 +280,7 @@ class SearchRescue:
         Raises:
             UnknownNameError: if the setting is neither ``clear`` nor ``smoke``.
         """
-        require_known(setting, "setting", self.settings)
+        require_known(setting, "setting", self.settings, self.name)
         _, distance = self.distance(observation)
         everything = torch.ones_like(observation["verbal"][..., 0], dtype=torch.bool)
         if setting == "clear":

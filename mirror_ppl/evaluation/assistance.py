@@ -102,6 +102,7 @@ class Played:
         items: communicated items by modality, ``[R]`` each.
         relevant: those of them that were relevant, by notion of relevance and modality, ``[R]``.
         chances: items that could have been communicated, by modality, summed over rounds.
+        steps: of all rounds, as long as they were under way: decisions.
         milliseconds: mean time of a decision.
         log: what was decided, one entry a decision, if asked for.
     """
@@ -112,6 +113,7 @@ class Played:
     items: dict[str, list[int]]
     relevant: dict[str, dict[str, list[int]]]
     chances: dict[str, int]
+    steps: int
     milliseconds: float
     log: list[dict[str, Any]] = field(default_factory=list)
 
@@ -283,7 +285,7 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
     items = {m.name: torch.zeros(number, dtype=torch.long) for m in domain.modalities}
     relevant: dict[str, dict[str, Tensor]] = {}
     chances = dict.fromkeys(items, 0)
-    seconds, log = 0.0, []
+    seconds, steps, log = 0.0, 0, []
     told, action = {}, torch.zeros(number, dtype=torch.long)
     for step in range(domain.horizon):
         observation = domain.observe(state)
@@ -297,6 +299,7 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
         flags, decisions = say(rounds, Truth(step, state, memory))
         seconds += perf_counter() - began
         under_way = ~domain.over(state)[0]
+        steps += int(under_way.sum())
         flags = flags & under_way[:, None]
         told = channels.split(flags)
         probability, memory = driver.step(memory, observation, channels.split(flags[None]))
@@ -334,7 +337,8 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
             for notion, counts in relevant.items()
         },
         chances,
-        1000 * seconds / (number * domain.horizon),
+        steps,
+        1000 * seconds / steps,
         log,
     )
 

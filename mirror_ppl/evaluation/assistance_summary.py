@@ -14,13 +14,12 @@ LEVELS = (0.05, 0.95)
 
 
 def summarize_assistance(
-    played: Mapping[str, Sequence[Played]], horizon: int, seed: int = 0
+    played: Mapping[str, Sequence[Played]], seed: int = 0
 ) -> dict[str, dict[str, Any]]:
     """One entry a communicator.
 
     Args:
         played: of each communicator the rounds of each of P people, R each; the same rounds.
-        horizon: steps of a round.
         seed: of the bootstrap.
 
     Returns:
@@ -51,7 +50,8 @@ def summarize_assistance(
             "net_by_person": net[name].mean(1).tolist(),
             "mishaps": _mean(parts, "mishaps"),
             "items": {
-                modality: float(np.mean([part.items[modality] for part in parts])) / horizon
+                modality: sum(sum(part.items[modality]) for part in parts)
+                / sum(part.steps for part in parts)
                 for modality in parts[0].items
             },
             "relevant": _relevance(parts),

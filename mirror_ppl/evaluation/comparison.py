@@ -33,6 +33,7 @@ import xarray as xr
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.export import az
+from mirror_ppl.models.loading import model_name
 
 FILE = "posterior.nc"
 """What a fit calls its posterior."""
@@ -99,7 +100,7 @@ class Standing:
     Attributes:
         label: what it is called.
         path: its posterior.
-        human_model: name of its class.
+        human_model: what commands call it.
         weight: by stacking; the weights of all models sum to 1.
         good_k: Pareto k up to which leave-one-out is trusted; ``None`` if held out.
         total: over all rounds.
@@ -231,7 +232,7 @@ def _constants(data: az.InferenceData, group: str) -> dict[str, np.ndarray]:
 
 
 def label_models(files: Sequence[FitFile]) -> tuple[str, ...]:
-    """Names of the models: their class, and of their path as much as tells them apart."""
+    """What commands call the models, and of their path as much as tells them apart."""
     models = [_model(file) for file in files]
     paths = [file.path.resolve() for file in files]
     # A fit's folder says more than the file in it, which is called the same in all of them.
@@ -293,7 +294,7 @@ def compare_fits(files: Sequence[FitFile], labels: Sequence[str], by: str = "loo
 
 
 def _model(file: FitFile) -> str:
-    return file.attributes.get("human_model", "unknown")
+    return model_name(file.attributes.get("human_model", "unknown"))
 
 
 def _source(file: FitFile) -> dict[str, str]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.table import Table
 
 from mirror_ppl.console import console_for_tables
+from mirror_ppl.inference.identifiability import NEGLIGIBLE
 from mirror_ppl.inference.ranks import HIGH_PARETO_K
 from mirror_ppl.models.implants import NOTICES
 
@@ -44,13 +45,18 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
             f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
             f"{HIGH_PARETO_K}): another --guide may do better"
         )
-    few = [person["id"] for person in people if person.get("effective_draws", FEW) < FEW]
+    few = [
+        person["id"]
+        for person in people
+        if person.get("rounds", 1) and person.get("effective_draws", FEW) < FEW
+    ]
     if few:
         print(
             f"In the population, fewer than {FEW} draws count of {', '.join(few)}: it is at odds "
             "with what they did, or far from the prior; their posterior is coarse"
         )
-    _show_open([person["identifiability"] for person in people if "identifiability" in person])
+    opened = [person["identifiability"] for person in people if "identifiability" in person]
+    _show_open(opened, sites)
     tested = [person["test"] for person in people if person["test"]]
     if not tested:
         print("No rounds were held out, so that predictions are not judged (--train-rounds)")
@@ -108,7 +114,7 @@ def _side_by_side(
     return blocks
 
 
-def _show_open(people: list[dict[str, Any]]) -> None:
+def _show_open(people: list[dict[str, Any]], sites: Iterable[str]) -> None:
     """What is open about sight, and which rounds would tell most."""
     if not people:
         return
@@ -116,14 +122,21 @@ def _show_open(people: list[dict[str, Any]]) -> None:
         sum(person[part]["together"] for person in people) / len(people)
         for part in ("open", "hangs_on_policy")
     )
-    line = f"Open about what they see: {entropy:.2f} nats on average, "
-    line += f"of which {hanging:.2f} hang on how they decide"
     expected = {
         name: sum(person["scenarios"][name]["expected"] for person in people) / len(people)
         for name in people[0]["scenarios"]
     }
-    if expected:
-        best = max(expected, key=lambda name: expected[name])
+    best = max(expected, key=lambda name: expected[name], default="")
+    told = [person["open"]["together"] for person in people]
+    told += [one["expected"] for person in people for one in person["scenarios"].values()]
+    if max(told) < NEGLIGIBLE:
+        noticing = any(name.startswith(NOTICES) for name in sites)
+        but = ", but for how soon they notice things, which is not counted" if noticing else ""
+        print(f"Nothing is open about what they see{but}")
+        return
+    line = f"Open about what they see: {entropy:.2f} nats on average, "
+    line += f"of which {hanging:.2f} hang on how they decide"
+    if best and expected[best] >= NEGLIGIBLE:
         line += f'; a round more of "{best}" would tell most, {expected[best]:.2f}'
     print(line)
 

@@ -264,9 +264,13 @@ LEARNERS: dict[str, Learn] = {
 those of other names; ``mirror-population`` has a prior learned from others.
 Rivals are told what the setting lets people see, which MIRROR has to find out, but for those that
 read ``everything``, as the human model is given it."""
-SLOW = {"mirror-nuts": DOMAINS, "mirror-svi": ("bomb_defusal",)}
-"""Of these what is compared on request only, and where: a chain of each person takes minutes, and
-`svi` sums over all rules of a bomb at each of its steps."""
+SLOW = {
+    "mirror-nuts": DOMAINS,
+    "mirror-svi": ("bomb_defusal",),
+    "sqil-everything": ("search_rescue", "bomb_defusal"),
+}
+"""Of these what is compared on request only, and where: a chain of each person takes minutes, `svi`
+sums over all rules of a bomb at each of its steps, and SQIL learns from long rounds for minutes."""
 PLANNABLE = ("mirror", "bc", "sqil")
 """Of these what drives a communicator in the comparison of assistance."""
 

@@ -8,6 +8,7 @@ open, the return of somebody who assumes nothing is all there is to compare.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -92,7 +93,11 @@ def planner_actions(domain: Domain, start: Any, steps: int, discount: float) -> 
 
 @torch.no_grad()
 def self_model_quality(
-    self_model: SelfModel, rounds: int = 4000, seed: int = 1, discount: float = 0.9
+    self_model: SelfModel,
+    rounds: int = 4000,
+    seed: int = 1,
+    discount: float = 0.9,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, float]:
     """Returns and agreements of a self-model, all on the same rounds.
 
@@ -101,6 +106,7 @@ def self_model_quality(
         rounds: number of rounds B.
         seed: seed of the rounds.
         discount: the discount that the self-model was trained with.
+        progress: told how many views are done, and of how many.
 
     Returns:
         By name: mean returns of the exact planner, of random actions and of the self-model in
@@ -130,7 +136,8 @@ def self_model_quality(
         views["clear"] = fixed_views(domain, rounds, generator)
     for name, reach in domain.partial_views.items():
         views[name] = fixed_views(domain, rounds, generator, reach)
-    for name, plan in views.items():
+    for done, (name, plan) in enumerate(views.items()):
+        progress(done, len(views))
         if name in ("full", "clear") or not domain.settled:
             own = drive(self_model, start, plan, steps, generator)
             reached = float(returns(domain, start, own).mean())
@@ -155,6 +162,7 @@ def self_model_quality(
         stake = exact.amax(-1) - exact.amin(-1)
         report[f"agreement_{name}"] = float(agree.float().mean())
         report[f"clear_agreement_{name}"] = float(agree[stake > CLEAR_DECISION].float().mean())
+    progress(len(views), len(views))
     return report
 
 

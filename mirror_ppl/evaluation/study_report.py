@@ -62,7 +62,7 @@ def _prediction(rows: Rows) -> Report:
         _tables(standings, "NLL of held-out actions, nats an action: less is better", floor),
         [_claimed(claim) for claim in claims],
         data,
-        plot_curves(standings, "NLL of held-out actions (nats an action)", floor),
+        plot_curves(standings, "NLL of held-out actions (nats an action)", floor, by_ratio=True),
     )
 
 

@@ -65,7 +65,7 @@ def simulated_people(
         UnknownNameError: there is no such domain, setting or population.
     """
     own = PEOPLE[require_known(domain, "domain", tuple(PEOPLE))]
-    require_known(population, "population", own.populations)
+    require_known(population, "population", own.populations, domain)
     return own.simulated(setting, population, people, seed, device)
 
 

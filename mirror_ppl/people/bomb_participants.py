@@ -100,7 +100,7 @@ def simulated_defusers(
     Raises:
         UnknownNameError: there is no such setting or population.
     """
-    require_known(setting, "setting", BombDefusal.settings)
-    require_known(population, "population", DEFUSER_POPULATIONS)
+    require_known(setting, "setting", BombDefusal.settings, BombDefusal.name)
+    require_known(population, "population", DEFUSER_POPULATIONS, BombDefusal.name)
     reads = torch.full((people,), setting == "labelled", device=device)
     return Defusers(learned_notices(people, seed, population == "diverse").to(device), reads)

@@ -68,8 +68,8 @@ def reaches(population: str, setting: str, people: int, seed: int) -> Tensor:
     Raises:
         UnknownNameError: there is no such population or setting.
     """
-    require_known(setting, "setting", Driving.settings)
-    require_known(population, "population", tuple(POPULATIONS))
+    require_known(setting, "setting", Driving.settings, Driving.name)
+    require_known(population, "population", tuple(POPULATIONS), Driving.name)
     return POPULATIONS[population](setting, people, seed)
 
 

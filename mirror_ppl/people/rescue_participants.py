@@ -189,8 +189,8 @@ def simulated_firefighters(
     Raises:
         UnknownNameError: there is no such setting or population.
     """
-    require_known(setting, "setting", SearchRescue.settings)
-    require_known(population, "population", tuple(RESCUE_POPULATIONS))
+    require_known(setting, "setting", SearchRescue.settings, SearchRescue.name)
+    require_known(population, "population", tuple(RESCUE_POPULATIONS), SearchRescue.name)
     return Firefighters(
         radius=RESCUE_POPULATIONS[population](setting, people, seed).to(device),
         transitions=learned_transitions(people, seed).to(device),

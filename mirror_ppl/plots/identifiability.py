@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 COLOURS = (BLUE, "#56B4E9", ORANGE, "#F0E442", PURPLE, "#009E73", "#D55E00", GREY)
 ROW = 0.34
 """Inches of a person."""
+TITLED = 3.8
+"""Inches that a title takes."""
 WRAP = 22
 MOST_PEOPLE = 60
 
@@ -36,10 +38,8 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
     scenarios = [str(name) for name in group["scenario"].values]
     sites = [str(name) for name in group["site"].values]
     # Room for what stands below: names of scenarios, or the legend.
-    figure = Picture(
-        figsize=(5.2 + 0.75 * len(scenarios), ROW * len(people) + 3.4), layout="constrained"
-    )
-    widths = [5.2, max(0.01, 0.75 * len(scenarios))][: 1 + bool(scenarios)]
+    widths = [5.2, max(TITLED, 0.75 * len(scenarios))][: 1 + bool(scenarios)]
+    figure = Picture(figsize=(sum(widths), ROW * len(people) + 3.4), layout="constrained")
     axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
     rows = np.arange(len(people))
     left = np.zeros(len(people))

@@ -30,8 +30,9 @@ SITE = SIGHT + "radius"
 MOST_PEOPLE = 12
 """More people than this do not fit on one picture."""
 SAMPLES = 4
-PLACE = (6, 1)
-"""Where the firefighter of the pictures stands: in the hall, before the left corridor."""
+PLACE = (6, 2)
+"""Where the firefighter of the pictures stands: in the hall, by the left corridor, in a corner of a
+portion, which they do not see all of with a radius of 1."""
 SCENARIO = "victim top-left, right corridor blocked"
 
 
@@ -43,7 +44,7 @@ def has_sight(data: az.InferenceData) -> bool:
 def sight_probability(data: az.InferenceData, person: str) -> np.ndarray:
     """Posterior probability that a person sees each cell of the map, ``[9, 9]``.
 
-    It is that of a firefighter who stands before the left corridor and has not looked around yet.
+    It is that of a firefighter who stands by the left corridor and has not looked around yet.
 
     Args:
         data: with the site ``sight_radius``, in cells.
@@ -56,7 +57,7 @@ def sight_probability(data: az.InferenceData, person: str) -> np.ndarray:
 
 
 def sight_picture(data: az.InferenceData) -> Picture:
-    """What people see of the house, one row each: truth, probability, and posterior samples.
+    """What people see of the house, one row each: the house, truth, probability, samples.
 
     Black is what they do not see. Of more than 12 people the first 12 are shown.
 
@@ -66,25 +67,26 @@ def sight_picture(data: az.InferenceData) -> Picture:
     everybody = people(data)
     shown = everybody[:MOST_PEOPLE]
     known = [truth(data, SITE, person) is not None for person in shown]
-    columns = (["what they see"] if any(known) else []) + ["probability"]
+    columns = ["all there is", *(["what they see"] if any(known) else []), "probability"]
     columns += [f"sample {number}" for number in range(1, SAMPLES + 1)]
     size = (1.75 * len(columns) + 0.6, 1.8 * len(shown) + 1.5)
     figure = Picture(figsize=size, layout="constrained")
     grid = figure.subplots(len(shown), len(columns), squeeze=False)
     for row, person in zip(grid, shown, strict=True):
         panels = list(row)
+        _draw(panels.pop(0), np.ones((SIDE, SIDE)), "")
         radius = truth(data, SITE, person)
         if any(known):
             ax = panels.pop(0)
             if radius is None:
                 ax.set_axis_off()
             else:
-                _draw(ax, _seen(np.array([radius]))[0], f"{radius:g} cells")
+                _draw(ax, _seen(np.array([radius]))[0], _cells(radius))
         _draw_probability(panels.pop(0), sight_probability(data, person))
         drawn = draws(of_person(data, "posterior", person)[SITE])
         chosen = np.linspace(0, len(drawn) - 1, SAMPLES).round().astype(int)
         for ax, value in zip(panels, drawn[chosen], strict=True):
-            _draw(ax, _seen(np.array([value]))[0], f"{value:g} cells")
+            _draw(ax, _seen(np.array([value]))[0], _cells(value))
         row[0].set_ylabel(person, fontsize=10)
     label_columns(grid[0], columns)
     explain(
@@ -92,8 +94,8 @@ def sight_picture(data: az.InferenceData) -> Picture:
         data,
         "What each person sees of the house",
         len(shown),
-        "Black: not seen. Blue: the firefighter, before the left corridor. Green: the victim.\n"
-        "Purple: the obstacle. Yellow: the entrance.",
+        "Black: not seen. Blue: the firefighter, by the left corridor. Green: the victim.\n"
+        "Purple: the obstacle. Yellow: the entrance. Below: how far they see.",
     )
     return figure
 
@@ -111,6 +113,10 @@ def _seen(radii: np.ndarray) -> np.ndarray:
     portions = (distance[0].numpy() <= radii[:, None]).astype(float)
     each = SIDE // PORTION
     return portions.reshape(-1, each, each).repeat(PORTION, 1).repeat(PORTION, 2)
+
+
+def _cells(radius: float) -> str:
+    return "1 cell" if radius == 1 else f"{radius:g} cells"
 
 
 def _map() -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from mirror_ppl.evaluation.study_summary import Place, Share, Standing
 from mirror_ppl.plots.picture import Picture
@@ -38,7 +39,10 @@ WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 
 
 def plot_curves(
-    standings: Sequence[Standing], label: str, floor: Mapping[Place, float] | None = None
+    standings: Sequence[Standing],
+    label: str,
+    floor: Mapping[Place, float] | None = None,
+    by_ratio: bool = False,
 ) -> Picture:
     """Draw a measure against the number of rounds, one panel a place; bands are 90% intervals.
 
@@ -46,6 +50,8 @@ def plot_curves(
         standings: of `summarize_study`; models that learn from 0 rounds are level lines.
         label: what is measured.
         floor: what cannot be surpassed, by place, if it is known.
+        by_ratio: the measure is shown by its logarithm, so that what is near the floor can be told
+            apart beside what is far from it.
     """
     places = list(dict.fromkeys(one.place for one in standings))
     figure = Picture(figsize=(WIDTH * len(places) + LEGEND, HEIGHT), layout="constrained")
@@ -61,11 +67,21 @@ def plot_curves(
         ax.set_xscale("log")
         ax.set_xticks(ticks, [str(number) for number in ticks])
         ax.minorticks_off()
+        if by_ratio:
+            _logarithmic(ax)
         ax.set_xlabel("rounds learned from")
         _title(ax, place)
     panels[0].set_ylabel(label)
     _legend(figure, panels)
     return figure
+
+
+def _logarithmic(ax: Axes) -> None:
+    """Show heights by their logarithm, with numbers that are read as such."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 4, 6, 8)))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_major_formatter("{x:g}")
 
 
 def _curve(ax: Axes, own: Sequence[Standing]) -> None:
