@@ -112,9 +112,9 @@ class Progress:
     """Shows on stderr how far long work has come; a context manager.
 
     On a terminal it is a bar with the time elapsed and remaining. Elsewhere (a file, a pipe, a
-    notebook) it is plain lines such as `fit: 120/300 loss 12.3, 8 s`: at most one in `interval`
-    seconds, and one for the last state when the work ends or fails. Cheap enough to be told about
-    every step.
+    notebook) it is plain lines such as `fit: 120/300 loss 12.3, 8 s, 12 s left`: at most one in
+    `interval` seconds, and one for the last state when the work ends or fails. Cheap enough to be
+    told about every step.
 
     Args:
         name: what is being done, such as "fit".
@@ -145,8 +145,40 @@ class Progress:
         self._display: _Display | None = None
         self._shown = (self.done, self.message)
         self._next = 0.0
+        self._resume(done)
+
+    def _resume(self, done: int) -> None:
+        self._start, self._begun = monotonic(), done
+        self._last = self._start
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the work began, or was resumed."""
+        return monotonic() - self._start
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that the rest will take if it goes on like this; None as long as nobody knows.
+
+        By all that was done in this run: steps can take minutes, and each another time.
+        """
+        done = self.done - self._begun
+        if self.total is None or done < 1:
+            return None
+        estimate = (self._last - self._start) / done * (self.total - self.done)
+        return max(0.0, estimate - (monotonic() - self._last))
+
+    def resume(self, done: int) -> None:
+        """Tell how many steps an earlier run did; what is left is not reckoned by those."""
+        self._resume(done)
+        self.done = done
+        if self._display is not None:
+            self.message = f"{done} were done before" if done else ""
+            self._shown = (done, self.message)
+            self._display.show(self)
 
     def __enter__(self) -> Self:
+        self._resume(self.done)
         if not self._quiet:
             # Looked up now, not when the class was defined: stderr may have been redirected since.
             stream = sys.stderr if self._stream is None else self._stream
@@ -171,7 +203,7 @@ class Progress:
 
     def update(self, done: int, message: str = "") -> None:
         """Tell that `done` steps are done in all, with a message such as "loss 12.3"."""
-        self.done, self.message = done, message
+        self.done, self.message, self._last = done, message, monotonic()
         if self._display is not None and (now := monotonic()) >= self._next:
             self._next = now + self._display.interval
             self._shown = (done, message)
@@ -218,12 +250,13 @@ class _Lines:
     def __init__(self, progress: Progress, stream: TextIO, interval: float) -> None:
         self.interval = interval
         self._stream = stream
-        self._start = monotonic()
 
     def show(self, progress: Progress) -> None:
         total = "" if progress.total is None else f"/{progress.total}"
         state = f"{progress.name}: {progress.done}{total} {progress.message}".rstrip()
-        print(f"{state}, {_duration(monotonic() - self._start)}", file=self._stream, flush=True)
+        left = progress.left
+        ahead = "" if not left else f", {_duration(left)} left"
+        print(f"{state}, {_duration(progress.elapsed)}{ahead}", file=self._stream, flush=True)
 
     def close(self) -> None:
         pass
@@ -238,19 +271,27 @@ class _Bar:
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
+            ProgressColumn,
+            Task,
             TextColumn,
             TimeElapsedColumn,
-            TimeRemainingColumn,
         )
         from rich.progress import Progress as RichProgress
+        from rich.text import Text
+
+        class Left(ProgressColumn):
+            """rich's own forgets what took longer than its window."""
+
+            def render(self, task: Task) -> Text:
+                left = progress.left
+                return Text("" if not left else f"{_duration(left)} left")
 
         self._rich = RichProgress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            Left(),
             TextColumn("{task.fields[message]}", markup=False),
             console=console,
             # rich sends what is printed meanwhile above the bar, to the bar's stream: right on a

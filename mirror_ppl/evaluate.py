@@ -26,8 +26,8 @@ given again; the exit status is 1 if something failed."""
 FAILED = 1
 QUICK = ("driving",)
 """Worlds of short rounds, of which more is learned in the same time."""
-SEEDS, FEW_SEEDS = 5, 2
-"""Of prediction in those, and otherwise."""
+SEEDS, FEW_SEEDS = (5, 2), (2, 1)
+"""Of prediction and of the others, in those worlds and otherwise."""
 TOLD = 0.03
 """Of an item at a step, in rounds from which it is learned how to help."""
 
@@ -47,13 +47,15 @@ class Options:
     people: int = 10
     """People of each seed."""
     seeds: int | None = None
-    """Seeds 0, 1 and so on, of people and rounds; 5 of prediction in driving, otherwise 2, unless
-    given: on two cores all studies of a world then take less than an hour."""
+    """Seeds 0, 1 and so on, of people and rounds. Unless given 5 of prediction and 2 of the others
+    in driving, and 2 and 1 where rounds are long: on two cores all studies of a world then take
+    about an hour."""
     models: tuple[str, ...] = ()
     """What is compared; by default everything that fits the study: mirror, mirror-amortized,
     mirror-svi, mirror-population, perceptual-only, policy-only, no-implants, bc,
     bc-everything, sqil, sqil-everything, logistic (and mirror-nuts, if asked for), or of
-    assistance and relevance mirror (which also plans as mirror-kl), bc, sqil, none, all, oracle."""
+    assistance and relevance mirror (which also plans as mirror-kl), bc, sqil, none, all, oracle.
+    path/to/file.py:Class is a human model of your own."""
     rounds: tuple[int, ...] = (1, 2, 5, 10, 20)
     """Numbers of rounds that are learned from, from 1 to 20; the most only, for relevance."""
     played: int = 5
@@ -65,7 +67,8 @@ class Options:
     learned from. Unless given .03 of assistance and relevance, so that everybody can learn what
     people make of messages, and none of prediction."""
     out: Path = Path("runs/evaluate")
-    """Folder for the results; made if it is not there."""
+    """Folder for the results; made if it is not there. Tables are of the last command: what is to
+    be in one table is asked for at once, and what was done before is not done again."""
     jobs: int = -1
     """Processes on this machine; -1 for one a core."""
     scheduler: str | None = None
@@ -117,6 +120,7 @@ def main(options: Options) -> int:
             options.jobs,
             options.scheduler,
             progress.update,
+            progress.resume,
         )
     rows = [row for outcome in outcomes for row in outcome.rows]
     failed = [outcome for outcome in outcomes if outcome.error is not None]
@@ -175,7 +179,7 @@ def _cells(options: Options) -> list[Any]:
                 f"{', '.join(settings)}"
             )
         for setting in dict.fromkeys(own):
-            most = SEEDS if predicting and domain in QUICK else FEW_SEEDS
+            most = (SEEDS if domain in QUICK else FEW_SEEDS)[0 if predicting else 1]
             for seed in range(options.seeds or most):
                 group = Group(domain, setting, options.population, options.people, seed, told)
                 cells += (

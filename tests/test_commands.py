@@ -238,8 +238,8 @@ def test_progress_lines_are_plain_and_rare(clock):
             clock[0] += 8 / 120
             progress.update(step, f"loss {step / 10:.1f}")
     assert stream.getvalue().splitlines() == [
-        "fit: 60/300 loss 6.0, 4 s",
-        "fit: 120/300 loss 12.0, 8 s",
+        "fit: 60/300 loss 6.0, 4 s, 16 s left",
+        "fit: 120/300 loss 12.0, 8 s, 12 s left",
     ]
 
 
@@ -250,6 +250,37 @@ def test_progress_ends_with_the_last_state_once(clock):
         progress.advance("loss 1.5")
         clock[0] += 125
     assert stream.getvalue() == "fit: 2/2 loss 1.5, 2 min 5 s\n"
+
+
+def test_progress_of_resumed_work_reckons_by_what_this_run_did(clock):
+    """One of six steps takes ten minutes, after four that were done before."""
+    stream = io.StringIO()
+    with Progress("evaluate", 6, stream=stream) as progress:
+        clock[0] += 5
+        progress.resume(4)
+        assert progress.left is None
+        clock[0] += 600
+        progress.update(5, "mirror")
+        clock[0] += 60
+        assert progress.left == 540
+        clock[0] += 1000
+        assert progress.left == 0
+        progress.update(6, "bc")
+    assert stream.getvalue().splitlines() == [
+        "evaluate: 4/6 4 were done before, 0 s",
+        "evaluate: 5/6 mirror, 10 min 0 s, 10 min 0 s left",
+        "evaluate: 6/6 bc, 27 min 40 s",
+    ]
+
+
+def test_progress_on_a_terminal_tells_what_is_left_of_slow_steps(monkeypatch, clock):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    stream = Terminal()
+    with Progress("evaluate", 3, stream=stream) as progress:
+        clock[0] += 600
+        progress.update(1)
+    assert "20 min 0 s left" in stream.getvalue()
 
 
 def test_progress_tells_how_far_failed_work_came(clock):

@@ -41,7 +41,7 @@ def test_mirror_predicts_what_a_fit_predicts():
     """The same draws of the same posterior, by the command's function and by the study's."""
     human = load_human_model(None, FOG.self_model)
     fit = fit_people(human, FOG.recordings(), InferenceOptions(), seed=3, train_rounds=2)
-    rows = predict(Prediction(FOG, "mirror", (2,)))
+    rows = predict(Prediction(FOG, "mirror", 2))
     assert [row["person"] for row in rows] == ["person-01", "person-02"]
     found = learn("mirror", FOG, 2, 3)
     test = FOG.recordings().select_rounds(TEST)
@@ -169,6 +169,30 @@ def test_mirror_speaks_in_two_ways_and_rivals_in_one(monkeypatch):
     ]
 
 
+def test_a_human_model_of_ones_own_is_compared(tmp_path):
+    """One that is the package's own predicts and plans as that does; its file counts."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from mirror_ppl.models import HumanModel\n\nclass Mine(HumanModel):\n    ...\n"
+    )
+    name, group = f"{file}:Mine", replace(FOG, people=1)
+    own, mirror = (predict(Prediction(group, model, 1)) for model in (name, "mirror"))
+    assert [row["model"] for row in own] == [name]
+    assert [row["nll"] for row in own] == [row["nll"] for row in mirror]
+    own, mirror = (assist(Assistance(group, model, 1, 1, 5)) for model in (name, "mirror"))
+    assert [row["model"] for row in own] == [name]
+    assert own[0]["net"] == mirror[0]["net"]
+    assert [cell.model for cell in study.prediction_cells(group, (name, "bc", name), (1,))] == [
+        "bc",
+        name,
+    ]
+    cells = [Prediction(group, model, 1) for model in (name, "mirror")]
+    before = [study.identities(["driving"])(cell) for cell in cells]
+    file.write_text(file.read_text() + "\n")
+    after = [study.identities(["driving"])(cell) for cell in cells]
+    assert before[0] != after[0] and before[1] == after[1]
+
+
 # --- the command ------------------------------------------------------------------------------
 
 
@@ -178,7 +202,8 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     assert command(evaluate, *args) == 0
     out, err = capsys.readouterr()
     assert "driving, fog, paper: NLL of held-out actions" in out
-    assert "prediction: 3/3 logistic in driving, fog, seed 0" in err
+    assert err.startswith("prediction: 0/6, 0 s\n")
+    assert "prediction: 6/6 logistic of 2 rounds in driving, fog, seed 0" in err
     with (tmp_path / "prediction.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(QUICK) * 2 * 2
@@ -193,14 +218,18 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     }
     assert f"| bc | {means[1]:.3f} | {means[2]:.3f} |" in page
     assert content["failed"] == {}
-    assert set(content["seconds"]) == {f"{name} in driving, fog, seed 0" for name in QUICK}
+    assert set(content["seconds"]) == {
+        f"{name} of {rounds} in driving, fog, seed 0"
+        for name in QUICK
+        for rounds in ("1 round", "2 rounds")
+    }
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
     # Again it does nothing, and says so; of more models it does the others.
     assert command(evaluate, *args) == 0
-    assert "3/3 3 were done before" in capsys.readouterr().err
+    assert "6/6 6 were done before" in capsys.readouterr().err
     args[args.index("logistic")] = "policy-only"
     assert command(evaluate, *args) == 0
-    assert len(list((tmp_path / "parts").iterdir())) == len(QUICK) + 1
+    assert len(list((tmp_path / "parts").iterdir())) == 2 * (len(QUICK) + 1)
 
 
 def test_what_fails_is_told_and_the_rest_is_shown(tmp_path, capsys, monkeypatch):
@@ -212,9 +241,11 @@ def test_what_fails_is_told_and_the_rest_is_shown(tmp_path, capsys, monkeypatch)
     args += ["--models", "no-implants", "bc", "--jobs", 1, "--out", tmp_path]
     assert command(evaluate, *args) == 1
     out = capsys.readouterr().out
-    assert "failed: bc in driving, fog, seed 0: RuntimeError: this one cannot learn" in out
+    assert (
+        "failed: bc of 1 round in driving, fog, seed 0: RuntimeError: this one cannot learn" in out
+    )
     content = json.loads((tmp_path / "prediction.json").read_text())
-    assert list(content["failed"]) == ["bc in driving, fog, seed 0"]
+    assert list(content["failed"]) == ["bc of 1 round in driving, fog, seed 0"]
     assert {one["model"] for one in content["nll"]} == {"no-implants"}
 
 
@@ -242,6 +273,7 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
         (("prediction", "--domain", "drivin"), 'unknown domain "drivin"'),
         (("prediction", "--models", "sqill"), 'unknown model "sqill"'),
         (("assistance", "--models", "logistic"), 'unknown model "logistic"'),
+        (("prediction", "--models", "mine.py:Mine"), "mine.py: there is no such file"),
         (("prediction", "--setting", "smog"), 'unknown setting "smog"'),
         (
             ("prediction", "--domain", "driving", "bomb_defusal", "--setting", "fog"),
@@ -295,11 +327,11 @@ def test_results_depend_on_the_code_that_made_them():
     for part in study.CODE:
         assert list(root.glob(part)), part
     assert root / "plots/study.py" not in files
-    cell = Prediction(FOG, "mirror", (1,))
+    cell = Prediction(FOG, "mirror", 1)
     before = study.identities(["driving"])(cell)
     assert before == study.identities(["driving", "bomb_defusal"])(cell)
     assert before != study.identities(["bomb_defusal"])(
-        Prediction(replace(FOG, domain="bomb_defusal"), "mirror", (1,))
+        Prediction(replace(FOG, domain="bomb_defusal"), "mirror", 1)
     )
 
 
@@ -314,6 +346,23 @@ def test_every_model_has_a_look_of_its_own():
 
 def standing(model, rounds, mean, place=Place("driving", "fog", "paper")):  # noqa: B008
     return Standing(place, model, rounds, Interval(mean, mean - 0.1, mean + 0.1), 3, None)
+
+
+def test_tables_say_where_somebody_is_missing():
+    """A cell of bc failed: its mean is of one person, and what is ahead of it, too."""
+    rows = [
+        Place("driving", "fog", "paper")._asdict()
+        | {"seed": seed, "person": "a", "model": model, "rounds": 1}
+        | {"nll": nll, "accuracy": 0.5, "floor": 0.1}
+        for seed, model, nll in ((0, "mirror", 0.2), (1, "mirror", 0.4), (1, "bc", 0.5))
+    ]
+    nll, accuracy = REPORTS["prediction"](rows).tables
+    assert "mean over people (2)" in nll.caption
+    assert dict(nll.rows) == {
+        "mirror": "0.300",
+        "bc": "0.500 (1 of 2 people)\n+0.100\n[+0.100, +0.100]\n100%",
+    }
+    assert dict(accuracy.rows)["bc"] == "0.500 (1 of 2 people)\n+0.000\n[+0.000, +0.000]\n50%"
 
 
 def test_relevance_has_a_panel_for_each_place(monkeypatch):
@@ -343,7 +392,11 @@ def test_worlds_of_long_rounds_have_fewer_seeds_unless_more_are_asked_for():
         "search_rescue": {0, 1},
         "bomb_defusal": {0, 1},
     }
-    assert seeds(study="assistance", domain=DOMAINS) == dict.fromkeys(DOMAINS, {0, 1})
+    assert seeds(study="assistance", domain=DOMAINS) == {
+        "driving": {0, 1},
+        "search_rescue": {0},
+        "bomb_defusal": {0},
+    }
     assert seeds(study="prediction", domain=("search_rescue",), seeds=3) == {
         "search_rescue": {0, 1, 2}
     }
@@ -374,8 +427,8 @@ def test_curves_have_a_panel_for_each_place_and_level_lines():
     (legend,) = picture.legends
     assert [text.get_text() for text in legend.get_texts()] == [
         "mirror",
-        "none",
         "bc",
+        "none",
         "people's own entropy",
     ]
 
@@ -390,7 +443,7 @@ def test_bars_are_of_the_most_rounds_and_silence_is_told():
     (ax,) = plot_relevance([shares]).axes
     (bar,) = ax.patches
     assert bar.get_height() == pytest.approx(60)  # pyright: ignore[reportAttributeAccessIssue]
-    assert [text.get_text() for text in ax.texts] == ["nothing told"]
+    assert [text.get_text() for text in ax.texts] == ["none: nothing told"]
 
 
 def test_people_are_told_things_where_help_is_compared():

@@ -147,4 +147,6 @@ def test_what_the_setting_shows_anyway_can_be_told(generator):
     told["visual"] = domain.sought(now)
     shown, _ = human.look({}, None, now, told, 0)
     difference = human.evidence(shown, now) - human.evidence(silent, now)
-    assert int((difference != 0).sum()) == 1 and float(difference.sum()) == 1.0
+    apart = (human.networks.weights["input"][0] - difference).abs().sum(-1)
+    assert difference.abs().sum() > 0
+    assert int((apart < 1e-4).sum()) == 1  # The weights of one input: that it was told.

@@ -119,6 +119,28 @@ def test_shares_are_of_all_items_and_of_each_modality():
     assert shares["none", "all"].items == 0
 
 
+def test_shares_are_compared_in_people_whom_both_told_something():
+    """Mirror 1/2, 2/2 and 1/4 of three people; bc 1/4, none and 1/2: ahead by 1/4 and -1/4."""
+
+    def told(model, rounds, person, items, goal):
+        return row(model, rounds, person, items_visual=items, goal_visual=goal)
+
+    rows = [
+        *(told("mirror", 20, *one) for one in (("a", 2, 1), ("b", 2, 2), ("c", 4, 1))),
+        *(told("bc", 20, *one) for one in (("a", 4, 1), ("b", 0, 0), ("c", 2, 1))),
+        *(told("all", 0, *one) for one in (("a", 10, 1), ("b", 10, 1), ("c", 10, 1))),
+        *(told("none", 0, *one) for one in (("a", 0, 0), ("b", 0, 0), ("c", 0, 0))),
+    ]
+    shares = {one.model: one for one in relevance(rows, "goal", ["visual"])}
+    assert shares["mirror"].mirror is None and shares["none"].mirror is None
+    bc, everything = shares["bc"].mirror, shares["all"].mirror
+    assert bc is not None and everything is not None
+    assert (bc.people, bc.ahead.mean, bc.improvement.mean) == (2, 0.0, 0.5)
+    assert everything.people == 3
+    assert everything.ahead.mean == pytest.approx((0.4 + 0.9 + 0.15) / 3)
+    assert everything.improvement.mean == 1.0
+
+
 def test_floors_count_each_person_once():
     rows = [
         row("mirror", 1, "a", floor=0.1),

@@ -52,11 +52,13 @@ def squares(outcomes):
 
 def test_outcomes_come_in_the_order_of_cells_and_progress_is_told(tmp_path):
     told = []
-    outcomes = run_cells(CELLS, square, tmp_path, same, 1, report=lambda *what: told.append(what))
+    outcomes = run_cells(
+        CELLS, square, tmp_path, same, 1, report=lambda *what: told.append(what), before=told.append
+    )
     assert squares(outcomes) == [9, 1, 4]
     assert [outcome.error for outcome in outcomes] == [None] * 3
     assert told == [
-        (0, ""),
+        0,
         (1, "square of 3"),
         (2, "square of 1"),
         (3, "square of 2"),
@@ -66,10 +68,12 @@ def test_outcomes_come_in_the_order_of_cells_and_progress_is_told(tmp_path):
 def test_what_is_done_is_not_done_again(tmp_path):
     run_cells(CELLS[:2], square, tmp_path, same, 1)
     told = []
-    outcomes = run_cells(CELLS, square, tmp_path, same, 1, report=lambda *what: told.append(what))
+    outcomes = run_cells(
+        CELLS, square, tmp_path, same, 1, report=lambda *what: told.append(what), before=told.append
+    )
     assert squares(outcomes) == [9, 1, 4]
     assert ASKED == [3, 1, 2]
-    assert told == [(2, "2 were done before"), (3, "square of 2")]
+    assert told == [2, (3, "square of 2")]
 
 
 def test_what_depends_on_something_else_is_done_again(tmp_path):

@@ -18,7 +18,6 @@ import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from mirror_ppl.baselines.inputs import network_inputs
 from mirror_ppl.baselines.recurrent import RecurrentNetworks
@@ -104,13 +103,14 @@ class NetworkPerson(HumanModel):
         return View({**seen, **heard}), knowledge
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
-        """What networks read at each step, ``[..., I]``, without the action before."""
+        """What is read at each step adds to the GRU's gates, ``[..., 3 H]``, but for the action."""
         none = torch.full(observation["ego"].shape[:-1], self._none, dtype=torch.long)
         none = none.to(observation["ego"].device)
         seen = {name: view.visible[name] for name in self._modalities}
         told = {name: view.visible[TOLD + name] for name in self._modalities}
         inputs = network_inputs(self.domain, observation, seen, told, none)
-        return inputs[..., : -(self._none + 1)]
+        inputs[..., -(self._none + 1) :] = 0.0
+        return self.networks.gates(inputs.flatten(0, -2)[None]).view(*inputs.shape[:-1], -1)
 
     def advance(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
@@ -118,9 +118,9 @@ class NetworkPerson(HumanModel):
         """One step of the GRU; its state has no spread."""
         del still
         shape = belief.shape
-        inputs = torch.cat([evidence, one_hot(action, self._none + 1).to(evidence)], -1)
-        inputs = inputs.expand(*shape[:-1], -1)
-        after = self.networks.step(belief.reshape(1, -1, shape[-1]), inputs.flatten(0, -2)[None])
+        gates = evidence + self.networks.weights["input"][0, -(self._none + 1) :][action]
+        gates = gates.expand(*shape[:-1], -1).flatten(0, -2)[None]
+        after = self.networks.update(belief.reshape(1, -1, shape[-1]), gates)
         mean = after.view(shape)
         return Gaussian(mean, torch.zeros_like(mean))
 

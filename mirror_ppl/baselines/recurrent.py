@@ -76,7 +76,7 @@ class RecurrentNetworks(nn.Module):
 
     def step(self, hidden: Tensor, inputs: Tensor) -> Tensor:
         """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` ``[P, B, H]`` and ``inputs`` ``[P, B, I]``."""
-        return self._update(hidden, self._project(inputs))
+        return self.update(hidden, self.gates(inputs))
 
     def outputs(self, hidden: Tensor) -> Tensor:
         """``y_t`` ``[P, B, A]`` of hidden states ``[P, B, H]``."""
@@ -88,10 +88,10 @@ class RecurrentNetworks(nn.Module):
     def forward(self, inputs: StepInputs) -> Tensor:
         """``y_t`` at every step ``[P, B, T, A]`` of the steps' inputs."""
         _, rounds, steps = inputs.place.shape
-        gates = each_step(self._project(inputs.rows), inputs.place)
+        gates = each_step(self.gates(inputs.rows), inputs.place)
         hidden, states = self.start(rounds), []
         for gate in gates.unbind(2):
-            hidden = self._update(hidden, gate)
+            hidden = self.update(hidden, gate)
             states.append(hidden)
         return self.outputs(torch.stack(states, 2).flatten(1, 2)).unflatten(1, (rounds, steps))
 
@@ -136,15 +136,15 @@ class RecurrentNetworks(nn.Module):
         people = [self.people[number] for number in numbers]
         return type(self)(self.domain, people, self.sight, weights)
 
-    def _project(self, inputs: Tensor) -> Tensor:
+    def gates(self, inputs: Tensor) -> Tensor:
         """The inputs' part ``[P, N, 3 H]`` of the gates, of ``inputs`` ``[P, N, I]``."""
         # Most symbols never occur in a batch, and columns of zeros add nothing.
         used = inputs.flatten(0, -2).any(0)
         weight = self.weights["input"][:, used]
         return torch.baddbmm(self.weights["input_bias"], inputs[..., used], weight)
 
-    def _update(self, hidden: Tensor, gates: Tensor) -> Tensor:
-        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` and the inputs' part of the gates."""
+    def update(self, hidden: Tensor, gates: Tensor) -> Tensor:
+        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` and the inputs' part of the :meth:`gates`."""
         own = torch.baddbmm(self.weights["recurrent_bias"], hidden, self.weights["recurrent"])
         size = 2 * self.hidden
         reset, keep = torch.sigmoid(gates[..., :size] + own[..., :size]).chunk(2, -1)

@@ -82,11 +82,19 @@ class PlannerOptions:
 
 
 BY_DOMAIN: dict[str, dict[str, Any]] = {
-    "search_rescue": {"horizon": 16, "beyond": True, "branch": 0.4},
+    "search_rescue": {"horizon": 16, "beyond": True, "branch": 0.4, "items": 2, "sure": 1.0},
     # Costs grow so fast that no third item is worth its own; the oracle looks at two, too. A bomb
     # does nothing by itself, so what helps cannot wait; and where the next stage takes as long,
     # steps that are looked at are used up all the same, whenever this one ends.
-    "bomb_defusal": {"horizon": 12, "beyond": True, "branch": 0.4, "items": 2, "patience": 1},
+    # A wrong button costs much more than a message: it is rash to be silent until a gain is sure.
+    "bomb_defusal": {
+        "horizon": 12,
+        "beyond": True,
+        "branch": 0.4,
+        "items": 2,
+        "patience": 1,
+        "sure": 0.0,
+    },
 }
 """Settings of planners that differ by domain."""
 

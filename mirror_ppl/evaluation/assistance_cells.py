@@ -34,8 +34,7 @@ from mirror_ppl.evaluation.assistance import (
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.loading import check_contract, load_human_model
-from mirror_ppl.models.variants import VARIANTS
+from mirror_ppl.models.loading import check_contract, file_of, load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
@@ -125,7 +124,7 @@ class Pairing:
             if name != "posterior"
         }
         digest = hashlib.sha256(json.dumps([settings, __version__], sort_keys=True).encode())
-        for path in (self.posterior, self.self_model, _file_of(self.human_model)):
+        for path in (self.posterior, self.self_model, file_of(self.human_model)):
             digest.update(b"" if path is None else path.read_bytes())
         return digest.hexdigest()
 
@@ -219,9 +218,3 @@ def _kept(path: Path, identity: str) -> Played | None:
         return Played(**content["played"]) if content["identity"] == identity else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _file_of(human_model: str | None) -> Path | None:
-    if human_model is None or human_model in VARIANTS:
-        return None
-    return Path(human_model.rpartition(":")[0])

@@ -161,10 +161,10 @@ class Trained:
         return self.networks.log_probabilities(rounds)
 
     def person(self, number: int, draws: int) -> Person:
-        """One of the networks; all draws are the same."""
+        """One of the networks; all draws are the same, so a few do."""
         own = self.networks.only(number)
         human = NetworkPerson(self.self_model, own, self.setting, self.world)
-        return Person(human, human.draws(draws))
+        return Person(human, human.draws(min(draws, SAME_DRAWS)))
 
 
 @dataclass(frozen=True)
@@ -271,17 +271,36 @@ SLOW = {
 }
 """Of these what is compared on request only, and where: a chain of each person takes minutes, `svi`
 sums over all rules of a bomb at each of its steps, and SQIL learns from long rounds for minutes."""
+SAME_DRAWS = 16
+"""Most draws that are planned with where all are the same: they differ in chance alone, of which
+each has several courses. To a network whatever is told is something new, so that its messages are
+many and planning with it takes longest."""
 PLANNABLE = ("mirror", "bc", "sqil")
 """Of these what drives a communicator in the comparison of assistance."""
+
+
+def is_own(name: str) -> bool:
+    """Whether it names a human model in a file, ``path/to/file.py:Class``."""
+    return ".py:" in name
 
 
 def learn(name: str, group: Group, rounds: int, seed: int) -> Learned:
     """What a learner makes of the first rounds of a group.
 
+    Args:
+        name: in ``LEARNERS``, or ``path/to/file.py:Class``, a human model of somebody's own, with
+            the guide ``exact``.
+        group: the people.
+        rounds: how many are learned from.
+        seed: of everything random.
+
     Raises:
         UnknownNameError: there is no such learner.
+        HumanModelError: there is no such human model.
         AssetError: no trained guide ships for that domain.
     """
+    if is_own(name):
+        return _mirror(name)(group, rounds, seed)
     if name not in LEARNERS:
         raise UnknownNameError.of("model", name, tuple(LEARNERS))
     return LEARNERS[name](group, rounds, seed)

@@ -23,11 +23,13 @@ from mirror_ppl.evaluation.learners import (
     TEST,
     Group,
     Plannable,
+    is_own,
     learn,
 )
 from mirror_ppl.evaluation.sweep import Rows
 from mirror_ppl.inference.guide_file import shipped_guide
 from mirror_ppl.inference.summary import score
+from mirror_ppl.models.loading import check_contract, file_of, load_human_model
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
 
 CODE = (
@@ -52,42 +54,39 @@ OBJECTIVES = {"mirror": ("mirror", "mirror-kl"), "bc": ("mirror",), "sqil": ("mi
 
 @dataclass(frozen=True)
 class Prediction:
-    """A learner in a group, with several numbers of rounds.
+    """A learner in a group.
 
     Attributes:
         group: the people.
         model: the learner.
-        rounds: numbers of rounds that it learns from.
+        rounds: how many it learns from.
     """
 
     group: Group
     model: str
-    rounds: tuple[int, ...]
+    rounds: int
 
     @property
     def label(self) -> str:
         """What it is, for people who wait."""
-        return f"{self.model} in {self.group}"
+        return _label(self)
 
 
 def predict(cell: Prediction) -> Rows:
-    """How well a learner predicts held-out rounds: a row for each person and number of rounds.
+    """How well a learner predicts held-out rounds: a row for each person.
 
     Columns of their own: ``nll`` in nats an action, ``accuracy``, ``floor`` (the person's own
     entropy).
     """
     group = cell.group
     test = group.recordings().select_rounds(TEST)
-    rows = []
-    for number in cell.rounds:
-        learned = learn(cell.model, group, number, group.seed)
-        found = score(learned.log_predictive(test)[None], test)
-        rows += [
-            _row(group, cell.model, number, person) | measured
-            for person, measured in zip(test.people, found, strict=True)
-            if measured is not None
-        ]
-    return rows
+    learned = learn(cell.model, group, cell.rounds, group.seed)
+    found = score(learned.log_predictive(test)[None], test)
+    return [
+        _row(group, cell.model, cell.rounds, person) | measured
+        for person, measured in zip(test.people, found, strict=True)
+        if measured is not None
+    ]
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ class Assistance:
         model: the learner, or one of ``REFERENCES``.
         rounds: how many it learns from; 0 of references.
         played: rounds of each person in which they are spoken to.
-        draws: posterior draws that are planned with.
+        draws: posterior draws that are planned with; 0 of references.
     """
 
     group: Group
@@ -111,8 +110,7 @@ class Assistance:
     @property
     def label(self) -> str:
         """What it is, for people who wait."""
-        of = f" of {self.rounds} round{'s' * (self.rounds > 1)}" if self.rounds else ""
-        return f"{self.model}{of} in {self.group}"
+        return _label(self)
 
 
 def assist(cell: Assistance) -> Rows:
@@ -129,7 +127,8 @@ def assist(cell: Assistance) -> Rows:
     for number, listener in enumerate(group.listeners(cell.played)):
         if learned is not None:
             listener = replace(listener, person=learned.person(number, cell.draws))
-        for objective in OBJECTIVES.get(cell.model, (cell.model,)):
+        own = ("mirror",) if is_own(cell.model) else (cell.model,)
+        for objective in OBJECTIVES.get(cell.model, own):
             who = cell.model if objective == "mirror" else objective
             played = play(listener, speaker(objective, listener, options, group.seed + number))
             rows.append(
@@ -157,14 +156,16 @@ def prediction_cells(
 
     Args:
         group: the people.
-        models: learners; all that can learn there unless given, but for slow ones.
+        models: learners, and human models in files of their own, ``path/to/file.py:Class``; all
+            learners that can learn there unless given, but for slow ones.
         rounds: numbers of rounds that are learned from.
 
     Raises:
         UnknownNameError: there is no such learner.
+        HumanModelError: a file has no such human model, or it does not keep to the contract.
         AssetError: one needs a trained guide, which there is not.
     """
-    chosen, guide = _known(models, tuple(LEARNERS)), _has_guide(group.domain)
+    chosen, guide = _known(models, tuple(LEARNERS), group), _has_guide(group.domain)
     if "mirror-amortized" in chosen and not guide:
         raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
     if not chosen:
@@ -174,7 +175,7 @@ def prediction_cells(
         # Who reads everything is somebody else only where something is hidden.
         ends = (EVERYTHING,) if _shows_everything(group) else ()
         chosen = [name for name in LEARNERS if name not in left_out and not name.endswith(ends)]
-    return [Prediction(group, name, tuple(sorted({*rounds}))) for name in chosen]
+    return [Prediction(group, name, number) for name in chosen for number in sorted({*rounds})]
 
 
 def assistance_cells(
@@ -183,8 +184,8 @@ def assistance_cells(
     """Who is to speak to a group; arguments as above and of `Assistance`."""
     every = (*PLANNABLE, *REFERENCES)
     return [
-        Assistance(group, name, number, played, draws)
-        for name in _known(models, every) or every
+        Assistance(group, name, number, played, 0 if name in REFERENCES else draws)
+        for name in _known(models, every, group) or every
         for number in ((0,) if name in REFERENCES else sorted({*rounds}))
     ]
 
@@ -199,15 +200,24 @@ def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], st
     weights = {
         name: fingerprint(load_self_model(shipped_weights(name), name)[0]) for name in {*domains}
     }
-    return lambda cell: f"{code} {weights[cell.group.domain]}"
+
+    def identity(cell: Prediction | Assistance) -> str:
+        own = file_of(cell.model) if is_own(cell.model) else None
+        file = "" if own is None else hashlib.sha256(own.read_bytes()).hexdigest()
+        return f"{code} {weights[cell.group.domain]} {file}"
+
+    return identity
 
 
-def _known(models: Sequence[str], known: Sequence[str]) -> list[str]:
-    """Each of the models once, in the order in which they are shown."""
+def _known(models: Sequence[str], known: Sequence[str], group: Group) -> list[str]:
+    """Each of the models once, in the order in which they are shown; then people's own."""
+    own = [name for name in dict.fromkeys(models) if is_own(name)]
     for name in models:
-        if name not in known:
+        if name not in known and name not in own:
             raise UnknownNameError.of("model", name, known)
-    return [name for name in known if name in models]
+    for name in own:
+        check_contract(load_human_model(name, group.self_model))
+    return [*(name for name in known if name in models), *own]
 
 
 def _shows_everything(group: Group) -> bool:
@@ -223,6 +233,11 @@ def _has_guide(domain: str) -> bool:
     except AssetError:
         return False
     return True
+
+
+def _label(cell: Prediction | Assistance) -> str:
+    of = f" of {cell.rounds} round{'s' * (cell.rounds > 1)}" if cell.rounds else ""
+    return f"{cell.model}{of} in {cell.group}"
 
 
 def _row(group: Group, model: str, rounds: int, person: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from mirror_ppl.domains import Domain, Observation, get_domain
 from mirror_ppl.evaluation.study_summary import (
     Claim,
     Interval,
+    Paired,
     Place,
     Share,
     Standing,
@@ -52,14 +53,13 @@ class Report:
 
 def _prediction(rows: Rows) -> Report:
     standings, floor = summarize_study(rows, "nll", -1), floors(rows)
-    claims = few_against_many(rows, "nll", -1)
-    data = {
-        "nll": standings,
-        "accuracy": summarize_study(rows, "accuracy"),
-        "few_against_many": claims,
-    }
+    accuracy, claims = summarize_study(rows, "accuracy"), few_against_many(rows, "nll", -1)
+    data = {"nll": standings, "accuracy": accuracy, "few_against_many": claims}
     return Report(
-        _tables(standings, "NLL of held-out actions, nats an action: less is better", floor),
+        [
+            *_tables(standings, "NLL of held-out actions, nats an action: less is better", floor),
+            *_tables(accuracy, "accuracy of held-out actions: more is better", {}),
+        ],
         [_claimed(claim) for claim in claims],
         data,
         plot_curves(standings, "NLL of held-out actions (nats an action)", floor, by_ratio=True),
@@ -119,12 +119,13 @@ def _tables(
         if any(one.mirror for one in here):
             caption += (
                 "; below it how far mirror is ahead with as many (of who learns nothing: with "
-                "the most), the 90% interval of that over people, and in how many of them"
+                "the most), the 90% interval of that over people, and in how many of them (ties "
+                "count half)"
             )
         if place in floor:
             caption += f"; people's own entropy: {floor[place]:.3f}"
         rows = tuple(
-            (model, *(_entry(by.get((model, number))) for number in numbers))
+            (model, *(_entry(by.get((model, rounds)), number) for rounds in numbers))
             for model in dict.fromkeys(one.model for one in here)
         )
         heads = ("model", *("-" if number == 0 else _counted(number) for number in numbers))
@@ -132,16 +133,20 @@ def _tables(
     return tables
 
 
-def _entry(one: Standing | None) -> str:
+def _entry(one: Standing | None, people: int) -> str:
     if one is None:
         return ""
     text = f"{one.measured.mean:.3f}"
-    if one.mirror is None:
-        return text
-    ahead, better = one.mirror.ahead, one.mirror.improvement
+    if one.people < people:  # Something failed: it is not of the same people as the others.
+        text += f" ({one.people} of {people} people)"
+    return text if one.mirror is None else f"{text}\n{_ahead(one.mirror)}"
+
+
+def _ahead(mirror: Paired) -> str:
+    ahead, better = mirror.ahead, mirror.improvement
     digits = 2 if max(abs(ahead.low), abs(ahead.high)) >= 1 else 3
     low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
-    return f"{text}\n{ahead.mean:+.{digits}f}\n[{low}, {high}]\n{100 * better.mean:.0f}%"
+    return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]\n{100 * better.mean:.0f}%"
 
 
 def _shares(shares: Sequence[Share], title: str) -> TextTable:
@@ -152,12 +157,19 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
         if one.share is not None:
             low, high = 100 * one.share.low, 100 * one.share.high
             text = f"{100 * one.share.mean:.0f}% [{low:.0f}, {high:.0f}] of {one.items}"
+        if one.mirror is not None:
+            text += f"\n{_ahead(one.mirror)}"
         cells.setdefault((one.model, one.rounds), {})[one.modality] = text
     rows = tuple(
         (model, "-" if rounds == 0 else str(rounds), *(own[name] for name in names))
         for (model, rounds), own in cells.items()
     )
     caption = "share that is relevant [90% interval over people] of the items told"
+    if any(one.mirror for one in shares):
+        caption += (
+            "; below it how far mirror's share is ahead person by person, the 90% interval of "
+            "that, and in how many it is (ties count half), of people whom both told something"
+        )
     return TextTable(title, caption, ("model", "rounds", *names), rows)
 
 

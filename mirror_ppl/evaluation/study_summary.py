@@ -99,6 +99,9 @@ class Share:
         modality: of what was told; ``all`` together.
         items: how many were told.
         share: of them that was relevant; ``None`` if nothing was told.
+        mirror: how much more of what MIRROR told was, with as many rounds or, of who learns
+            nothing, with the most; of the people whom both told something. ``None`` for itself,
+            and where there is nobody.
     """
 
     place: Place
@@ -107,6 +110,7 @@ class Share:
     modality: str
     items: int
     share: Interval | None
+    mirror: Paired | None = None
 
 
 def interval(values: np.ndarray) -> Interval:
@@ -132,8 +136,7 @@ def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[Standing]:
     """
     found, values = [], _by_model(rows, measure)
     for (place, model, rounds), people in values.items():
-        most = max((n for where, name, n in values if (where, name) == (place, FIRST)), default=0)
-        mirror = values.get((place, FIRST, rounds or most), {}) if model != FIRST else {}
+        mirror = _mirror(values, place, model, rounds)
         own = np.array(list(people.values()))
         ahead = _both(mirror, people, sign)
         found.append(Standing(place, model, rounds, interval(own), len(own), ahead))
@@ -164,6 +167,9 @@ def few_against_many(
 def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]:
     """Share of what was told that was relevant; the bootstrap draws people.
 
+    Shares are of the items that all people were told together, and what MIRROR is ahead by is
+    the mean of the differences person by person.
+
     Args:
         rows: of a study of assistance, of one domain.
         notion: of relevance; columns are ``<notion>_<modality>`` and ``items_<modality>``.
@@ -178,9 +184,15 @@ def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]
             )
             for kind in ("items", notion)
         )
+        shares_of = {
+            key: {who: right[key][who] / items for who, items in people.items() if items}
+            for key, people in told.items()
+        }
         for (place, model, rounds), people in told.items():
             items = np.array(list(people.values()))
             good = np.array(list(right[place, model, rounds].values()))
+            mirror = _mirror(shares_of, place, model, rounds)
+            ahead = _both(mirror, shares_of[place, model, rounds], 1)
             share = None
             if items.sum():
                 drawn = _drawn(len(items))
@@ -188,7 +200,7 @@ def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]
                 shares = good[drawn].sum(1)[totals > 0] / totals[totals > 0]
                 low, high = np.quantile(shares, LEVELS)
                 share = Interval(float(good.sum() / items.sum()), float(low), float(high))
-            found.append(Share(place, model, rounds, name, int(items.sum()), share))
+            found.append(Share(place, model, rounds, name, int(items.sum()), share, ahead))
     return found
 
 
@@ -211,6 +223,19 @@ def _by_model(
         key = (_place(row), row["model"], row["rounds"])
         found.setdefault(key, {})[_who(row)] = row[measure]
     return found
+
+
+def _mirror(
+    values: dict[tuple[Place, str, int], dict[tuple[int, str], float]],
+    place: Place,
+    model: str,
+    rounds: int,
+) -> dict[tuple[int, str], float]:
+    """Values of MIRROR that a model is compared with; none for itself."""
+    if model == FIRST:
+        return {}
+    most = max((n for where, name, n in values if (where, name) == (place, FIRST)), default=0)
+    return values.get((place, FIRST, rounds or most), {})
 
 
 def _place(row: dict) -> Place:

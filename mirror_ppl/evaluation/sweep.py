@@ -70,6 +70,7 @@ def run_cells(
     jobs: int = -1,
     scheduler: str | None = None,
     report: Report = lambda done, message: None,
+    before: Callable[[int], None] = lambda done: None,
 ) -> list[Outcome]:
     """Do the work of every cell that is not done yet.
 
@@ -81,6 +82,7 @@ def run_cells(
         jobs: processes on this machine; -1 for one a core.
         scheduler: address of a Dask cluster that does the work instead.
         report: told of progress.
+        before: told how many cells earlier runs did, when work begins.
 
     Returns:
         One outcome a cell, in their order.
@@ -96,7 +98,7 @@ def run_cells(
         kept = _kept(folder / name, cell)
         if kept is not None:
             outcomes[place] = kept
-    report(len(outcomes), f"{len(outcomes)} were done before" if outcomes else "")
+    before(len(outcomes))
     todo = [place for place in range(len(cells)) if place not in outcomes]
     with ExitStack() as stack:
         if scheduler is not None:

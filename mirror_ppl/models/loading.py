@@ -45,6 +45,13 @@ def model_name(class_name: str) -> str:
     return class_name
 
 
+def file_of(specification: str | None) -> Path | None:
+    """Of ``path/to/file.py:Class`` the file; the package's own models have none."""
+    if specification is None or specification in VARIANTS:
+        return None
+    return Path(specification.rpartition(":")[0])
+
+
 def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
     """Make a human model.
 

@@ -114,12 +114,12 @@ def plot_relevance(places: Sequence[Sequence[Share]]) -> Picture:
         for one in last:
             x = names.index(one.modality)
             x += (models.index(one.model) - (len(models) - 1) / 2) * width
-            if one.share is None:
-                ax.text(x, 1, "nothing told", rotation=90, ha="center", va="bottom", fontsize=7)
-                continue
             colour = STYLES.get(one.model, OTHER)[0]
-            label = one.model if one.modality == names[0] else None
-            ax.bar(x, 100 * one.share.mean, 0.9 * width, color=colour, label=label)
+            if one.share is None:
+                text = f"{one.model}: nothing told"
+                ax.text(x, 1, text, rotation=90, ha="center", va="bottom", fontsize=7, color=colour)
+                continue
+            ax.bar(x, 100 * one.share.mean, 0.9 * width, color=colour, label=one.model)
             ax.plot([x, x], [100 * one.share.low, 100 * one.share.high], color=BLACK, lw=1)
         ax.set_xticks(range(len(names)), names)
         ax.set_ylim(0, 105)
@@ -135,11 +135,12 @@ def _title(ax: Axes, place: Place) -> None:
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One for all panels, each name once."""
+    """One for all panels, each name once, models in the order of `STYLES`."""
     entries = {}
     for ax in panels:
         for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
             entries.setdefault(name, handle)
-    figure.legend(
-        list(entries.values()), list(entries), loc="outside right upper", frameon=False, fontsize=9
-    )
+    order = [name for name in STYLES if name in entries]
+    order += [name for name in entries if name not in STYLES]
+    handles = [entries[name] for name in order]
+    figure.legend(handles, order, loc="outside right upper", frameon=False, fontsize=9)
