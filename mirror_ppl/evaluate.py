@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -206,13 +207,23 @@ def _origin(options: Options) -> dict[str, Any]:
     from mirror_ppl import __version__
 
     return {
-        "command": PROGRAM,
+        "command": _command(options),
         "options": {name: value for name, value in asdict(options).items() if name != "jobs"}
         | {"told": _told(options)},
         "version": __version__,
         "torch": torch.__version__,
         "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
     }
+
+
+def _command(options: Options) -> str:
+    """The command that asks for the same."""
+    words = [*PROGRAM.split(), options.study]
+    for part in fields(options):
+        value = getattr(options, part.name)
+        if part.name not in ("study", "jobs") and value != part.default:
+            words += [f"--{part.name}", *map(str, value if isinstance(value, tuple) else [value])]
+    return shlex.join(words)
 
 
 def _effort(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -218,6 +218,9 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     }
     assert f"| bc | {means[1]:.3f} | {means[2]:.3f} |" in page
     assert content["failed"] == {}
+    words = content["command"].split()
+    assert words[:4] == ["python", "-m", "mirror_ppl.evaluate", "prediction"]
+    assert set(words[4:]) == {str(arg) for arg in args[1:] if arg != "--jobs"}
     assert set(content["seconds"]) == {
         f"{name} of {rounds} in driving, fog, seed 0"
         for name in QUICK
