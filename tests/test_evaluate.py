@@ -436,6 +436,16 @@ def test_curves_have_a_panel_for_each_place_and_level_lines():
     ]
 
 
+def test_levels_that_would_flatten_the_curves_are_told_in_words():
+    """Curves from .1 to .5 with their intervals: a level at 1.9 is drawn, one at -90 is not."""
+    standings = [standing("mirror", 20, 0.2), standing("bc", 1, 0.4)]
+    standings += [standing("none", 0, 1.9), standing("all", 0, -90.0)]
+    (ax,) = plot_curves(standings, "net return").axes
+    assert {line.get_label() for line in ax.lines} == {"mirror", "bc", "none"}
+    assert [text.get_text() for text in ax.texts] == ["all: -90.0, off the scale"]
+    assert ax.get_ylim()[0] > -1
+
+
 def test_bars_are_of_the_most_rounds_and_silence_is_told():
     place = Place("driving", "fog", "paper")
     shares = [

@@ -139,12 +139,14 @@ def _entry(one: Standing | None, people: int) -> str:
     text = f"{one.measured.mean:.3f}"
     if one.people < people:  # Something failed: it is not of the same people as the others.
         text += f" ({one.people} of {people} people)"
-    return text if one.mirror is None else f"{text}\n{_ahead(one.mirror)}"
+    if one.mirror is None:
+        return text
+    ahead = one.mirror.ahead
+    return f"{text}\n{_ahead(one.mirror, 2 if max(abs(ahead.low), abs(ahead.high)) >= 1 else 3)}"
 
 
-def _ahead(mirror: Paired) -> str:
+def _ahead(mirror: Paired, digits: int) -> str:
     ahead, better = mirror.ahead, mirror.improvement
-    digits = 2 if max(abs(ahead.low), abs(ahead.high)) >= 1 else 3
     low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
     return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]\n{100 * better.mean:.0f}%"
 
@@ -158,7 +160,7 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
             low, high = 100 * one.share.low, 100 * one.share.high
             text = f"{100 * one.share.mean:.0f}% [{low:.0f}, {high:.0f}] of {one.items}"
         if one.mirror is not None:
-            text += f"\n{_ahead(one.mirror)}"
+            text += f"\n{_ahead(one.mirror, 2)}"
         cells.setdefault((one.model, one.rounds), {})[one.modality] = text
     rows = tuple(
         (model, "-" if rounds == 0 else str(rounds), *(own[name] for name in names))
@@ -167,8 +169,8 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
     caption = "share that is relevant [90% interval over people] of the items told"
     if any(one.mirror for one in shares):
         caption += (
-            "; below it how far mirror's share is ahead person by person, the 90% interval of "
-            "that, and in how many it is (ties count half), of people whom both told something"
+            "; below it how far mirror's share (of 1) is ahead person by person, the 90% interval "
+            "of that, and in how many it is (ties count half), of people whom both told something"
         )
     return TextTable(title, caption, ("model", "rounds", *names), rows)
 

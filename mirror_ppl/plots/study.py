@@ -34,6 +34,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
 }
 """Colour, line and mark of each model."""
 OTHER = (GREY, "-", ".")
+OFF_SCALE = 4.0
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
 
@@ -45,6 +46,9 @@ def plot_curves(
     by_ratio: bool = False,
 ) -> Picture:
     """Draw a measure against the number of rounds, one panel a place; bands are 90% intervals.
+
+    Who learns nothing and does so much better or worse that all others would look alike is told in
+    words.
 
     Args:
         standings: of `summarize_study`; models that learn from 0 rounds are level lines.
@@ -58,9 +62,13 @@ def plot_curves(
     panels = figure.subplots(1, len(places), squeeze=False)[0]
     for ax, place in zip(panels, places, strict=True):
         here = [one for one in standings if one.place == place]
-        for model in dict.fromkeys(one.model for one in here):
+        far = _far([one for one in here if one.rounds == 0], [one for one in here if one.rounds])
+        for model in dict.fromkeys(one.model for one in here if one not in far):
             own = [one for one in here if one.model == model]
             _curve(ax, sorted(own, key=lambda one: one.rounds))
+        for number, one in enumerate(far):
+            text = f"{one.model}: {one.measured.mean:.1f}, off the scale"
+            ax.text(0.02, 0.02 + 0.06 * number, text, transform=ax.transAxes, fontsize=8)
         if floor is not None and place in floor:
             ax.axhline(floor[place], color=BLACK, lw=1, ls=":", label="people's own entropy")
         ticks = sorted({one.rounds for one in here} - {0})
@@ -74,6 +82,15 @@ def plot_curves(
     panels[0].set_ylabel(label)
     _legend(figure, panels)
     return figure
+
+
+def _far(level: Sequence[Standing], curves: Sequence[Standing]) -> list[Standing]:
+    """Which levels are farther from the curves than ``OFF_SCALE`` times their span."""
+    if not curves:
+        return []
+    low, high = min(one.measured.low for one in curves), max(one.measured.high for one in curves)
+    away = OFF_SCALE * (high - low)
+    return [one for one in level if not low - away <= one.measured.mean <= high + away]
 
 
 def _logarithmic(ax: Axes) -> None:
