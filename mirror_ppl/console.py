@@ -203,8 +203,9 @@ class Progress:
 
     def update(self, done: int, message: str = "") -> None:
         """Tell that `done` steps are done in all, with a message such as "loss 12.3"."""
-        self.done, self.message, self._last = done, message, monotonic()
-        if self._display is not None and (now := monotonic()) >= self._next:
+        now = monotonic()
+        self.done, self.message, self._last = done, message, now
+        if self._display is not None and now >= self._next:
             self._next = now + self._display.interval
             self._shown = (done, message)
             self._display.show(self)

@@ -126,6 +126,8 @@ def test_rivals_know_what_rewards_tell_of_the_world():
     assert isinstance(person.human, NetworkPerson)
     assert person.human.networks.people == ("person-02",)
     assert person.number == 3
+    more = learn("bc", group, 1, 0).person(1, 64)  # pyright: ignore[reportAttributeAccessIssue]
+    assert more.number == learners.SAME_DRAWS < 64
     world = person.human.known_world(person.draws)
     assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
     assert world.rules != OLD_RULES  # pyright: ignore[reportAttributeAccessIssue]
@@ -317,6 +319,8 @@ def test_by_default_everything_is_compared():
     cells = evaluate._cells(evaluate.Options("assistance", domain=DOMAINS))
     assert {cell.group.setting for cell in cells} == {worst(domain) for domain in DOMAINS}
     assert {cell.model for cell in cells} == {*PLANNABLE, "none", "all", "oracle"}
+    # What learns nothing is played once, whatever learners plan with.
+    assert {cell.draws for cell in cells if cell.model in study.REFERENCES} == {0}  # pyright: ignore
     # Relevance is of what assistance plays, after the most rounds.
     told = evaluate._cells(evaluate.Options("relevance", domain=DOMAINS))
     assert set(told) == {cell for cell in cells if cell.rounds in (0, 20)}

@@ -35,6 +35,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
 """Colour, line and mark of each model."""
 OTHER = (GREY, "-", ".")
 OFF_SCALE = 4.0
+"""Spans of the curves beyond which a level is told in words."""
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
 
