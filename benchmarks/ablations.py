@@ -4,7 +4,7 @@
 
 Each row gives up one choice. Shown are held-out NLL in nats an action, net return of a round with
 the communicator ``mirror``, of ten people a seed with 20 rounds each, and how far the package is
-ahead in the same people.
+ahead in the same people. The table is printed and, for a page, written to ``ablations.md``.
 
 - ``relaxed``: sight thresholds on a continuous scale by a mean-field guide, where beliefs are the
   encoder's means, reparameterized draws, or draws without gradients (``benchmarks._relaxed``).
@@ -37,6 +37,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learners import TEST, TRAINING, Group, Posterior
 from mirror_ppl.evaluation.study_summary import paired
+from mirror_ppl.evaluation.tables import TextTable, write_page
 from mirror_ppl.inference.fitting import predict_rounds
 from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
@@ -73,6 +74,19 @@ class Options:
     """Folder of the self-models."""
 
 
+@dataclass(frozen=True)
+class Measured:
+    """What was found of a choice; a number for each person.
+
+    Attributes:
+        nll: of held-out actions, nats an action.
+        net: return of a round with the communicator, less what messages cost.
+    """
+
+    nll: list[float]
+    net: list[float]
+
+
 class ShiftedTransition(SelfModel):
     """A self-model whose transition is ``p(z_t | z_{t-1}, a_{t-2})``, as if by mistake."""
 
@@ -103,32 +117,56 @@ def main(options: Options) -> None:
     unknown = {*options.choices} - {*CHOICES}
     if unknown:
         raise SystemExit(f"no such choice: {', '.join(sorted(unknown))}; known: {CHOICES}")
-    nll: dict[str, list[float]] = {}
-    net: dict[str, list[float]] = {}
+    options.out.mkdir(parents=True, exist_ok=True)
+    found: dict[str, Measured] = {}
     partners = [PACKAGE, *([REFERENCE] if {*TRAINED} & {*chosen} else [])]
     for name in dict.fromkeys([*partners, *chosen]):
-        human = human_of(name, options)
-        for seed in options.seeds:
-            group = Group(DOMAIN, SETTING, "paper", options.people, seed)
-            posterior = learned(name, human, group)
-            test = group.recordings().select_rounds(TEST)
-            found = score(posterior.log_predictive(test)[None], test)
-            nll.setdefault(name, []).extend(one["nll"] for one in found if one is not None)
-            net.setdefault(name, []).extend(net_returns(posterior, group, options.played))
-        print(
-            f"{name:<18} NLL {np.mean(nll[name]):.3f} {against(nll, name, -1)}   "
-            f"net {np.mean(net[name]):.2f} {against(net, name, 1)}",
-            flush=True,
-        )
+        found[name] = measure(name, human_of(name, options), options)
+        print("   ".join(entry.replace("\n", " ") for entry in row(found, name)), flush=True)
+    write_page(options.out / "ablations.md", [], [table(found, options)])
 
 
-def against(values: dict[str, list[float]], name: str, sign: int) -> str:
-    """How far what it is compared with is ahead, with its 90% interval."""
-    if name == PACKAGE:
-        return f"{'':<24}"
+def measure(name: str, human: HumanModel, options: Options) -> Measured:
+    """How it predicts and helps the people of all seeds."""
+    nll, net = [], []
+    for seed in options.seeds:
+        group = Group(DOMAIN, SETTING, "paper", options.people, seed)
+        posterior = learned(name, human, group)
+        test = group.recordings().select_rounds(TEST)
+        scores = score(posterior.log_predictive(test)[None], test)
+        nll.extend(one["nll"] for one in scores if one is not None)
+        net.extend(net_returns(posterior, group, options.played))
+    return Measured(nll, net)
+
+
+def table(found: Mapping[str, Measured], options: Options) -> TextTable:
+    """All rows."""
+    people = options.people * len(options.seeds)
+    return TextTable(
+        f"{DOMAIN}, {SETTING}: what this package's own choices are worth",
+        f"mean over people ({people}), each with {TRAINING} rounds to learn from; below it how far "
+        f"what it is compared with is ahead, and the 90% interval of that: {REFERENCE} for "
+        f"self-models that were trained otherwise, {PACKAGE} for all others",
+        ("choice", "NLL (nats an action)", "net return of a round"),
+        tuple(row(found, name) for name in found),
+    )
+
+
+def row(found: Mapping[str, Measured], name: str) -> tuple[str, str, str]:
+    """One choice: its name, NLL and net return."""
+    own, entries = found[name], []
     partner = REFERENCE if name in TRAINED and name != REFERENCE else PACKAGE
-    ahead = paired(sign * np.array(values[partner]), sign * np.array(values[name])).ahead
-    return f"{f'({ahead.mean:+.3f} [{ahead.low:+.3f}, {ahead.high:+.3f}])':<24}"
+    for values, others, sign, digits in (
+        (own.nll, found[partner].nll, -1, 3),
+        (own.net, found[partner].net, 1, 2),
+    ):
+        entry = f"{np.mean(values):.{digits}f}"
+        if name != PACKAGE:
+            ahead = paired(sign * np.array(others), sign * np.array(values)).ahead
+            low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
+            entry += f"\n{ahead.mean:+.{digits}f}\n[{low}, {high}]"
+        entries.append(entry)
+    return name, entries[0], entries[1]
 
 
 def human_of(name: str, options: Options) -> HumanModel:
@@ -136,7 +174,6 @@ def human_of(name: str, options: Options) -> HumanModel:
     if name not in TRAINED:
         return load_human_model(None, Group(DOMAIN, SETTING, "paper", 1, 0).self_model)
     kind, changes = TRAINED[name]
-    options.out.mkdir(parents=True, exist_ok=True)
     phases = "" if options.phases is None else f"-{options.phases}"
     stem = f"{name.replace(' ', '_')}-{options.training_seed}{phases}"
     path = options.out / f"{stem}.safetensors"
