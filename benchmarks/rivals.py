@@ -29,10 +29,11 @@ from mirror_ppl.baselines import (
 from mirror_ppl.baselines.training import TrainingOptions
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import get_domain
+from mirror_ppl.evaluation.learners import VALIDATION
 from mirror_ppl.people import simulate
 
-PEOPLE, RECORDED = 10, 30
-TRAINING, VALIDATION = (5, 20), slice(20, 30)
+PEOPLE, RECORDED = 10, VALIDATION.stop
+TRAINING = 5, 20
 SEEDS = (100, 101)
 """Of people."""
 SEED = 100
@@ -40,7 +41,7 @@ SEED = 100
 OPTIONS: Mapping[str, Any] = {"bc": BehaviourCloneOptions, "sqil": SoftQOptions}
 GRIDS: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
     "bc": {
-        "learning_rate": (0.003, 0.01, 0.03),
+        "learning_rate": (0.001, 0.003, 0.01, 0.03, 0.06),
         "weight_decay": (0.1, 0.3, 1.0, 3.0, 6.0, 12.0),
     },
     "sqil": {

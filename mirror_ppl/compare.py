@@ -67,6 +67,7 @@ def main(options: Options) -> None:
     from mirror_ppl.plots.comparison import save_comparison_picture
 
     outputs = _outputs(options)
+    _require_different(options.posteriors)
     files = [read_fit(path, options.by) for path in options.posteriors]
     comparison = compare_fits(files, options.labels or label_models(files), options.by)
     for path in outputs:
@@ -81,6 +82,18 @@ def main(options: Options) -> None:
     for path, content in what:
         if path is not None:
             print(f"{path}: {content}")
+
+
+def _require_different(posteriors: tuple[Path, ...]) -> None:
+    """Refuse a posterior that is given twice, whose difference to itself says nothing."""
+    from mirror_ppl.evaluation.comparison import posterior_path
+
+    seen = set()
+    for path in posteriors:
+        real = posterior_path(path).resolve()
+        if real in seen:
+            raise OptionError(f"{path} is given twice")
+        seen.add(real)
 
 
 def _outputs(options: Options) -> list[Path]:

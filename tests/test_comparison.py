@@ -478,6 +478,11 @@ def test_one_model_is_no_comparison(number, paths, tmp_path, capsys):
     assert message == f"give at least two posteriors to compare, not {number}"
 
 
+def test_a_posterior_given_twice_is_refused(paths, tmp_path, capsys):
+    again = paths[0].parent / ".." / paths[0].parent.name / paths[0].name
+    assert refused(capsys, tmp_path, paths[0], again) == f"{again} is given twice"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

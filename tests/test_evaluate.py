@@ -294,6 +294,12 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
         (("prediction", "--people", "0"), "--people must be at least 1, not 0"),
         (("prediction", "--jobs", "0"), "--jobs must be at least 1, or -1 for all, not 0"),
         (("prediction", "--scheduler", "nowhere"), "--scheduler nowhere cannot be reached"),
+        (("prediction", "--scheduler", " "), "--scheduler must be an address, such as tcp://"),
+        (
+            ("prediction", "--played", "3"),
+            "--played is of assistance and relevance, not of prediction",
+        ),
+        (("prediction", "--draws", "9"), "--draws is of assistance and relevance, not of"),
     ],
 )
 def test_what_makes_no_sense_is_refused(args, message, tmp_path, capsys):
@@ -438,6 +444,14 @@ def test_curves_have_a_panel_for_each_place_and_level_lines():
         "none",
         "people's own entropy",
     ]
+
+
+def test_models_of_ones_own_are_called_by_file_and_class_unless_two_are_called_so():
+    names = ["mirror", "a/mine.py:Mine", "b/mine.py:Mine", "b/other.py:Mine"]
+    (ax,) = plot_curves([standing(name, 1, 0.1) for name in names], "NLL").axes
+    labels = ["mirror", "a/mine.py:Mine", "b/mine.py:Mine", "other.py:Mine"]
+    assert [line.get_label() for line in ax.lines] == labels
+    assert len({line.get_linestyle() for line in ax.lines[1:]}) == len(names) - 1
 
 
 def test_levels_that_would_flatten_the_curves_are_told_in_words():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -33,11 +34,21 @@ STYLES: dict[str, tuple[str, str, str]] = {
     "oracle": (BLACK, "--", ""),
 }
 """Colour, line and mark of each model."""
-OTHER = (GREY, "-", ".")
+OTHER_LINES, OTHER_MARK = ("-", "--", "-.", ":"), "."
+"""Of models of one's own."""
 OFF_SCALE = 4.0
 """Spans of the curves beyond which a level is told in words."""
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
+
+
+class Look(NamedTuple):
+    """How a model is called and drawn."""
+
+    label: str
+    colour: str
+    line: str
+    mark: str
 
 
 def plot_curves(
@@ -61,14 +72,15 @@ def plot_curves(
     places = list(dict.fromkeys(one.place for one in standings))
     figure = Picture(figsize=(WIDTH * len(places) + LEGEND, HEIGHT), layout="constrained")
     panels = figure.subplots(1, len(places), squeeze=False)[0]
+    looks = _looks(one.model for one in standings)
     for ax, place in zip(panels, places, strict=True):
         here = [one for one in standings if one.place == place]
         far = _far([one for one in here if one.rounds == 0], [one for one in here if one.rounds])
         for model in dict.fromkeys(one.model for one in here if one not in far):
             own = [one for one in here if one.model == model]
-            _curve(ax, sorted(own, key=lambda one: one.rounds))
+            _curve(ax, sorted(own, key=lambda one: one.rounds), looks[model])
         for number, one in enumerate(far):
-            text = f"{one.model}: {one.measured.mean:.1f}, off the scale"
+            text = f"{looks[one.model].label}: {one.measured.mean:.1f}, off the scale"
             ax.text(0.02, 0.02 + 0.06 * number, text, transform=ax.transAxes, fontsize=8)
         if floor is not None and place in floor:
             ax.axhline(floor[place], color=BLACK, lw=1, ls=":", label="people's own entropy")
@@ -102,15 +114,14 @@ def _logarithmic(ax: Axes) -> None:
     ax.yaxis.set_major_formatter("{x:g}")
 
 
-def _curve(ax: Axes, own: Sequence[Standing]) -> None:
-    model = own[0].model
-    colour, line, mark = STYLES.get(model, OTHER)
+def _curve(ax: Axes, own: Sequence[Standing], look: Look) -> None:
+    label, colour, line, mark = look
     if own[-1].rounds == 0:
-        ax.axhline(own[0].measured.mean, color=colour, ls=line, lw=1.2, label=model)
+        ax.axhline(own[0].measured.mean, color=colour, ls=line, lw=1.2, label=label)
         return
     rounds = [one.rounds for one in own]
     mean = [one.measured.mean for one in own]
-    ax.plot(rounds, mean, color=colour, ls=line, marker=mark, ms=5, label=model)
+    ax.plot(rounds, mean, color=colour, ls=line, marker=mark, ms=5, label=label)
     low, high = [one.measured.low for one in own], [one.measured.high for one in own]
     ax.fill_between(rounds, low, high, color=colour, alpha=0.12, lw=0)
 
@@ -123,6 +134,7 @@ def plot_relevance(places: Sequence[Sequence[Share]]) -> Picture:
     """
     figure = Picture(figsize=(WIDTH * len(places) + LEGEND, HEIGHT), layout="constrained")
     panels = figure.subplots(1, len(places), squeeze=False)[0]
+    looks = _looks(one.model for shares in places for one in shares)
     for ax, shares in zip(panels, places, strict=True):
         most = max(one.rounds for one in shares)
         last = [one for one in shares if one.rounds in (0, most)]
@@ -132,12 +144,12 @@ def plot_relevance(places: Sequence[Sequence[Share]]) -> Picture:
         for one in last:
             x = names.index(one.modality)
             x += (models.index(one.model) - (len(models) - 1) / 2) * width
-            colour = STYLES.get(one.model, OTHER)[0]
+            label, colour = looks[one.model][:2]
             if one.share is None:
-                text = f"{one.model}: nothing told"
+                text = f"{label}: nothing told"
                 ax.text(x, 1, text, rotation=90, ha="center", va="bottom", fontsize=7, color=colour)
                 continue
-            ax.bar(x, 100 * one.share.mean, 0.9 * width, color=colour, label=one.model)
+            ax.bar(x, 100 * one.share.mean, 0.9 * width, color=colour, label=label)
             ax.plot([x, x], [100 * one.share.low, 100 * one.share.high], color=BLACK, lw=1)
         ax.set_xticks(range(len(names)), names)
         ax.set_ylim(0, 105)
@@ -150,6 +162,18 @@ def plot_relevance(places: Sequence[Sequence[Share]]) -> Picture:
 def _title(ax: Axes, place: Place) -> None:
     ax.set_title(" ".join(place).replace("_", " "), fontsize=10)
     ax.spines[["top", "right"]].set_visible(False)
+
+
+def _looks(models: Iterable[str]) -> dict[str, Look]:
+    """How each model looks; those of one's own are called by file and class if that is enough."""
+    names = list(dict.fromkeys(models))
+    own = [name for name in names if name not in STYLES]
+    short = [name.rsplit("/", 1)[-1] for name in own]
+    looks = {name: Look(name, *style) for name, style in STYLES.items()}
+    for place, (name, last) in enumerate(zip(own, short, strict=True)):
+        label = last if short.count(last) == 1 else name
+        looks[name] = Look(label, GREY, OTHER_LINES[place % len(OTHER_LINES)], OTHER_MARK)
+    return looks
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
