@@ -36,6 +36,7 @@ from mirror_ppl.console import Progress
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learners import TEST, TRAINING, Group, Posterior
+from mirror_ppl.evaluation.study_report import difference
 from mirror_ppl.evaluation.study_summary import paired
 from mirror_ppl.evaluation.tables import TextTable, write_page
 from mirror_ppl.inference.fitting import predict_rounds
@@ -163,8 +164,7 @@ def row(found: Mapping[str, Measured], name: str) -> tuple[str, str, str]:
         entry = f"{np.mean(values):.{digits}f}"
         if name != PACKAGE:
             ahead = paired(sign * np.array(others), sign * np.array(values)).ahead
-            low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
-            entry += f"\n{ahead.mean:+.{digits}f}\n[{low}, {high}]"
+            entry += f"\n{difference(ahead, digits)}"
         entries.append(entry)
     return name, entries[0], entries[1]
 

@@ -31,8 +31,6 @@ SEEDS, FEW_SEEDS = (5, 2), (2, 1)
 """Of prediction and of the others, in those worlds and otherwise."""
 TOLD = 0.03
 """Of an item at a step, in rounds from which it is learned how to help."""
-PLAYED, DRAWS = 5, 64
-"""Rounds in which people are spoken to, and posterior draws that are planned with."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +59,9 @@ class Options:
     path/to/file.py:Class is a human model of your own."""
     rounds: tuple[int, ...] = (1, 2, 5, 10, 20)
     """Numbers of rounds that are learned from, from 1 to 20; the most only, for relevance."""
-    played: int = PLAYED
+    played: int = 5
     """Rounds of each person in which they are spoken to; of assistance and relevance."""
-    draws: int = DRAWS
+    draws: int = 64
     """Posterior draws that are planned with; of assistance and relevance."""
     told: float | None = None
     """Chance that an item that can be communicated is told, at each step of the rounds that are
@@ -83,8 +81,8 @@ class Options:
             if number is not None and number < 1:
                 raise OptionError(f"--{name} must be at least 1, not {number}")
         if self.study == "prediction":
-            for name, usual in (("played", PLAYED), ("draws", DRAWS)):
-                if getattr(self, name) != usual:
+            for name in ("played", "draws"):
+                if getattr(self, name) != getattr(Options, name):  # which has the default
                     raise OptionError(f"--{name} is of assistance and relevance, not of prediction")
         if self.scheduler is not None and not self.scheduler.strip():
             raise OptionError("--scheduler must be an address, such as tcp://host:8786")

@@ -146,9 +146,13 @@ def _entry(one: Standing | None, people: int) -> str:
 
 
 def _ahead(mirror: Paired, digits: int) -> str:
-    ahead, better = mirror.ahead, mirror.improvement
+    return f"{difference(mirror.ahead, digits)}\n{100 * mirror.improvement.mean:.0f}%"
+
+
+def difference(ahead: Interval, digits: int) -> str:
+    """How far one is ahead of another, and below it the interval of that."""
     low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
-    return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]\n{100 * better.mean:.0f}%"
+    return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]"
 
 
 def _shares(shares: Sequence[Share], title: str) -> TextTable:
