@@ -32,13 +32,13 @@ import tyro
 from torch import Tensor
 
 from benchmarks._relaxed import Latents, relaxed_draws
-from mirror_ppl.console import Progress
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learners import TEST, TRAINING, Group, Posterior
 from mirror_ppl.evaluation.study_report import difference
 from mirror_ppl.evaluation.study_summary import paired
-from mirror_ppl.evaluation.tables import TextTable, write_page
+from mirror_ppl.evaluation.tables import TextTable, page
+from mirror_ppl.files import write_whole
 from mirror_ppl.inference.fitting import predict_rounds
 from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
@@ -48,6 +48,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, save_self_model
+from mirror_ppl.progress import Progress
 
 DOMAIN, SETTING = "driving", "fog"
 DRAWS = 200
@@ -124,7 +125,7 @@ def main(options: Options) -> None:
     for name in dict.fromkeys([*partners, *chosen]):
         found[name] = measure(name, human_of(name, options), options)
         print("   ".join(entry.replace("\n", " ") for entry in row(found, name)), flush=True)
-    write_page(options.out / "ablations.md", [], [table(found, options)])
+    write_whole(options.out / "ablations.md", page([], [table(found, options)]))
 
 
 def measure(name: str, human: HumanModel, options: Options) -> Measured:

@@ -5,17 +5,25 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mirror_ppl.console import Progress, console_for_tables, run
+from mirror_ppl.console import console_for_tables, run
 from mirror_ppl.errors import (
     HumanModelError,
     OptionError,
     PosteriorError,
     UnknownNameError,
 )
+from mirror_ppl.limits import check_numbers
+from mirror_ppl.progress import Progress
+
+if TYPE_CHECKING:
+    from mirror_ppl.evaluation.assistance import Played
+    from mirror_ppl.inference.posterior_file import PosteriorFile
 
 FAR_BELOW = -10
 """Ways from silence to the oracle of which less is told."""
@@ -83,10 +91,8 @@ class Options:
     """Processes that share the work."""
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "people", "draws", "horizon", "patience", "jobs"):
-            number = getattr(self, name)
-            if number is not None and number < 1:
-                raise OptionError(f"--{name} must be at least 1, not {number}")
+        check_numbers(self, "rounds", "people", "draws", "horizon", "patience", jobs=1)
+        check_numbers(self, "seed", "people_seed")
         if not 0 < self.discount <= 1:
             raise OptionError(f"--discount must be above 0 and at most 1, not {self.discount}")
         if self.branch is not None and not 0 <= self.branch <= 1:
@@ -95,11 +101,6 @@ class Options:
             raise OptionError(f"--sure must be at least 0, not {self.sure}")
         if not 0 < self.kl_weight < math.inf:
             raise OptionError(f"--kl-weight must be a positive number, not {self.kl_weight}")
-        for name in ("seed", "people_seed"):
-            number = getattr(self, name)
-            if number is not None and number < 0:
-                option = name.replace("_", "-")
-                raise OptionError(f"--{option} must be at least 0, not {number}")
         if self.kl_measure not in ("kl", "squared"):
             raise OptionError(f'--kl-measure must be kl or squared, not "{self.kl_measure}"')
 
@@ -112,8 +113,8 @@ def main(options: Options) -> None:
     """
     from mirror_ppl.evaluation.assistance import COMMUNICATORS, RATES_FROM, PlannerOptions
     from mirror_ppl.evaluation.assistance_cells import Pairing, run_cells
-    from mirror_ppl.evaluation.assistance_summary import compare, summarize_assistance
-    from mirror_ppl.files import prepare_output_folder, write_whole
+    from mirror_ppl.evaluation.assistance_summary import summarize_assistance
+    from mirror_ppl.files import lock_of, output_folder, remove_abandoned, write_together
 
     chosen = options.communicator or COMMUNICATORS
     for name in chosen:
@@ -121,6 +122,7 @@ def main(options: Options) -> None:
             raise UnknownNameError.of("communicator", name, COMMUNICATORS)
     chosen = tuple(name for name in COMMUNICATORS if name in chosen)
     outputs = _outputs(options)
+    kept = options.json or options.log
     posterior, source = _people(options)
     number = len(posterior.people) if options.people is None else options.people
     if number > len(posterior.people):
@@ -166,34 +168,55 @@ def main(options: Options) -> None:
             f"{LEARNED} is left out: the robot was taught wrong in {pairing.domain.name}",
             file=sys.stderr,
         )
-    for path in outputs:
-        prepare_output_folder(path.parent)
-    kept = options.json or options.log
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
     # Rates of random messages are those of a planner, which plays then, too.
     playing = len({*chosen} | ({RATES_FROM} if "random" in chosen else set()))
-    with Progress("assist", number * playing) as progress:
+    with ExitStack() as stack:
+        for path in outputs:
+            stack.enter_context(output_folder(path.parent, [path.name], lock_of(path)))
+        if parts is not None:
+            remove_abandoned(parts)
+        progress = stack.enter_context(Progress("assist", number * playing))
         played = run_cells(pairing, chosen, number, options.jobs, parts, progress.update)
-    summary = summarize_assistance(played, options.seed)
-    results: dict[str, Any] = {
-        "command": PROGRAM,
-        "options": {
-            name: str(value) if isinstance(value, Path) else value
-            for name, value in asdict(options).items()
-            if name not in ("json", "log", "jobs")
-        },
-        "posterior": dict(posterior.attributes),
-        "communicators": summary,
-    }
-    if "mirror" in played:
-        results["mirror_above"] = {
-            name: compare(played, "mirror", name, options.seed)
-            for name in played
-            if name != "mirror"
-        }
+        summary = summarize_assistance(played, options.seed)
+        write_together(_contents(options, posterior, played, summary))
+        if parts is not None:
+            pairing.forget(parts)
+    _show(summary, posterior.attributes, number, options.rounds)
+    for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
+        if path is not None:
+            print(f"{path}: {what}")
+
+
+def _contents(
+    options: Options,
+    posterior: PosteriorFile,
+    played: Mapping[str, Sequence[Played]],
+    summary: dict[str, dict[str, Any]],
+) -> dict[Path, str]:
+    """What is written: a summary as data, and every decision."""
+    from mirror_ppl.evaluation.assistance_summary import compare
+    from mirror_ppl.files import json_text
+
+    contents = {}
     if options.json is not None:
-        text = json.dumps(results, indent=1) + "\n"
-        write_whole(options.json, lambda temporary: temporary.write_text(text))
+        results: dict[str, Any] = {
+            "command": PROGRAM,
+            "options": {
+                name: value
+                for name, value in asdict(options).items()
+                if name not in ("json", "log", "jobs")
+            },
+            "posterior": dict(posterior.attributes),
+            "communicators": summary,
+        }
+        if "mirror" in played:
+            results["mirror_above"] = {
+                name: compare(played, "mirror", name, options.seed)
+                for name in played
+                if name != "mirror"
+            }
+        contents[options.json] = json_text(results)
     if options.log is not None:
         lines = [
             json.dumps({"communicator": name, "person": posterior.people[person]} | entry) + "\n"
@@ -201,13 +224,8 @@ def main(options: Options) -> None:
             for person, one in enumerate(people)
             for entry in one.log
         ]
-        write_whole(options.log, lambda temporary: temporary.write_text("".join(lines)))
-    if parts is not None:
-        pairing.forget(parts)
-    _show(summary, posterior.attributes, number, options.rounds)
-    for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
-        if path is not None:
-            print(f"{path}: {what}")
+        contents[options.log] = "".join(lines)
+    return contents
 
 
 def _outputs(options: Options) -> list[Path]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mirror_ppl.console import Progress, console_for_tables, run
+from mirror_ppl.console import console_for_tables, run
 from mirror_ppl.errors import OptionError, UnknownNameError
+from mirror_ppl.limits import check_numbers
+from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
     from mirror_ppl.data import Demonstrations
@@ -61,18 +64,15 @@ class Options:
     """Seed of everything random."""
 
     def __post_init__(self) -> None:
-        for name in ("people", "draws"):
-            if (number := getattr(self, name)) < 1:
-                raise OptionError(f"--{name} must be at least 1, not {number}")
-        if self.seed < 0:
-            raise OptionError(f"--seed must be at least 0, not {self.seed}")
+        check_numbers(self, "people", "draws", "seed")
         if self.guide_file is not None and self.guide != "amortized":
             raise OptionError("--guide-file is for --guide amortized")
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
             numbers = " ".join(map(str, self.rounds))
             raise OptionError(f"--rounds must be positive and increase, not {numbers or 'none'}")
-        if self.jobs == 0 or self.jobs < -1:
-            raise OptionError(f"--jobs must be at least 1, or -1 for all, not {self.jobs}")
+        check_numbers(self, "rounds", "jobs")
+        if self.jobs == 0:
+            raise OptionError("--jobs must be at least 1, or -1 for all, not 0")
 
 
 def main(options: Options) -> int:
@@ -86,7 +86,7 @@ def main(options: Options) -> int:
     """
     from mirror_ppl.data import asset_path, load_demonstrations
     from mirror_ppl.domains import get_domain, require_known
-    from mirror_ppl.files import prepare_output_folder
+    from mirror_ppl.files import output_folder, remove_abandoned, write_together
     from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
     from mirror_ppl.inference.guide_file import network_for
     from mirror_ppl.inference.guides import GUIDES, InferenceOptions, run_identity
@@ -106,13 +106,15 @@ def main(options: Options) -> int:
     name = f"{options.domain}_{setting}_paper.nc"
     human.learn_world(load_demonstrations(asset_path(name)))
     network = network_for(options.guide, options.guide_file, human)
-    folder = prepare_output_folder(options.out)
     settings = InferenceOptions(options.guide, options.draws)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
-    parts = folder / "parts"
     what = [settings, setting, options.seed, trial]
     identity = run_identity(human, network, what)
-    with Progress("calibrate", options.people) as progress:
+    pictures = {"ranks.png": plot_ranks, "ecdf.png": plot_ecdf, "coverage.png": plot_coverage}
+    results = output_folder(options.out, ["calibration.nc", *pictures])
+    with results as folder, Progress("calibrate", options.people) as progress:
+        parts = folder / "parts"
+        remove_abandoned(parts)
         calibration = calibrate(
             human,
             partial(_infer, human, settings, network),
@@ -123,17 +125,16 @@ def main(options: Options) -> int:
             options.jobs,
             (parts, identity),
         )
-    calibration.save(folder / "calibration.nc")
-    pictures = {"ranks": plot_ranks, "ecdf": plot_ecdf, "coverage": plot_coverage}
-    for name, plot in pictures.items():
-        plot(calibration).save(folder / f"{name}.png")
-    for file in parts.glob("*.nc"):
-        file.unlink()
-    parts.rmdir()
+        drawn = {folder / name: plot(calibration).content() for name, plot in pictures.items()}
+        write_together({folder / "calibration.nc": calibration.content(), **drawn})
+        for file in parts.glob("*.nc"):
+            file.unlink()
+        with suppress(OSError):  # something else is in it
+            parts.rmdir()
     _show(calibration, options.guide)
     print(f"{folder / 'calibration.nc'}: ranks of every person")
-    for name in pictures:
-        print(f"{folder / f'{name}.png'}")
+    for path in drawn:
+        print(path)
     return REJECTED if calibration.rejected else 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -63,20 +62,20 @@ def main(options: Options) -> None:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
     from mirror_ppl.evaluation.comparison import compare_fits, label_models, read_fit
-    from mirror_ppl.files import prepare_output_folder, write_whole
-    from mirror_ppl.plots.comparison import save_comparison_picture
+    from mirror_ppl.files import json_text, write_together
+    from mirror_ppl.plots.comparison import plot_comparison
 
-    outputs = _outputs(options)
+    _check_outputs(options)
     _require_different(options.posteriors)
     files = [read_fit(path, options.by) for path in options.posteriors]
     comparison = compare_fits(files, options.labels or label_models(files), options.by)
-    for path in outputs:
-        prepare_output_folder(path.parent)
+    contents = {}
     if options.json is not None:
-        text = json.dumps({"command": PROGRAM} | comparison.as_data(), indent=1) + "\n"
-        write_whole(options.json, lambda temporary: temporary.write_text(text))
+        contents[options.json] = json_text({"command": PROGRAM} | comparison.as_data())
     if options.figure is not None:
-        save_comparison_picture(comparison, options.figure)
+        picture = plot_comparison(comparison)
+        contents[options.figure] = picture.content(options.figure.suffix[1:].lower())
+    write_together(contents)
     _show(comparison)
     what = ((options.json, "the numbers, also of each person"), (options.figure, "the differences"))
     for path, content in what:
@@ -96,12 +95,12 @@ def _require_different(posteriors: tuple[Path, ...]) -> None:
         seen.add(real)
 
 
-def _outputs(options: Options) -> list[Path]:
+def _check_outputs(options: Options) -> None:
     from mirror_ppl.evaluation.comparison import posterior_path
     from mirror_ppl.files import require_files_of_their_own
 
     inputs = {"a posterior": [posterior_path(path) for path in options.posteriors]}
-    return require_files_of_their_own({"--json": options.json, "--figure": options.figure}, inputs)
+    require_files_of_their_own({"--json": options.json, "--figure": options.figure}, inputs)
 
 
 def _show(comparison: Comparison) -> None:

@@ -1,14 +1,17 @@
-"""What the commands share: how they start and end, and how they show progress."""
+"""What the commands share: how they start and end, and what they print to."""
 
 import contextlib
+import errno
+import io
 import os
+import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
-from time import monotonic
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self, TextIO, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
-from mirror_ppl.errors import MirrorError, UnknownNameError
+from mirror_ppl.errors import HumanModelError, MirrorError, OptionError, UnknownNameError
+from mirror_ppl.user_code import describe, passed_user_code
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,6 +22,11 @@ EXIT_BAD_INPUT = 2
 # As shells report a process that a signal ended: 128 + the signal's number.
 EXIT_INTERRUPTED = 128 + 2
 EXIT_BROKEN_PIPE = 128 + 13
+EXIT_TERMINATED = 128 + 15
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF)
+"""Errors of writing that are not the code's."""
+NO_MEMORY = ("can't allocate memory", "CUDA out of memory")
+"""How torch says that there is too little memory."""
 
 
 def run(
@@ -45,36 +53,129 @@ def run(
             too small to gain from more than one.
 
     Returns:
-        What `main` returns; 2 after an argument error or a `MirrorError`, which is reported in one
-        line on stderr; 130 after an interruption; 141 when the reader of stdout went away. Other
-        exceptions are mistakes of the code and pass through.
+        What `main` returns; 2 after an argument error, a `MirrorError`, a fault in a file of the
+        user, or where there is too little memory or room, which is reported in one line on stderr;
+        130 after an interruption and 143 after SIGTERM; 141 when the reader of stdout went away.
+        Other exceptions are mistakes of the code and pass through.
     """
+    _open_streams()
+    with _terminable():
+        try:
+            status = _run(options_class, main, prog, description, args, threads)
+            sys.stdout.flush()
+            return status
+        except (KeyboardInterrupt, Exception) as error:
+            ending = _ending(error)
+            if ending is None:
+                raise
+            status, message = ending
+            # What was printed before goes first, where it still goes anywhere.
+            with contextlib.suppress(OSError, ValueError):
+                sys.stdout.flush()
+            with contextlib.suppress(OSError, ValueError):
+                print(message, end="\n" if message else "", file=sys.stderr, flush=True)
+            _leave_streams()
+            return status
+
+
+def _run(
+    options_class: type[Options],
+    main: Callable[[Options], int | None],
+    prog: str,
+    description: str,
+    args: Sequence[str] | None,
+    threads: int,
+) -> int:
     import tyro
 
+    said = io.StringIO()
     try:
-        try:
+        with contextlib.redirect_stderr(said):
             options = tyro.cli(options_class, prog=prog, description=description, args=args)
-        except SystemExit as end:  # after --help, or after tyro reported an argument error
-            status = int(end.code or 0)
-        else:
-            # After parsing, so that --help and argument errors do not wait for the import of torch.
-            _use_threads(threads)
-            status = main(options) or 0
-        sys.stdout.flush()
-        return status
-    except MirrorError as error:
-        message = " ".join(str(error).splitlines()) or type(error).__name__
-        print(f"error: {message}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # As in `... | head`. What is still buffered has to go somewhere, or the interpreter
-        # complains when it flushes stdout at its end.
-        with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())
-        return EXIT_BROKEN_PIPE
+    except SystemExit as end:
+        if end.code:
+            raise OptionError(_argument_error(said.getvalue(), prog)) from end
+        return 0  # after --help
+    # After parsing, so that --help and argument errors do not wait for the import of torch.
+    _use_threads(threads)
+    try:
+        return main(options) or 0
+    except SystemExit as end:
+        raise HumanModelError(describe(end)) from end
+
+
+def _argument_error(box: str, prog: str) -> str:
+    """What tyro says in a box, in one line."""
+    lines = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
+    text = "\n".join(lines)
+    parts = [" ".join(part.split()) for part in re.split("─{3,}", text)]
+    meant = [word for part in parts if part.startswith("Perhaps") for word in part.split()]
+    options = dict.fromkeys(word.rstrip(",") for word in meant if word.startswith("--"))
+    message = parts[0].rstrip(".")
+    if options:
+        message += f"; perhaps you meant {' or '.join(options)}"
+    return f"{message}; see {prog} --help"
+
+
+def _ending(error: BaseException) -> tuple[int, str] | None:
+    """Exit status and line of an exception; None of a mistake of the code."""
+    if isinstance(error, MirrorError):
+        text = " ".join(str(error).split()) or type(error).__name__
+        return EXIT_BAD_INPUT, f"error: {text}"
+    if isinstance(error, _Terminated):
+        return EXIT_TERMINATED, "terminated"
+    if isinstance(error, KeyboardInterrupt):
+        return EXIT_INTERRUPTED, "interrupted"
+    if isinstance(error, BrokenPipeError):  # as in `... | head`
+        return EXIT_BROKEN_PIPE, ""
+    if passed_user_code(error):
+        return EXIT_BAD_INPUT, f"error: {describe(error)}"
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        return EXIT_BAD_INPUT, f"error: cannot write: {error}"
+    if isinstance(error, MemoryError) or any(sign in str(error) for sign in NO_MEMORY):
+        return EXIT_BAD_INPUT, f"error: there is too little memory ({' '.join(str(error).split())})"
+    return None
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end, by SIGTERM; work ends as after an interruption."""
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    def terminate(number: int, frame: object) -> None:
+        raise _Terminated
+
+    try:
+        before = signal.signal(signal.SIGTERM, terminate)
+    except ValueError:  # not the main thread, which alone can
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _open_streams() -> None:
+    """Streams that were closed lead nowhere, and characters that one lacks are escaped."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - to the process's end
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - to the process's end
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _leave_streams() -> None:
+    """Let what a stream cannot take go nowhere: the interpreter flushes them at its end."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError), open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _use_threads(threads: int) -> None:
@@ -92,236 +193,18 @@ def usable_device(name: str) -> str:
     """
     import torch
 
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:  # an AssertionError where torch lacks CUDA
-        known = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-        raise UnknownNameError.of("device", name, known) from error
+    known = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+    if name not in known and not (name == "cuda" and len(known) > 1):
+        raise UnknownNameError.of("device", name, known)
     return name
 
 
 def console_for_tables(width: int) -> "Console":
-    """A console as wide as the terminal, or as told where there is none."""
-    from rich.console import Console
+    """A console as wide as the terminal, or as told where there is none.
 
-    console = Console()
-    return console if console.is_terminal else Console(width=width)
-
-
-class Progress:
-    """Shows on stderr how far long work has come; a context manager.
-
-    On a terminal it is a bar with the time elapsed and remaining. Elsewhere (a file, a pipe, a
-    notebook) it is plain lines such as `fit: 120/300 loss 12.3, 8 s, 12 s left`: at most one in
-    `interval` seconds, and one for the last state when the work ends or fails. Cheap enough to be
-    told about every step.
-
-    Args:
-        name: what is being done, such as "fit".
-        total: how many steps there are; None if that is not known.
-        done: how many of them were done before, by the run that is resumed.
-        interval: seconds between plain lines.
-        quiet: show nothing.
-        stream: where to, instead of stderr.
+    It shows names as they are, whatever brackets or colons are in them.
     """
-
-    def __init__(
-        self,
-        name: str,
-        total: int | None = None,
-        *,
-        done: int = 0,
-        interval: float = 5.0,
-        quiet: bool = False,
-        stream: TextIO | None = None,
-    ) -> None:
-        self.name = name
-        self.total = total
-        self.done = done
-        self.message = ""
-        self._interval = interval
-        self._quiet = quiet
-        self._stream = stream
-        self._display: _Display | None = None
-        self._shown = (self.done, self.message)
-        self._next = 0.0
-        self._resume(done)
-
-    def _resume(self, done: int) -> None:
-        self._start, self._begun = monotonic(), done
-        self._last = self._start
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the work began, or was resumed."""
-        return monotonic() - self._start
-
-    @property
-    def left(self) -> float | None:
-        """Seconds that the rest will take if it goes on like this; None as long as nobody knows.
-
-        By all that was done in this run: steps can take minutes, and each another time.
-        """
-        done = self.done - self._begun
-        if self.total is None or done < 1:
-            return None
-        estimate = (self._last - self._start) / done * (self.total - self.done)
-        return max(0.0, estimate - (monotonic() - self._last))
-
-    def resume(self, done: int) -> None:
-        """Tell how many steps an earlier run did; what is left is not reckoned by those."""
-        self._resume(done)
-        self.done = done
-        if self._display is not None:
-            self.message = f"{done} were done before" if done else ""
-            self._shown = (done, self.message)
-            self._display.show(self)
-
-    def __enter__(self) -> Self:
-        self._resume(self.done)
-        if not self._quiet:
-            # Looked up now, not when the class was defined: stderr may have been redirected since.
-            stream = sys.stderr if self._stream is None else self._stream
-            display = _bar(self, stream) if stream.isatty() else None
-            self._display = display or _Lines(self, stream, self._interval)
-            self._next = monotonic() + self._display.interval
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._display is not None:
-            display, self._display = self._display, None
-            try:
-                if self._shown != (self.done, self.message):
-                    display.show(self)
-            finally:
-                display.close()
-
-    def update(self, done: int, message: str = "") -> None:
-        """Tell that `done` steps are done in all, with a message such as "loss 12.3"."""
-        now = monotonic()
-        self.done, self.message, self._last = done, message, now
-        if self._display is not None and now >= self._next:
-            self._next = now + self._display.interval
-            self._shown = (done, message)
-            self._display.show(self)
-
-    def advance(self, message: str = "") -> None:
-        """Tell that one more step is done."""
-        self.update(self.done + 1, message)
-
-
-class Stages:
-    """Progress of one stage of work after the other; a context manager."""
-
-    def __init__(self) -> None:
-        self.progress: Progress | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        if self.progress is not None:
-            self.progress.__exit__(*(error or (None, None, None)))
-            self.progress = None
-
-    def report(self, name: str, done: int, total: int, message: str) -> None:
-        """Tell how far a stage is; the one before it is over when the name changes."""
-        if self.progress is None or self.progress.name != name:
-            self.__exit__(None, None, None)
-            self.progress = Progress(name, total).__enter__()
-        self.progress.update(done, message)
-
-
-class _Display(Protocol):
-    interval: float  # seconds from one `show` to the next, at least
-
-    def show(self, progress: Progress) -> None: ...
-
-    def close(self) -> None: ...
-
-
-class _Lines:
-    """Plain lines, for files, pipes and notebooks."""
-
-    def __init__(self, progress: Progress, stream: TextIO, interval: float) -> None:
-        self.interval = interval
-        self._stream = stream
-
-    def show(self, progress: Progress) -> None:
-        total = "" if progress.total is None else f"/{progress.total}"
-        state = f"{progress.name}: {progress.done}{total} {progress.message}".rstrip()
-        left = progress.left
-        ahead = "" if not left else f", {_duration(left)} left"
-        print(f"{state}, {_duration(progress.elapsed)}{ahead}", file=self._stream, flush=True)
-
-    def close(self) -> None:
-        pass
-
-
-class _Bar:
-    """A bar of rich, for terminals."""
-
-    interval = 0.1  # rich redraws ten times a second; telling it more often is wasted
-
-    def __init__(self, progress: Progress, console: "Console") -> None:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            ProgressColumn,
-            Task,
-            TextColumn,
-            TimeElapsedColumn,
-        )
-        from rich.progress import Progress as RichProgress
-        from rich.text import Text
-
-        class Left(ProgressColumn):
-            """rich's own forgets what took longer than its window."""
-
-            def render(self, task: Task) -> Text:
-                left = progress.left
-                return Text("" if not left else f"{_duration(left)} left")
-
-        self._rich = RichProgress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            Left(),
-            TextColumn("{task.fields[message]}", markup=False),
-            console=console,
-            # rich sends what is printed meanwhile above the bar, to the bar's stream: right on a
-            # terminal, but output that goes to a file must stay in that file.
-            redirect_stdout=sys.stdout.isatty(),
-        )
-        self._task = self._rich.add_task(
-            progress.name, total=progress.total, completed=progress.done, message=""
-        )
-        self._rich.start()
-
-    def show(self, progress: Progress) -> None:
-        self._rich.update(self._task, completed=progress.done, message=progress.message)
-
-    def close(self) -> None:
-        self._rich.stop()
-
-
-def _bar(progress: Progress, stream: TextIO) -> _Bar | None:
-    """A bar, or None on a terminal that cannot redraw a line."""
     from rich.console import Console
 
-    console = Console(file=stream)
-    return None if console.is_dumb_terminal else _Bar(progress, console)
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    own = None if sys.stdout.isatty() else width
+    return Console(width=own, markup=False, emoji=False, highlight=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -11,8 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from mirror_ppl.console import Progress, run
+from mirror_ppl.console import run
 from mirror_ppl.errors import OptionError, UnknownNameError
+from mirror_ppl.limits import check_numbers
+from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
     from mirror_ppl.evaluation.sweep import Outcome
@@ -76,10 +77,7 @@ class Options:
     """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
 
     def __post_init__(self) -> None:
-        for name in ("people", "seeds", "played", "draws"):
-            number = getattr(self, name)
-            if number is not None and number < 1:
-                raise OptionError(f"--{name} must be at least 1, not {number}")
+        check_numbers(self, "people", "seeds", "played", "draws", "jobs")
         if self.study == "prediction":
             for name in ("played", "draws"):
                 if getattr(self, name) != getattr(Options, name):  # which has the default
@@ -95,8 +93,8 @@ class Options:
             raise OptionError(
                 f"--rounds must be from 1 to 20, not {', '.join(map(str, wrong)) or 'none'}"
             )
-        if self.jobs == 0 or self.jobs < -1:
-            raise OptionError(f"--jobs must be at least 1, or -1 for all, not {self.jobs}")
+        if self.jobs == 0:
+            raise OptionError("--jobs must be at least 1, or -1 for all, not 0")
 
 
 def main(options: Options) -> int:
@@ -111,14 +109,17 @@ def main(options: Options) -> int:
     from mirror_ppl.evaluation.study import assist, identities, predict
     from mirror_ppl.evaluation.study_report import REPORTS
     from mirror_ppl.evaluation.sweep import run_cells
-    from mirror_ppl.evaluation.tables import write_page, write_rows
-    from mirror_ppl.files import prepare_output_folder, write_whole
+    from mirror_ppl.evaluation.tables import comma_separated, page
+    from mirror_ppl.files import json_text, output_folder, remove_abandoned, write_together
 
     cells = _cells(options)
-    folder = prepare_output_folder(options.out)
-    parts = prepare_output_folder(folder / "parts")
     work = predict if options.study == "prediction" else assist
-    with Progress(options.study, len(cells)) as progress:
+    path = options.out / f"{options.study}.csv"
+    kinds = (".csv", ".md", ".json", ".png")
+    results = output_folder(path.parent, [path.with_suffix(kind).name for kind in kinds])
+    with results as folder, Progress(options.study, len(cells)) as progress:
+        parts = folder / "parts"
+        remove_abandoned(parts)
         outcomes = run_cells(
             cells,
             work,
@@ -129,21 +130,21 @@ def main(options: Options) -> int:
             progress.update,
             progress.resume,
         )
-    rows = [row for outcome in outcomes for row in outcome.rows]
-    failed = [outcome for outcome in outcomes if outcome.error is not None]
-    if rows:
-        path = folder / f"{options.study}.csv"
-        write_whole(path, lambda temporary: write_rows(temporary, rows))
-        report = REPORTS[options.study](rows)
+        rows = [row for outcome in outcomes for row in outcome.rows]
+        failed = [outcome for outcome in outcomes if outcome.error is not None]
+        report = REPORTS[options.study](rows) if rows else None
+        if report is not None:
+            content = _origin(options) | report.data | _effort(outcomes)
+            write_together(
+                {
+                    path: comma_separated(rows),
+                    path.with_suffix(".md"): page(report.sentences, report.tables),
+                    path.with_suffix(".json"): json_text(content),
+                    path.with_suffix(".png"): report.picture.content(),
+                }
+            )
+    if report is not None:
         report.show()
-        write_whole(
-            path.with_suffix(".md"),
-            lambda temporary: write_page(temporary, report.sentences, report.tables),
-        )
-        content = _origin(options) | report.data | _effort(outcomes)
-        text = json.dumps(content, indent=1, default=_plain) + "\n"
-        write_whole(folder / f"{options.study}.json", lambda temporary: temporary.write_text(text))
-        report.picture.save(folder / f"{options.study}.png")
         print(f"{path}: a row for each person, model and number of rounds")
         print(f"{path.with_suffix('.md')}: the tables above")
         print(f"{path.with_suffix('.json')}: means, differences and intervals")
@@ -240,11 +241,6 @@ def _effort(outcomes: Sequence[Outcome]) -> dict[str, Any]:
             outcome.cell.label: outcome.error for outcome in outcomes if outcome.error is not None
         },
     }
-
-
-def _plain(value: Any) -> Any:
-    """What JSON has no word for."""
-    return str(value) if isinstance(value, Path) else asdict(value)
 
 
 if __name__ == "__main__":

@@ -1,28 +1,40 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and files that are read whole."""
 
 import errno
+import json
 import os
 import secrets
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+import stat
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, is_dataclass
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from platform import node
+from typing import Any, BinaryIO
 
-from mirror_ppl.errors import CheckpointError, OutputError
+from mirror_ppl.errors import MirrorError, OutputError
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system: files are written whole there, but not locked
+    fcntl = None
+
+PARTIAL = ".partial"
+"""Suffix of files that are being written."""
+LOCK = ".lock"
+"""Name of the file that a process holds while it alone writes in a folder."""
 
 
-def write_whole(path: str | os.PathLike[str], writer: Callable[[Path], object]) -> Path:
+Content = bytes | memoryview | str
+
+
+def write_whole(path: str | os.PathLike[str], content: Content) -> Path:
     """Write a file such that readers see its old content or all of the new, never a part.
-
-    The writer fills a temporary file in the same folder, which then takes the file's place. Folders
-    that are missing are created. On any failure, interruption included, the old file is untouched
-    and nothing new is left behind.
 
     Args:
         path: the file to write; a link is followed.
-        writer: is given the temporary file's path, which ends in the same suffix as `path`, and
-            writes there. It should do nothing else: each `OSError` of it counts as a failure to
-            write.
+        content: all of it; text is written as UTF-8.
 
     Returns:
         `path`.
@@ -30,72 +42,165 @@ def write_whole(path: str | os.PathLike[str], writer: Callable[[Path], object]) 
     Raises:
         OutputError: the folder cannot be created, or the file cannot be written.
     """
-    # The temporary file must lie where the file itself does: a rename cannot cross file systems.
-    target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():
-        # As root, a rename would replace even a device such as /dev/null.
-        raise OutputError(f"cannot write {path}: it is not a regular file")
-    made = _make_folder(target.parent)
-    temporary = _temporary_beside(target)
-    try:
-        # Created here, not by tempfile, so that it gets the permissions of any other new file.
-        temporary.touch(exist_ok=False)
-        writer(temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        _remove_folders(made)
-        if isinstance(error, OSError):
-            raise OutputError(f"cannot write {path}: {_reason(error)}") from error
-        raise
+    write_together({path: content})
     return Path(path)
 
 
-def prepare_output_folder(path: str | os.PathLike[str]) -> Path:
-    """Create a folder where it is missing, and make sure that files can be written in it.
+def write_together(
+    contents: Mapping[str | os.PathLike[str], Content] | Mapping[Path, Content],
+    remove: Iterable[Path] = (),
+) -> None:
+    """Write several files, all of them or none, each whole.
 
-    Called before long work, so that a folder that cannot be written is found out first.
+    Temporary files in the same folders are filled, and then take the files' places. Folders that
+    are missing are created. On any failure, interruption included, old files are untouched and
+    nothing new is left behind; what a killed process leaves is removed by the next `output_folder`.
 
-    Returns:
+    Content is made in memory first: libraries that write files themselves report a full disk in
+    many ways, one of which is to crash.
+
+    Args:
+        contents: of each file all that will be in it; links are followed, text becomes UTF-8.
+        remove: older files that are out of date when these are written.
+
+    Raises:
+        OutputError: a folder cannot be created, or a file cannot be written.
+    """
+    ready: list[tuple[Path, BinaryIO, Path]] = []
+    made: list[Path] = []
+    path: str | os.PathLike[str] = ""
+    try:
+        for path, content in contents.items():
+            # The temporary file must lie where the file itself does: a rename cannot cross file
+            # systems.
+            target = Path(os.path.realpath(path))
+            _require_file(target, path)
+            made += _make_folder(target.parent)
+            temporary, file = _locked_temporary(target)
+            ready.append((temporary, file, target))
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        for old in remove:
+            old.unlink(missing_ok=True)
+        for temporary, _, target in ready:
+            path = target
+            temporary.replace(target)
+    except BaseException as error:
+        for temporary, _, _ in ready:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+        _remove_folders(made)
+        if isinstance(error, OSError | ValueError):  # a ValueError of a name or text that cannot be
+            raise OutputError(f"cannot write {path}: {_reason(error)}") from error
+        raise
+    finally:
+        for _, file, _ in ready:
+            with suppress(OSError):
+                file.close()
+
+
+def read_whole(path: str | os.PathLike[str], failure: type[MirrorError]) -> bytes:
+    """Everything that is in a regular file.
+
+    Pipes and devices are refused: reading them may never end.
+
+    Raises:
+        failure: the file is missing, cannot be read, or is not a regular file.
+    """
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise failure(f"{path}: is not a regular file")
+        return Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise failure(f"{path}: there is no such file") from error
+    except (OSError, ValueError) as error:  # a ValueError of a path with a null character
+        raise failure(f"{path}: cannot be read ({error})") from error
+
+
+def json_text(content: Any) -> str:
+    """Strict JSON of plain values, paths and dataclasses; numbers that are not finite are null."""
+    return json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
+
+
+def _plain(content: Any) -> Any:
+    if isinstance(content, float):
+        return content if isfinite(content) else None
+    if isinstance(content, Path):
+        return str(content)
+    if is_dataclass(content) and not isinstance(content, type):
+        content = asdict(content)
+    if isinstance(content, Mapping):
+        return {str(key): _plain(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_plain(value) for value in content]
+    return content
+
+
+@contextmanager
+def output_folder(
+    path: str | os.PathLike[str], names: Iterable[str] = (), lock: str = LOCK
+) -> Iterator[Path]:
+    """A folder in which this process alone writes its results; a context around long work.
+
+    It is created where it is missing, and removed again if the work fails before anything is in it.
+    What cannot be written is found out first. Temporary files of killed processes are removed. The
+    lock is a file that names its process; the operating system gives it up when that process ends,
+    however it ends.
+
+    Args:
+        path: the folder.
+        names: of the files that will be written in it.
+        lock: name of the lock; another than the folder's where files of one folder are the results
+            of several commands, see `lock_of`.
+
+    Yields:
         The folder.
 
     Raises:
-        OutputError: it cannot be created or written; nothing is left behind.
+        OutputError: it cannot be created or written, something that is not a regular file has the
+            name of a result, or another process is at work on these results; says which. Nothing is
+            left behind.
     """
     folder = Path(path)
+    for name in names:
+        _require_file(folder / name, folder / name)
     made = _make_folder(folder)
-    probe = _temporary_beside(folder / "probe")
     try:
-        probe.touch(exist_ok=False)
-        probe.unlink()
-    except OSError as error:
+        remove_abandoned(folder)
+        with _sole_use(folder / lock):
+            yield folder
+    except BaseException:
         _remove_folders(made)
-        raise OutputError(f"cannot write in the folder {folder}: {_reason(error)}") from error
-    return folder
+        raise
 
 
-def read_checkpoint(path: Path, run: Any) -> dict[str, Any]:
-    """What a checkpoint of a run holds, written by ``torch.save`` with the run under ``"run"``.
+def lock_of(path: Path) -> str:
+    """Name of the lock of a file that is written at the end of long work."""
+    return f".{path.name[:100]}{LOCK}"
 
-    Raises:
-        CheckpointError: the file is damaged or of another run.
-    """
-    import torch
 
+@contextmanager
+def _sole_use(path: Path) -> Iterator[None]:
     try:
-        content = torch.load(path, weights_only=True)
-        own = content["run"]
-    except Exception as error:
-        raise CheckpointError(f"{path} is not a checkpoint of this program; remove it") from error
-    if own != run:
-        raise CheckpointError(
-            f"{path} belongs to a run with other options, seed or recordings; remove it, or "
-            "write elsewhere"
+        file = _held(path)
+    except OSError as error:
+        raise OutputError(f"cannot write in {path.parent}: {_reason(error)}") from error
+    if file is None:
+        holder = ""
+        with suppress(OSError):
+            holder = path.read_text(errors="replace").strip()
+        own = path.name[1 : -len(LOCK)]
+        raise OutputError(
+            f"{path.with_name(own) if own else path.parent} is being written by "
+            f"{holder or 'another process'}; wait until it ends, or write elsewhere"
         )
-    return content
+    with file:
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 def require_files_of_their_own(
@@ -120,17 +225,83 @@ def require_files_of_their_own(
             continue
         if path.resolve() in taken:
             raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
-        if path.exists() and not path.is_file():
-            raise OutputError(f"cannot write {path}: it is not a regular file")
+        _require_file(path, path)
         taken[path.resolve()] = option
         result.append(path)
     return result
 
 
+def _require_file(target: Path, named: str | os.PathLike[str]) -> None:
+    try:
+        mode = os.stat(target).st_mode
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        # What is in the way of a folder is told when the folder is made.
+        if isinstance(error, NotADirectoryError):
+            return
+        raise OutputError(f"cannot write {named}: {_reason(error)}") from error
+    if not stat.S_ISREG(mode):
+        # As root, a rename would replace even a device such as /dev/null.
+        raise OutputError(f"cannot write {named}: it is not a regular file")
+
+
 def _temporary_beside(target: Path) -> Path:
-    # Some writers choose the format by the suffix, or add one where it is missing. The target's
-    # name is cut so that a long but valid one stays valid.
-    return target.with_name(f".{target.stem[:100]}-{secrets.token_hex(8)}{target.suffix}")
+    # The target's name is cut so that a long but valid one stays valid.
+    return target.with_name(f".{target.stem[:100]}-{secrets.token_hex(8)}{PARTIAL}")
+
+
+def _locked_temporary(target: Path) -> tuple[Path, BinaryIO]:
+    """A new file that is locked as long as it is open, so that nobody takes it for abandoned."""
+    while True:
+        path = _temporary_beside(target)
+        # Created here, not by tempfile, so that it gets the permissions of any other new file.
+        file = path.open("xb")
+        if _lock(file) and os.fstat(file.fileno()).st_nlink:
+            return path, file
+        file.close()  # another process removed it before it was locked
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove temporary files that killed processes left in a folder, if it is there."""
+    for path in folder.glob(f".*{PARTIAL}"):
+        with suppress(OSError), path.open("r+b") as file:
+            if fcntl is not None and _lock(file):
+                path.unlink()
+
+
+def _lock(file: BinaryIO) -> bool:
+    """Whether this process holds the file's lock now, or the file system has no locks."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+            raise
+    return True
+
+
+def _held(path: Path) -> BinaryIO | None:
+    """The lock, open and held; None where another process holds it."""
+    while True:
+        file = path.open("a+b")
+        try:
+            if not _lock(file):
+                file.close()
+                return None
+            # Whoever held it before may have removed it in between.
+            if os.fstat(file.fileno()).st_nlink:
+                file.truncate(0)
+                file.write(f"process {os.getpid()} on {node()}\n".encode())
+                file.flush()
+                return file
+        except BaseException:
+            file.close()
+            raise
+        file.close()
 
 
 def _make_folder(folder: Path) -> list[Path]:
@@ -149,7 +320,7 @@ def _make_folder(folder: Path) -> list[Path]:
                     raise NotADirectoryError(code, os.strerror(code), str(step)) from None
             else:
                 made.append(step)
-    except OSError as error:
+    except (OSError, ValueError) as error:
         _remove_folders(made)
         raise OutputError(f"cannot create the folder {folder}: {_reason(error)}") from error
     return made
@@ -162,7 +333,7 @@ def _remove_folders(made: list[Path]) -> None:
             folder.rmdir()
 
 
-def _reason(error: OSError) -> str:
-    if error.strerror is None:
+def _reason(error: OSError | ValueError) -> str:
+    if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
     return f"{error.strerror}: {error.filename}" if error.filename else error.strerror

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 
-from mirror_ppl.console import Stages, run, usable_device
+from mirror_ppl.console import run, usable_device
 from mirror_ppl.errors import OptionError
+from mirror_ppl.limits import check_numbers, share
+from mirror_ppl.progress import Stages
 
 PROGRAM = "python -m mirror_ppl.fit"
 DOMAIN, POPULATION = "driving", "paper"
+CHECKPOINT = "fit.checkpoint"
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
@@ -56,6 +58,9 @@ class Options:
     inferred with them, and posterior.nc holds it)."""
     prior_from: Path | None = None
     """A posterior.nc of --pooling partial, whose population is the prior of these people."""
+    allow_contradictions: str = "0%"
+    """Share of steps whose action may contradict the next observation, such as 2%: for recordings
+    of noisy rigs. The summary counts them."""
     explore: int = 8
     """Rounds that the model plays in each scenario, to say which would tell more of what people
     see; 0 leaves it out."""
@@ -77,12 +82,8 @@ class Options:
             raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
         if self.refine and self.guide not in ("amortized", "exact"):
             raise OptionError("--refine is for --guide amortized and exact")
-        least_of = {"steps": 1, "draws": 1, "train_rounds": 0, "explore": 0, "refine": 0}
-        for name, least in least_of.items():
-            number = getattr(self, name)
-            if number is not None and number < least:
-                option = f"--{name.replace('_', '-')}"
-                raise OptionError(f"{option} must be at least {least}, not {number}")
+        check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed")
+        share(self.allow_contradictions, "--allow-contradictions")
 
 
 def main(options: Options) -> None:
@@ -95,9 +96,9 @@ def main(options: Options) -> None:
     demonstrations = _recordings(options)
     from mirror_ppl.domains import get_domain
     from mirror_ppl.evaluation.fit_report import show_fit
-    from mirror_ppl.files import prepare_output_folder, write_whole
-    from mirror_ppl.inference.export import add_identifiability, save_inference_data
-    from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
+    from mirror_ppl.files import json_text, output_folder, write_together
+    from mirror_ppl.inference.export import add_identifiability, netcdf_content
+    from mirror_ppl.inference.fitting import fit_people, split_rounds
     from mirror_ppl.inference.guide_file import network_for
     from mirror_ppl.inference.guides import InferenceOptions
     from mirror_ppl.inference.identifiability import identify
@@ -112,7 +113,12 @@ def main(options: Options) -> None:
     device = usable_device(options.device)
     svi = FitOptions(steps=options.steps)
     settings = InferenceOptions(
-        options.guide, options.draws, svi, pooling=options.pooling, refine=options.refine
+        options.guide,
+        options.draws,
+        svi,
+        pooling=options.pooling,
+        refine=options.refine,
+        allow_contradictions=share(options.allow_contradictions, "--allow-contradictions"),
     )
     weights = options.self_model or shipped_weights(demonstrations.domain)
     self_model, _ = load_self_model(weights, demonstrations.domain)
@@ -123,12 +129,9 @@ def main(options: Options) -> None:
     if options.prior_from is not None:
         pooling = Pooling(human)
         population = load_population(options.prior_from, pooling, demonstrations.setting)
-    # Faults of the recordings come to light before anything is written.
-    check_world(demonstrations)
     split_rounds(demonstrations, options.train_rounds)
-    folder = prepare_output_folder(options.out)
-    checkpoint = folder / "fit.checkpoint"
-    with Stages() as stages:
+    results = ("summary.json", "posterior.nc", "open.png", *FILES)
+    with output_folder(options.out, (*results, CHECKPOINT)) as folder, Stages() as stages:
         result = fit_people(
             human,
             demonstrations.to(device),
@@ -136,7 +139,7 @@ def main(options: Options) -> None:
             options.seed,
             options.train_rounds,
             stages.report,
-            checkpoint,
+            folder / CHECKPOINT,
             network,
             population,
         )
@@ -149,34 +152,34 @@ def main(options: Options) -> None:
             stages.report,
             options.explore,
         )
-    if found is not None:
-        scenarios = get_domain(demonstrations.domain).scenarios
-        for number, person in enumerate(result.summary["people"]):
-            person["identifiability"] = found.of(number, scenarios)
-        add_identifiability(result.data, found, result.data["posterior"].attrs)
-    if options.prior_from is not None:
-        result.summary["prior_from"] = str(options.prior_from)
-    summary = result.summary | {"seconds": round(monotonic() - began, 1)}
-    text = json.dumps(summary, indent=1) + "\n"
-    # Without it, results of a run that was killed here cannot be taken for those of an older one.
-    for name in ("summary.json", "open.png", *FILES):
-        (folder / name).unlink(missing_ok=True)
-    save_inference_data(result.data, folder / "posterior.nc")
-    pictures = sight_pictures(result.data)
-    for name, (picture, _) in pictures.items():
-        picture.save(folder / name)
-    drawn = found is not None and not found.nothing
-    if drawn:
-        plot_identifiability(result.data).save(folder / "open.png")
-    write_whole(folder / "summary.json", lambda temporary: temporary.write_text(text))
-    for file in folder.glob("fit.checkpoint*"):
-        file.unlink()
+        if found is not None:
+            scenarios = get_domain(demonstrations.domain).scenarios
+            for number, person in enumerate(result.summary["people"]):
+                person["identifiability"] = found.of(number, scenarios)
+            add_identifiability(result.data, found, result.data["posterior"].attrs)
+        if options.prior_from is not None:
+            result.summary["prior_from"] = str(options.prior_from)
+        pictures = sight_pictures(result.data)
+        drawn = {name: picture for name, (picture, _) in pictures.items()}
+        if found is not None and not found.nothing:
+            drawn["open.png"] = plot_identifiability(result.data)
+        summary = result.summary | {"seconds": round(monotonic() - began, 1)}
+        contents = {
+            folder / "posterior.nc": netcdf_content(result.data),
+            **{folder / name: picture.content() for name, picture in drawn.items()},
+            folder / "summary.json": json_text(summary),
+        }
+        # Those of an older fit go first: it may have drawn what this one does not, and results of
+        # a fit that is killed here cannot be taken for whole without their summary.
+        write_together(contents, remove=[folder / name for name in results])
+        for file in folder.glob(f"{CHECKPOINT}*"):
+            file.unlink()
     show_fit(summary, get_domain(demonstrations.domain).reach_unit)
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
     for name, (_, shows) in pictures.items():
         print(f"{folder / name}: {shows}")
-    if drawn:
+    if "open.png" in drawn:
         print(f"{folder / 'open.png'}: what is open about what they see, and what would tell")
 
 
@@ -194,10 +197,11 @@ def _recordings(options: Options):
         if options.population is not None:
             raise OptionError("--population is of the shipped recordings; leave it or --demos out")
         return recorded
-    domain = options.domain or DOMAIN
+    domain = DOMAIN if options.domain is None else options.domain
     settings = get_domain(domain).settings
-    setting = require_known(options.setting or settings[-1], "setting", settings, domain)
-    population = options.population or POPULATION
+    setting = settings[-1] if options.setting is None else options.setting
+    require_known(setting, "setting", settings, domain)
+    population = POPULATION if options.population is None else options.population
     require_known(population, "population", PEOPLE[domain].populations, domain)
     name = f"{domain}_{setting}_{population}.nc"
     return load_demonstrations(asset_path(name))

@@ -3,10 +3,14 @@
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from mirror_ppl.console import Progress, run, usable_device
+from mirror_ppl.console import run, usable_device
 from mirror_ppl.errors import OptionError
+from mirror_ppl.limits import check_numbers, require_memory
+from mirror_ppl.progress import Progress
 
 PROGRAM = "python -m mirror_ppl.simulate"
+COPIES = 4
+"""Of recordings in memory: while they are made, checked and packed into a file."""
 DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
 for python -m mirror_ppl.fit. How the people are made is told in docs/people.md."""
 
@@ -41,9 +45,7 @@ class Options:
     """Where to compute: cpu, cuda or cuda:0."""
 
     def __post_init__(self) -> None:
-        for name in ("people", "rounds"):
-            if (number := getattr(self, name)) < 1:
-                raise OptionError(f"--{name} must be at least 1, not {number}")
+        check_numbers(self, "people", "rounds", "seed")
         if not 0 <= self.told <= 1:
             raise OptionError(f"--told must be from 0 to 1, not {self.told}")
 
@@ -57,13 +59,15 @@ def main(options: Options) -> None:
     """
     from mirror_ppl.data import save_demonstrations
     from mirror_ppl.domains import get_domain
-    from mirror_ppl.files import prepare_output_folder
+    from mirror_ppl.files import lock_of, output_folder
     from mirror_ppl.people import simulate
 
     domain = get_domain(options.domain)
-    setting = options.setting or domain.settings[-1]
-    prepare_output_folder(options.out.parent)
-    with Progress("simulate", domain.horizon) as progress:
+    setting = domain.settings[-1] if options.setting is None else options.setting
+    device = usable_device(options.device)
+    require_memory(_bytes(options), "rounds of so many people")
+    folder = output_folder(options.out.parent, [options.out.name], lock_of(options.out))
+    with folder, Progress("simulate", domain.horizon) as progress:
         demonstrations = simulate(
             options.domain,
             setting,
@@ -71,12 +75,12 @@ def main(options: Options) -> None:
             options.people,
             options.rounds,
             options.seed,
-            usable_device(options.device),
+            device,
             progress,
             options.told,
         )
-    provenance = {**demonstrations.provenance, "command": _command(options)}
-    path = save_demonstrations(options.out, replace(demonstrations, provenance=provenance))
+        provenance = {**demonstrations.provenance, "command": _command(options)}
+        path = save_demonstrations(options.out, replace(demonstrations, provenance=provenance))
 
     assert demonstrations.rewards is not None and demonstrations.action_entropy is not None
     reward = demonstrations.rewards.nansum(-1).mean().item()
@@ -87,12 +91,23 @@ def main(options: Options) -> None:
     print(f"  mean entropy of an action {entropy:.4f} nats")
 
 
+def _bytes(options: Options) -> int:
+    """About how much memory the recordings take, and copies that are made of them."""
+    from mirror_ppl.domains import get_domain
+
+    domain = get_domain(options.domain)
+    values = sum(len(m.items) * (len(m.features) + 1) for m in domain.modalities)
+    times = options.people * options.rounds * (domain.horizon + 1)
+    return COPIES * 4 * times * (values + len(domain.ego_features) + 3)
+
+
 def _command(options: Options) -> str:
     """The command that makes the same recordings again, wherever it is to write them."""
     from mirror_ppl.domains import get_domain
 
     values = {part.name: getattr(options, part.name) for part in fields(options)}
-    values["setting"] = options.setting or get_domain(options.domain).settings[-1]
+    if options.setting is None:
+        values["setting"] = get_domain(options.domain).settings[-1]
     unsaid = {"out"} if options.told else {"out", "told"}
     parts = [f"--{name} {value}" for name, value in values.items() if name not in unsaid]
     return " ".join([PROGRAM, *parts])

@@ -1,12 +1,13 @@
 """`python -m mirror_ppl.train`: train a self-model or a guide."""
 
 from dataclasses import asdict, dataclass, fields
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from mirror_ppl.console import Progress, Stages, run, usable_device
+from mirror_ppl.console import run, usable_device
 from mirror_ppl.errors import OptionError
+from mirror_ppl.limits import check_numbers
+from mirror_ppl.progress import Progress, Stages
 
 LEAST_PEOPLE = 10
 PROGRAM = "python -m mirror_ppl.train"
@@ -65,19 +66,15 @@ class Options:
     def __post_init__(self) -> None:
         if self.what not in (SELF_MODEL, GUIDE):
             raise OptionError(f"--what must be {SELF_MODEL} or {GUIDE}, not {self.what}")
-        if self.people < LEAST_PEOPLE:
-            raise OptionError(f"--people must be at least {LEAST_PEOPLE}, not {self.people}")
+        check_numbers(self, "phases", "steps", "seed", people=LEAST_PEOPLE)
         other, of_other = (SELF_MODEL, OF_SELF_MODEL) if self.what == GUIDE else (GUIDE, OF_GUIDE)
         defaults = {field.name: field.default for field in fields(self)}
         for name in of_other:
             if getattr(self, name) != defaults[name]:
                 raise OptionError(f"--{name.replace('_', '-')} is for --what {other}")
-        for name in ("phases", "steps"):
-            if (number := getattr(self, name)) is not None and number < 1:
-                raise OptionError(f"--{name} must be at least 1, not {number}")
         rate = self.learning_rate
-        if rate is not None and not (rate > 0 and isfinite(rate)):
-            raise OptionError(f"--learning-rate must be a positive number, not {rate}")
+        if rate is not None and not 0 < rate <= 1:
+            raise OptionError(f"--learning-rate must be above 0 and at most 1, not {rate}")
 
 
 def main(options: Options) -> None:
@@ -91,7 +88,7 @@ def main(options: Options) -> None:
         CheckpointError: a checkpoint of a run with other options is in the way.
     """
     from mirror_ppl.domains import get_domain
-    from mirror_ppl.files import prepare_output_folder, require_files_of_their_own
+    from mirror_ppl.files import lock_of, output_folder, require_files_of_their_own
 
     if options.card is not None:
         _show(_card(options.card))
@@ -101,10 +98,10 @@ def main(options: Options) -> None:
     out = options.out or Path("runs") / f"{options.domain}_{name}.safetensors"
     inputs = {"--self-model": [options.self_model]}
     require_files_of_their_own({"--out": out}, inputs)
-    prepare_output_folder(out.parent)
     checkpoint = out.with_suffix(".checkpoint")
-    card = (_guide if options.what == GUIDE else _self_model)(options, out, checkpoint)
-    checkpoint.unlink(missing_ok=True)
+    with output_folder(out.parent, [out.name, checkpoint.name], lock_of(out)):
+        card = (_guide if options.what == GUIDE else _self_model)(options, out, checkpoint)
+        checkpoint.unlink(missing_ok=True)
     _show(card)
     print(f"weights and card: {out}")
 

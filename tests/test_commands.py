@@ -1,7 +1,6 @@
 """What the commands share: start and end, progress, files, errors; and `python -m mirror_ppl`."""
 
 import io
-import os
 import pickle
 import re
 import signal
@@ -10,16 +9,15 @@ import sys
 import textwrap
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 import torch
 
 import mirror_ppl
-from mirror_ppl import console, errors
+from mirror_ppl import errors
 from mirror_ppl.__main__ import COMMANDS
-from mirror_ppl.console import Progress, run
-from mirror_ppl.errors import MirrorError, OutputError, UnknownNameError
-from mirror_ppl.files import prepare_output_folder, write_whole
+from mirror_ppl.console import run
+from mirror_ppl.errors import MirrorError, UnknownNameError
+from mirror_ppl.progress import Progress
 
 
 def python(*args, **kwargs):
@@ -222,7 +220,7 @@ def test_run_is_quiet_when_the_reader_goes_away(lines):
 def clock(monkeypatch):
     """Time that passes only when it is told to: `clock[0] += 1`."""
     now = [1000.0]
-    monkeypatch.setattr(console, "monotonic", lambda: now[0])
+    monkeypatch.setattr("mirror_ppl.progress.monotonic", lambda: now[0])
     return now
 
 
@@ -330,130 +328,3 @@ def test_progress_on_a_terminal_that_cannot_redraw_is_plain(monkeypatch):
     with Progress("fit", 3, stream=stream) as progress:
         progress.update(3)
     assert stream.getvalue() == "fit: 3/3, 0 s\n"
-
-
-# --- files ------------------------------------------------------------------------------------
-
-
-def content(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
-
-
-def test_write_whole_writes_and_replaces(tmp_path):
-    path = tmp_path / "new" / "deep" / "a.txt"
-    assert write_whole(path, lambda to: to.write_text("one")) == path
-    assert path.read_text() == "one"
-    write_whole(str(path), lambda to: to.write_text("two"))
-    assert path.read_text() == "two"
-    assert content(path.parent) == ["a.txt"]
-
-
-def test_write_whole_gives_the_permissions_of_any_new_file(tmp_path):
-    (tmp_path / "plain").touch()
-    write_whole(tmp_path / "whole", lambda to: to.write_text("x"))
-    assert (tmp_path / "whole").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-def test_write_whole_suits_writers_that_go_by_the_suffix(tmp_path):
-    write_whole(tmp_path / "a.npz", lambda to: np.savez(to, x=np.arange(3)))
-    assert content(tmp_path) == ["a.npz"]
-    with np.load(tmp_path / "a.npz") as arrays:
-        assert arrays["x"].tolist() == [0, 1, 2]
-
-
-def test_write_whole_takes_the_longest_names(tmp_path):
-    name = "n" * 251 + ".txt"
-    write_whole(tmp_path / name, lambda to: to.write_text("x"))
-    assert content(tmp_path) == [name]
-
-
-def test_write_whole_shows_readers_the_old_content_until_the_end(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-
-    def writer(to):
-        to.write_text("new, first half")
-        assert path.read_text() == "old"
-        to.write_text("new")
-
-    write_whole(path, writer)
-    assert path.read_text() == "new"
-
-
-@pytest.mark.parametrize("failure", [ZeroDivisionError, KeyboardInterrupt, OSError])
-def test_write_whole_leaves_nothing_of_a_failure(tmp_path, failure):
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-
-    def writer(to):
-        to.write_text("half")
-        raise failure("no space")
-
-    raised = OutputError if failure is OSError else failure
-    with pytest.raises(raised, match="no space"):
-        write_whole(path, writer)
-    with pytest.raises(raised, match="no space"):
-        write_whole(tmp_path / "new" / "deep" / "a.txt", writer)
-    assert content(tmp_path) == ["a.txt"]
-    assert path.read_text() == "old"
-
-
-def test_write_whole_killed_half_way_keeps_the_old_content(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-    code = """
-        import os, sys
-        from mirror_ppl.files import write_whole
-
-        def writer(to):
-            to.write_text("half")
-            os._exit(9)
-
-        write_whole(sys.argv[1], writer)
-        """
-    assert python("-c", textwrap.dedent(code), str(path)).returncode == 9
-    assert path.read_text() == "old"
-
-
-def test_write_whole_follows_a_link(tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "a.txt").symlink_to("elsewhere/b.txt")
-    write_whole(tmp_path / "a.txt", lambda to: to.write_text("x"))
-    assert (tmp_path / "a.txt").is_symlink()
-    assert (tmp_path / "elsewhere" / "b.txt").read_text() == "x"
-
-
-def test_write_whole_refuses_what_is_no_regular_file(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, tmp_path / "pipe"):
-        with pytest.raises(OutputError, match="not a regular file"):
-            write_whole(path, pytest.fail)
-    assert content(tmp_path) == ["pipe"]
-
-
-@pytest.mark.parametrize("call", [prepare_output_folder, lambda to: write_whole(to, pytest.fail)])
-def test_a_file_in_the_way_is_an_output_error(tmp_path, call):
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(OutputError, match=r"cannot create the folder .*file"):
-        call(tmp_path / "file" / "sub" / "deep")
-    assert content(tmp_path) == ["file"]
-
-
-def test_prepare_output_folder_creates_it_and_leaves_it_empty(tmp_path):
-    folder = tmp_path / "runs" / "demo"
-    assert prepare_output_folder(str(folder)) == folder
-    assert prepare_output_folder(folder) == folder
-    assert content(tmp_path) == ["runs", "runs/demo"]
-
-
-def test_prepare_output_folder_that_cannot_be_written(tmp_path, monkeypatch):
-    # Root may write anywhere, so the refusal is staged.
-    def refuse(self, **kwargs):
-        raise PermissionError(13, "Permission denied", str(self))
-
-    monkeypatch.setattr("pathlib.Path.touch", refuse)
-    with pytest.raises(OutputError, match=r"cannot write in the folder .*Permission denied"):
-        prepare_output_folder(tmp_path / "runs" / "demo")
-    with pytest.raises(OutputError, match=r"cannot write .*Permission denied"):
-        write_whole(tmp_path / "runs" / "a.txt", pytest.fail)
-    assert content(tmp_path) == []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mirror_ppl.evaluation.tables import TextTable, write_page, write_rows
+from mirror_ppl.evaluation.tables import TextTable, comma_separated, page
 
 TABLE = TextTable(
     "driving: NLL",
@@ -21,19 +21,16 @@ Mean over people; 90% interval.
 """
 
 
-def test_a_page_says_what_a_terminal_says(tmp_path, capsys):
+def test_a_page_says_what_a_terminal_says(capsys):
     assert TABLE.markdown == PAGE
     TABLE.show()
     shown = capsys.readouterr().out
     for text in (TABLE.title, TABLE.caption, *TABLE.heads, "+0.4", "[red]"):
         assert text in shown
-    write_page(tmp_path / "page.md", ["mirror is ahead", "bc is not"], [TABLE, TABLE])
-    page = (tmp_path / "page.md").read_text()
-    assert page == f"- mirror is ahead\n- bc is not\n\n{PAGE}\n{PAGE}"
-    write_page(tmp_path / "page.md", [], [TABLE])
-    assert (tmp_path / "page.md").read_text() == PAGE
+    expected = f"- mirror is ahead\n- bc is not\n\n{PAGE}\n{PAGE}"
+    assert page(["mirror is ahead", "bc is not"], [TABLE, TABLE]) == expected
+    assert page([], [TABLE]) == PAGE
 
 
-def test_rows_may_lack_columns(tmp_path):
-    write_rows(tmp_path / "rows.csv", [{"one": 1}, {"one": 2, "two": 3}])
-    assert (tmp_path / "rows.csv").read_text().split() == ["one,two", "1,", "2,3"]
+def test_rows_may_lack_columns():
+    assert comma_separated([{"one": 1}, {"one": 2, "two": 3}]).split() == ["one,two", "1,", "2,3"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Mapping
@@ -19,16 +18,13 @@ from mirror_ppl.data.schema import TOLD, TRUTH
 from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
 from mirror_ppl.files import write_whole
+from mirror_ppl.netcdf import read_netcdf
 
 if TYPE_CHECKING:
     import xarray as xr
 
 FORMAT = "mirror_ppl demonstrations"
 FORMAT_VERSION = "1"
-
-# The first bytes of a file, and the xarray engine that reads it: netCDF-4 is HDF5, netCDF-3 is what
-# xarray writes where it finds nothing but scipy.
-ENGINES = {b"\x89HDF\r\n\x1a\n": "h5netcdf", b"CDF": "scipy"}
 
 _LONG_NAMES = {
     "round_count": ("number of rounds; those from it on are padding", "rounds"),
@@ -56,11 +52,7 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrat
     dataset = to_dataset(demonstrations)
     packed = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
     encoding = {str(name): packed for name in dataset.data_vars}
-
-    def write(temporary: Path) -> None:
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
-
-    return write_whole(path, write)
+    return write_whole(path, dataset.to_netcdf(engine="h5netcdf", encoding=encoding))
 
 
 def load_demonstrations(
@@ -82,7 +74,7 @@ def load_demonstrations(
         require_known(setting, "setting", get_domain(domain).settings, domain)
     elif domain is not None:
         get_domain(domain)
-    dataset = _read(Path(path))
+    dataset = read_netcdf(path, DemonstrationsError)["/"]
     try:
         return from_dataset(dataset, domain, setting)
     except (DemonstrationsError, UnknownNameError) as error:
@@ -172,32 +164,6 @@ def from_dataset(
     )
 
 
-def _read(path: Path) -> xr.Dataset:
-    import h5py
-    import xarray as xr
-
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DemonstrationsError(f"{path}: cannot be read ({error.strerror})") from error
-    engine = next((name for magic, name in ENGINES.items() if content.startswith(magic)), None)
-    if engine is None:
-        raise DemonstrationsError(f"{path}: is not a netCDF file")
-    try:
-        if engine == "h5netcdf":
-            # h5netcdf would write to stderr if it failed to read these.
-            with h5py.File(io.BytesIO(content)) as file:
-                list(file.attrs.items())
-        # From memory, because the libraries leave a damaged file open. Without decode_times=False,
-        # units such as "seconds" would turn numbers into dates.
-        with xr.open_dataset(io.BytesIO(content), engine=engine, decode_times=False) as dataset:
-            return dataset.load()
-    # Nearly any exception can come of a damaged file, depending on where the damage is.
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise DemonstrationsError(f"{path}: is truncated or damaged ({reason})") from error
-
-
 def _agreed(dataset: xr.Dataset, name: str, wanted: str | None) -> str:
     given = dataset.attrs.get(name)
     if given is None and wanted is None:
@@ -221,8 +187,11 @@ def _in_order(dataset: xr.Dataset, labels: Mapping[str, tuple[str, ...]]) -> xr.
 
 
 def _texts(array: xr.DataArray) -> list[str]:
-    entries = np.atleast_1d(array.values).tolist()
-    return [entry.decode() if isinstance(entry, bytes) else str(entry) for entry in entries]
+    entries = np.atleast_1d(array.values).ravel().tolist()
+    try:
+        return [entry.decode() if isinstance(entry, bytes) else str(entry) for entry in entries]
+    except UnicodeDecodeError as error:
+        raise DemonstrationsError(f"{array.name} has names that are not UTF-8") from error
 
 
 def _tensor(array: xr.DataArray, dimensions: tuple[str, ...]) -> Tensor:

@@ -248,6 +248,13 @@ class Domain(Protocol):
         """The state ``[...]`` that gives this observation of everything."""
         ...
 
+    def next_observation(self, observation: Observation, action: Tensor) -> Observation:
+        """What there is to observe after an action ``[...]``; NaN where it may be one or another.
+
+        Recordings are held against it, see :mod:`mirror_ppl.data.contradictions`.
+        """
+        ...
+
     def nearest(self, observation: Observation) -> Observation:
         """The possible observation ``[...]`` nearest to one that decoders came up with."""
         ...

@@ -350,6 +350,15 @@ class BombDefusal:
             symbols=symbols[..., None, :].expand(*live.shape, STAGES, TERMINALS),
         )
 
+    def next_observation(self, observation: Observation, action: Tensor) -> Observation:
+        """What there is to observe after an action ``[...]``; NaN for terminals of a new stage."""
+        state = self.state_behind(observation)
+        following = self.transition(state, action)
+        expected = self.observe(following)
+        new = (following.stage != state.stage) & ~self.over(following)
+        visual = expected["visual"].masked_fill(new[..., None, None], torch.nan)
+        return expected | {"visual": visual}
+
     def nearest(self, observation: Observation) -> Observation:
         """The observation that can be and is nearest to decoded values."""
         stage, since = observation["ego"].round().unbind(-1)

@@ -352,6 +352,10 @@ class Driving:
             speed=torch.where(away, 0, speed),
         )
 
+    def next_observation(self, observation: Observation, action: Tensor) -> Observation:
+        """What there is to observe after an action ``[...]``; all of it is determined."""
+        return self.observe(self.transition(self.state_behind(observation), action))
+
     def nearest(self, observation: Observation) -> Observation:
         """The observation that can be and is nearest to decoded values.
 

@@ -403,6 +403,10 @@ class SearchRescue:
             victim=(holds[..., len(sides) :] * rooms).sum(-1),
         )
 
+    def next_observation(self, observation: Observation, action: Tensor) -> Observation:
+        """What there is to observe after an action ``[...]``; all of it is determined."""
+        return self.observe(self.transition(self.state_behind(observation), action))
+
     def nearest(self, observation: Observation) -> Observation:
         """The observation that can be and is nearest to decoded values.
 

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, cast
-
-import torch
+from typing import Any
 
 from mirror_ppl import __version__
 from mirror_ppl.communication.minds import Person
@@ -36,6 +33,7 @@ from mirror_ppl.inference.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import check_contract, file_of, load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.workers import run_tasks
 
 
 @dataclass(frozen=True)
@@ -158,8 +156,6 @@ def run_cells(
     Returns:
         Of each communicator, what each person played.
     """
-    from joblib import Parallel, delayed
-
     # Slowest first, so that no process is left waiting for another at the end.
     first = [name for name in communicators if name != "random"]
     first.sort(key=lambda name: not name.startswith(("mirror", "oracle")))
@@ -173,17 +169,14 @@ def run_cells(
             number: results[RATES_FROM, number].rates() if "random" in names else None
             for number in range(people)
         }
-        finished = Parallel(n_jobs=jobs, return_as="generator_unordered")(
-            delayed(_cell)(pairing, name, number, rates[number], parts, identity)
+        tasks = [
+            partial(_cell, pairing, name, number, rates[number], parts, identity)
             for name in names
             for number in range(people)
-        )
-        with warnings.catch_warnings():
-            # Processes that have used much memory are replaced by new ones; nothing is lost.
-            warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
-            for name, number, played in cast(Iterator[tuple[str, int, Played]], finished):
-                results[name, number] = played
-                report(len(results), f"{name}, person {number + 1}")
+        ]
+        for name, number, played in run_tasks(tasks, jobs):
+            results[name, number] = played
+            report(len(results), f"{name}, person {number + 1}")
 
     work(first)
     if "random" in communicators:
@@ -199,15 +192,12 @@ def _cell(
     parts: Path | None,
     identity: str,
 ) -> tuple[str, int, Played]:
-    # One thread a process: the cores are shared by processes.
-    torch.set_num_threads(1)
     path = None if parts is None else parts / f"{name}-{number}.json"
     played = None if path is None else _kept(path, identity)
     if played is None:
         played = pairing.play(number, name, rates)
         if path is not None:
-            text = json.dumps({"identity": identity, "played": asdict(played)})
-            write_whole(path, lambda temporary: temporary.write_text(text))
+            write_whole(path, json.dumps({"identity": identity, "played": asdict(played)}))
     return name, number, played
 
 

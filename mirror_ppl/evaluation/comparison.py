@@ -33,10 +33,16 @@ import xarray as xr
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.export import az
+from mirror_ppl.inference.posterior_file import read_results
 from mirror_ppl.models.loading import model_name
 
 FILE = "posterior.nc"
 """What a fit calls its posterior."""
+GROUPS = {
+    "loo": ("log_likelihood", "observed_data", "constant_data"),
+    "heldout": ("predictions", "observed_data", "constant_data", "predictions_constant_data"),
+}
+"""Groups of a posterior file that each measure reads; the first is there if it can be taken."""
 LACKS = {
     "loo": "has no log-likelihoods of the rounds that were learned from (group log_likelihood)",
     "heldout": "has no held-out rounds; leave some out of the fit (--train-rounds)",
@@ -178,13 +184,10 @@ def read_fit(path: Path, by: str = "loo") -> FitFile:
         PosteriorError: the file is missing or damaged, or lacks what is measured.
     """
     path = posterior_path(path)
-    if not path.is_file():
-        raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
+    data = read_results(path, "posterior", *GROUPS[by])
     try:
-        data = az.from_netcdf(str(path))
         attributes = {str(key): str(value) for key, value in data["posterior"].attrs.items()}
-        group = "log_likelihood" if by == "loo" else "predictions"
-        file = _content(path, attributes, data, by) if group in data.groups() else None
+        file = _content(path, attributes, data, by) if GROUPS[by][0] in data else None
     except Exception as error:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     if file is None or not (file.actions >= 0).any():
@@ -194,7 +197,9 @@ def read_fit(path: Path, by: str = "loo") -> FitFile:
     return file
 
 
-def _content(path: Path, attributes: Mapping[str, str], data: az.InferenceData, by: str) -> FitFile:
+def _content(
+    path: Path, attributes: Mapping[str, str], data: Mapping[str, xr.Dataset], by: str
+) -> FitFile:
     learned = data["observed_data"]["action"].transpose("person", "round", "step")
     recorded = {"observed_data action": learned.values} | _constants(data, "constant_data")
     if by == "loo":
@@ -220,9 +225,9 @@ def _joined(values: xr.DataArray) -> np.ndarray:
     return values.values.reshape(-1, *values.shape[2:]).astype(float)
 
 
-def _constants(data: az.InferenceData, group: str) -> dict[str, np.ndarray]:
+def _constants(data: Mapping[str, xr.Dataset], group: str) -> dict[str, np.ndarray]:
     """What there was to see, was told and was done; not what is known of simulated people."""
-    if group not in data.groups():
+    if group not in data:
         return {}
     return {
         f"{group} {name}": value.values

@@ -10,19 +10,18 @@ from __future__ import annotations
 import hashlib
 import json
 import traceback
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Protocol, cast
 
-import torch
-
 from mirror_ppl.errors import OptionError
 from mirror_ppl.files import write_whole
+from mirror_ppl.workers import run_tasks
 
 Rows = list[dict[str, Any]]
 """A table of plain values."""
@@ -90,8 +89,6 @@ def run_cells(
     Raises:
         OptionError: the cluster's library is not installed, or it cannot be reached.
     """
-    from joblib import Parallel, delayed
-
     outcomes: dict[int, Outcome] = {}
     names = [_name(cell, identity(cell)) for cell in cells]
     for place, (cell, name) in enumerate(zip(cells, names, strict=True)):
@@ -103,9 +100,6 @@ def run_cells(
     with ExitStack() as stack:
         if scheduler is not None:
             stack.enter_context(_cluster(scheduler))
-        # Processes that have used much memory are replaced by new ones; nothing is lost.
-        stack.enter_context(warnings.catch_warnings())
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
 
         def done(place: int, outcome: Outcome) -> None:
             outcomes[place] = outcome
@@ -114,9 +108,7 @@ def run_cells(
             report(len(outcomes), outcome.cell.label + (" failed" if outcome.error else ""))
 
         def results(places: Sequence[int]) -> Iterator[tuple[int, Outcome]]:
-            parallel = Parallel(n_jobs=jobs, return_as="generator_unordered")
-            tasks = (delayed(_cell)(place, cells[place], work) for place in places)
-            return cast(Iterator[tuple[int, Outcome]], parallel(tasks))
+            return run_tasks([partial(_cell, place, cells[place], work) for place in places], jobs)
 
         try:
             for place, outcome in results(todo):
@@ -142,8 +134,6 @@ def _killed(error: Exception) -> bool:
 
 
 def _cell(place: int, cell: Cell, work: Callable[[Any], Rows]) -> tuple[int, Outcome]:
-    # One thread a process: the cores are shared by processes.
-    torch.set_num_threads(1)
     began = perf_counter()
     try:
         rows = work(cell)
@@ -193,8 +183,7 @@ def _keep(path: Path, outcome: Outcome) -> None:
         "seconds": outcome.seconds,
         "rows": outcome.rows,
     }
-    text = json.dumps(content, indent=1) + "\n"
-    write_whole(path, lambda temporary: temporary.write_text(text))
+    write_whole(path, json.dumps(content, indent=1) + "\n")
 
 
 def _kept(path: Path, cell: Cell) -> Outcome | None:

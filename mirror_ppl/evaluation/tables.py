@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -61,16 +61,17 @@ class TextTable:
         return f"**{self.title}**\n\n{table}\n\n{self.caption[:1].upper()}{self.caption[1:]}.\n"
 
 
-def write_rows(path: Path, rows: Rows) -> None:
-    """As comma-separated values; columns that a row lacks stay empty."""
+def comma_separated(rows: Rows) -> str:
+    """Rows as comma-separated values; columns that a row lacks stay empty."""
     columns = dict.fromkeys(name for row in rows for name in row)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(columns))
-        writer.writeheader()
-        writer.writerows(rows)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(columns))
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
-def write_page(path: Path, sentences: Sequence[str], tables: Sequence[TextTable]) -> None:
-    """As Markdown."""
+def page(sentences: Sequence[str], tables: Sequence[TextTable]) -> str:
+    """Sentences and tables as Markdown."""
     parts = ["\n".join(f"- {one}" for one in sentences) + "\n"] if sentences else []
-    path.write_text("\n".join([*parts, *(table.markdown for table in tables)]))
+    return "\n".join([*parts, *(table.markdown for table in tables)])

@@ -17,11 +17,11 @@ is tested, in two ways (:mod:`mirror_ppl.inference.uniformity`).
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,6 +39,7 @@ from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.workers import run_tasks
 
 PRIOR_PEOPLE = 4000
 """Drawn to know the prior's widths and entropies to a few percent."""
@@ -208,25 +209,19 @@ def _each_batch(
             yield begin, _batch(trial, infer, begin, parts)
         return
     import cloudpickle
-    from joblib import Parallel, delayed
 
     for kind in type(trial.human).__mro__:
         if kind.__module__.split(".")[0] not in ("mirror_ppl", "torch", "builtins"):
             # The model of somebody's file, which other processes cannot import by its name.
             cloudpickle.register_pickle_by_value(sys.modules[kind.__module__])
 
-    def numbered(begin: int) -> tuple[int, dict[int, xr.Dataset]]:
-        # One thread a process: the cores are shared by processes.
-        torch.set_num_threads(1)
-        return begin, _batch(trial, infer, begin, parts)
+    yield from run_tasks([partial(_numbered, trial, infer, begin, parts) for begin in begins], jobs)
 
-    with warnings.catch_warnings():
-        # Processes that have used much memory are replaced by new ones; nothing is lost.
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
-        finished = Parallel(n_jobs=jobs, return_as="generator_unordered")(
-            delayed(numbered)(begin) for begin in begins
-        )
-        yield from cast(Iterator[tuple[int, dict[int, xr.Dataset]]], finished)
+
+def _numbered(
+    trial: _Trial, infer: Infer, begin: int, parts: tuple[Path, str] | None
+) -> tuple[int, dict[int, xr.Dataset]]:
+    return begin, _batch(trial, infer, begin, parts)
 
 
 def _batch(
@@ -243,8 +238,7 @@ def _batch(
         return judged
     judged = trial.batch(infer, begin)
     for number, path in paths.items():
-        data = judged[number].assign_attrs(run=run)
-        write_whole(path, lambda file, data=data: data.to_netcdf(file, engine="h5netcdf"))
+        write_whole(path, judged[number].assign_attrs(run=run).to_netcdf(engine="h5netcdf"))
     return judged
 
 

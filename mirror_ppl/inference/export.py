@@ -162,12 +162,29 @@ def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) ->
 
 
 def save_inference_data(data: az.InferenceData, path: Path) -> None:
-    """Write netCDF, whole or not at all.
+    """Write netCDF, compressed, with checksums, whole or not at all.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    write_whole(path, lambda temporary: data.to_netcdf(str(temporary), engine="h5netcdf"))
+    write_whole(path, netcdf_content(data))
+
+
+def netcdf_content(inference_data: az.InferenceData) -> memoryview:
+    """What a netCDF file of it holds; numbers are compressed and have checksums."""
+    data = inference_data.to_datatree()
+    packing = {"zlib": True, "complevel": 1, "shuffle": True, "fletcher32": True}
+    encoding = {
+        group.path: {
+            name: packing
+            for name, variable in group.variables.items()
+            if variable.dtype.kind in "biuf" and variable.ndim
+        }
+        for group in data.subtree
+    }
+    content = data.to_netcdf(engine="h5netcdf", encoding=encoding)
+    assert isinstance(content, memoryview)  # as no path was given
+    return content
 
 
 def _constants(rounds: Demonstrations) -> dict[str, Any]:

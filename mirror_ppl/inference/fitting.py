@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.amortized import AmortizedGuide
@@ -88,25 +89,6 @@ def split_rounds(
     return train, demonstrations.select_rounds(test) if test else None
 
 
-def check_world(demonstrations: Demonstrations) -> None:
-    """Make sure that what was recorded can be in the domain's world.
-
-    Raises:
-        DemonstrationsError: it cannot; says where and why.
-    """
-    domain = get_domain(demonstrations.domain)
-    times = torch.arange(demonstrations.ego.shape[2], device=demonstrations.ego.device)
-    lengths = demonstrations.lengths[..., None]
-    real = (times <= lengths) & (lengths > 0)
-    for rule, broken in domain.faults(demonstrations.observation()).items():
-        where = (broken & real).nonzero()
-        if len(where):
-            person, number, time = where[0].tolist()
-            raise DemonstrationsError(
-                f"person {demonstrations.people[person]}, round {number}, time {time}: {rule}"
-            )
-
-
 def predict_rounds(
     human: HumanModel, rounds: Demonstrations, draws: Mapping[str, Tensor]
 ) -> Tensor:
@@ -143,7 +125,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
 
     Args:
         human: the model of people.
-        demonstrations: rounds of P people; see :func:`check_world`.
+        demonstrations: rounds of P people.
         options: how to infer.
         seed: seed of everything random.
         train_rounds: see :func:`split_rounds`.
@@ -153,10 +135,12 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         population: that the people are from, if it is known from others.
 
     Raises:
-        DemonstrationsError: too few rounds.
+        DemonstrationsError: there are too few rounds, or they cannot be of the domain's world (see
+            :func:`mirror_ppl.data.contradictions.check_world`).
         HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
         CheckpointError: the checkpoint is damaged or of another run.
     """
+    contradictions = check_world(demonstrations, options.allow_contradictions)
     train, test = split_rounds(demonstrations, train_rounds)
     people = train.num_people
     human.learn_world(train)
@@ -213,7 +197,12 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     if posterior.effective is not None:
         for person, value in zip(found, posterior.effective.tolist(), strict=True):
             person["effective_draws"] = round(value, 1)
-    summary = attributes | {"options": asdict(options), "people": found} | newcomer
+    summary = attributes | {
+        "options": asdict(options),
+        "contradictions": contradictions.as_data(),
+        "people": found,
+    }
+    summary |= newcomer
     return Fit(learned, posterior, data, summary)
 
 

@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import AssetError
-from mirror_ppl.files import write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, reference_places
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.variants import VARIANTS
-from mirror_ppl.models.weights import fingerprint, read_tensors
+from mirror_ppl.models.weights import fingerprint, read_tensors, save_tensors
 
 FORMAT = "mirror_ppl guide 1"
 FIRST = next(iter(VARIANTS))
@@ -53,8 +51,7 @@ def save_guide(
         "self_model": fingerprint(human.self_model),
         "card": json.dumps(card, indent=1),
     }
-    tensors = {name: value.contiguous() for name, value in guide.state_dict().items()}
-    write_whole(path, lambda temporary: save_file(tensors, temporary, metadata))
+    save_tensors(path, guide.state_dict(), metadata)
 
 
 def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str, Any]]:

@@ -19,8 +19,8 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
     guide_screening,
@@ -143,8 +143,7 @@ def simulate_examples(
         parts.append(Examples(place, torch.stack(evidence), torch.stack(steps)))
         done += number
         if checkpoint is not None:
-            content = {"run": run, "parts": [vars(part) for part in parts]}
-            write_whole(checkpoint, lambda path, what=content: torch.save(what, path))
+            save_checkpoint(checkpoint, run, {"parts": [vars(part) for part in parts]})
     report("simulate", done, options.people, "people")
     return Examples(*(torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])))
 

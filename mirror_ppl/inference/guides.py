@@ -24,9 +24,9 @@ import torch
 from torch import Tensor
 
 from mirror_ppl import __version__
+from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import UnknownNameError
-from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.nuts import sample_nuts
@@ -82,6 +82,8 @@ class InferenceOptions:
         pooling: ``none``, or ``partial`` to infer with the people the population that they are
             from (:mod:`mirror_ppl.inference.pooling`).
         refine: gradient steps of ``svi`` that start at what ``amortized`` or ``exact`` found.
+        allow_contradictions: share of recorded steps, from 0 to 1, that may contradict the next
+            observation.
     """
 
     guide: str = "exact"
@@ -91,6 +93,7 @@ class InferenceOptions:
     screening: Screening | None = Screening()
     pooling: str = "none"
     refine: int = 0
+    allow_contradictions: float = 0.0
 
     def __post_init__(self) -> None:
         if self.guide not in GUIDES:
@@ -99,6 +102,10 @@ class InferenceOptions:
             raise UnknownNameError.of("pooling", self.pooling, POOLINGS)
         if self.draws < 1:
             raise ValueError(f"draws must be at least 1, not {self.draws}")
+        if not 0 <= self.allow_contradictions <= 1:
+            raise ValueError(
+                f"allow_contradictions must be from 0 to 1, not {self.allow_contradictions}"
+            )
         if self.refine < 0:
             raise ValueError(f"refine must be at least 0, not {self.refine}")
         if self.refine and self.guide not in ("amortized", "exact"):
@@ -287,7 +294,7 @@ class _People:
         return len(self.draws)
 
     def save(self, path: Path, run: str) -> None:
-        write_whole(path, lambda temporary: torch.save({"run": run, **vars(self)}, temporary))
+        save_checkpoint(path, run, vars(self))
 
     @classmethod
     def restored(cls, path: Path, run: str) -> _People:

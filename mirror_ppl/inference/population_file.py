@@ -18,7 +18,7 @@ import xarray as xr
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.export import az, in_units, is_reach
 from mirror_ppl.inference.pooling import Pooling, Population
-from mirror_ppl.inference.posterior_file import check_origin
+from mirror_ppl.inference.posterior_file import check_origin, read_results
 
 SAMPLE = ("chain", "draw")
 
@@ -82,15 +82,7 @@ def load_population(path: Path, pooling: Pooling, setting: str | None = None) ->
         PosteriorError: the file is missing or damaged, holds no population, or is of another human
             model, self-model, version of the domain or setting.
     """
-    if not path.is_file():
-        raise PosteriorError(f"{path}: there is no such file; fit --pooling partial makes one")
-    try:
-        data = az.from_netcdf(str(path))
-    except Exception as error:
-        raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
-    if "population" not in data.groups():
-        raise PosteriorError(f"{path}: holds no population; fit --pooling partial makes one")
-    group = data["population"]
+    group = read_results(path, "population")["population"]
     attributes = {str(key): str(value) for key, value in group.attrs.items()}
     check_origin(path, attributes, pooling.human)
     if setting is not None and attributes.get("setting") != setting:
@@ -105,7 +97,10 @@ def load_population(path: Path, pooling: Pooling, setting: str | None = None) ->
         for name in names:
             if f"{name}_{kind}" not in group:
                 raise PosteriorError(f'{path}: the population lacks "{name}_{kind}"')
-            value = group[f"{name}_{kind}"].transpose(*SAMPLE, ...).values
+            variable = group[f"{name}_{kind}"]
+            if variable.dims[:2] != SAMPLE or variable.dtype.kind not in "iuf":
+                raise PosteriorError(f'{path}: "{name}_{kind}" holds no draws of numbers')
+            value = variable.values
             if value.ndim != len(SAMPLE) + event or not np.isfinite(value).all() or not value.size:
                 raise PosteriorError(f'{path}: "{name}_{kind}" holds no numbers of a population')
             found[name] = torch.as_tensor(value.reshape(-1, *value.shape[2:])).to(like)

@@ -8,15 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import xarray as xr
 from torch import Tensor
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.export import az, is_reach
+from mirror_ppl.inference.export import is_reach
 from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.netcdf import read_netcdf
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,21 @@ class PosteriorFile:
         return draws
 
 
+def read_results(path: Path, *groups: str) -> dict[str, xr.Dataset]:
+    """Groups of a file that a fit wrote.
+
+    Raises:
+        PosteriorError: the file is missing or damaged, or lacks the first of the groups.
+    """
+    if not path.exists():
+        raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
+    data = read_netcdf(path, PosteriorError, groups)
+    if groups[0] not in data:
+        how = "--pooling partial makes one" if groups[0] == "population" else "makes one"
+        raise PosteriorError(f"{path}: holds no {groups[0]}; python -m mirror_ppl.fit {how}")
+    return data
+
+
 def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -> None:
     """Make sure that a file is of this human model.
 
@@ -115,19 +132,8 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
         PosteriorError: the file is missing or damaged, holds no draws, or is of another domain.
         UnknownNameError: it is of a domain that there is not.
     """
-    if not path.is_file():
-        raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
+    group = read_results(path, "posterior")["posterior"]
     try:
-        data = az.from_netcdf(str(path))
-    except Exception as error:
-        raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
-    if "posterior" not in data.groups():
-        raise PosteriorError(
-            f"{path}: cannot be read as a posterior (it holds none; "
-            "python -m mirror_ppl.fit makes one of recordings)"
-        )
-    try:
-        group = data["posterior"]
         attributes = {str(name): str(value) for name, value in group.attrs.items()}
         people = tuple(map(str, group["person"].values))
         stacked = {

@@ -153,8 +153,12 @@ class Calibration:
         Raises:
             OutputError: the file cannot be written.
         """
+        write_whole(path, self.content())
+
+    def content(self) -> memoryview:
+        """What a file of it holds."""
         data = self.data.assign_attrs(failure_rate=self.failure_rate)
-        write_whole(path, lambda temporary: data.to_netcdf(temporary, engine="h5netcdf"))
+        return data.to_netcdf(engine="h5netcdf")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:

@@ -23,8 +23,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
-from mirror_ppl.files import read_checkpoint, write_whole
 from mirror_ppl.inference.experience import Experience, drive, experience
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
@@ -301,7 +301,6 @@ class _Trainer:
             for start in self.starts
         ]
         content = {
-            "run": self.run_id,
             "phase": self.phase,
             "self_model": self.self_model.state_dict(),
             "target": self.target.state_dict(),
@@ -312,7 +311,7 @@ class _Trainer:
             "generator": self.generator.get_state(),
             "torch": torch.random.get_rng_state(),
         }
-        write_whole(path, lambda temporary: torch.save(content, temporary))
+        save_checkpoint(path, self.run_id, content)
 
     def _restore(self, path: Path) -> None:
         content = read_checkpoint(path, self.run_id)

@@ -22,7 +22,7 @@ from pyro.nn import PyroParam
 from torch import Tensor
 from torch.distributions import biject_to
 
-from mirror_ppl.files import read_checkpoint, write_whole
+from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.inference.combinations import discrete_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.inference.marginal_elbo import PLATES, marginal_elbo
@@ -241,7 +241,6 @@ def _save(
     path: Path, run: str, guide, optimizer, schedule, losses: list[float], alive: Tensor
 ) -> None:
     content = {
-        "run": run,
         "guide": guide.state_dict(),
         "optimizer": optimizer.state_dict(),
         "schedule": schedule.state_dict(),
@@ -249,7 +248,7 @@ def _save(
         "alive": alive,
         "torch": torch.random.get_rng_state(),
     }
-    write_whole(path, lambda temporary: torch.save(content, temporary))
+    save_checkpoint(path, run, content)
 
 
 def _restore(path: Path, run: str, guide, optimizer, schedule) -> tuple[list[float], Tensor]:

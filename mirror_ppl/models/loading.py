@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-import traceback
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -22,6 +21,7 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.models.span_contract import check_spans_hold
 from mirror_ppl.models.variants import VARIANTS
+from mirror_ppl.user_code import describe, remember_file
 
 MIRROR = "mirror"
 """The package's own model; which it is depends on the domain."""
@@ -82,10 +82,11 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
         raise HumanModelError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module
+    remember_file(path)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise HumanModelError(f"{path} does not import: {_where(error, path)}") from error
+        raise HumanModelError(f"{path} does not import: {describe(error, path)}") from error
     chosen = getattr(module, name, None)
     if not (isinstance(chosen, type) and issubclass(chosen, HumanModel)):
         classes = [
@@ -99,8 +100,8 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
         )
     try:
         return chosen(self_model)
-    except Exception as error:
-        raise HumanModelError(f"{name} cannot be made: {_where(error, path)}") from error
+    except (Exception, SystemExit) as error:
+        raise HumanModelError(f"{name} cannot be made: {describe(error, path)}") from error
 
 
 @torch.no_grad()
@@ -170,9 +171,9 @@ def check_contract(human: HumanModel) -> None:
         _check_sites(trace.trace, people)
     except MirrorError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
-        where = _where(error, None if file is None else Path(file))
+        where = describe(error, None if file is None else Path(file))
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
 
 
@@ -217,15 +218,3 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
                 f'"{name}" has batch shape {tuple(fn.batch_shape)}, expected ({people}, 1) for '
                 f"{people} people; use .to_event() for several numbers a person"
             )
-
-
-def _where(error: BaseException, path: Path | None = None) -> str:
-    """The exception in one line, with the last line of the user's own file that it passed."""
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [
-        frame
-        for frame in frames
-        if path is not None and Path(frame.filename).resolve() == path.resolve()
-    ]
-    line = (own or frames)[-1]
-    return f"{type(error).__name__}: {error} ({Path(line.filename).name}, line {line.lineno})"

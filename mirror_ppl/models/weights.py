@@ -10,18 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from mirror_ppl.data import asset_path
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, MirrorError
-from mirror_ppl.files import write_whole
+from mirror_ppl.files import read_whole, write_whole
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
 
 FORMAT = "mirror_ppl self-model 1"
+CHECKSUM = "checksum"
+"""Of everything else in a file, in its metadata."""
+HEADER = 8
+"""Bytes at the beginning of a safetensors file that say how long its header is."""
 
 
 def shipped_weights(domain: str) -> Path:
@@ -55,8 +58,17 @@ def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) 
         "sizes": json.dumps(asdict(self_model.sizes)),
         "card": json.dumps(card, indent=1),
     }
-    tensors = {name: value.contiguous() for name, value in self_model.state_dict().items()}
-    write_whole(path, lambda temporary: save_file(tensors, temporary, metadata))
+    save_tensors(path, self_model.state_dict(), metadata)
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Write a safetensors file with a checksum of all that is in it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    own = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    write_whole(path, save(own, {**metadata, CHECKSUM: _checksum(own, metadata)}))
 
 
 def read_tensors(path: Path, kinds: Mapping[str, str]) -> tuple[dict[str, str], dict[str, Tensor]]:
@@ -69,15 +81,35 @@ def read_tensors(path: Path, kinds: Mapping[str, str]) -> tuple[dict[str, str], 
     Raises:
         AssetError: the file is missing or damaged, or something else.
     """
+    content = read_whole(path, AssetError)
     try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
+        tensors = load(content)
+        header = content[HEADER : HEADER + int.from_bytes(content[:HEADER], "little")]
+        metadata: dict[str, str] = json.loads(header).get("__metadata__", {})
+    # Nearly any exception can come of a damaged file, depending on where the damage is.
+    except Exception as error:
         raise AssetError(f"{path}: cannot be read as weights ({error})") from error
     if metadata.get("format") not in kinds:
         raise AssetError(f"{path}: not a {' or '.join(kinds.values())} of this program")
+    checksum = metadata.pop(CHECKSUM, None)
+    if checksum is None:
+        raise AssetError(
+            f"{path}: has no checksum; version 0.1.0 wrote none, train the network again"
+        )
+    if checksum != _checksum(tensors, metadata):
+        raise AssetError(f"{path}: is damaged, its checksum is not that of its content")
+    for name, value in tensors.items():
+        if not value.isfinite().all():
+            raise AssetError(f"{path}: {name} has values that are not finite numbers")
     return metadata, tensors
+
+
+def _checksum(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(sorted(metadata.items())).encode())
+    for name, value in sorted(tensors.items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+        digest.update(value.numpy().tobytes())
+    return digest.hexdigest()
 
 
 def read_card(path: Path, kinds: Mapping[str, str]) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import torch
 
-from mirror_ppl.console import Progress
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
@@ -26,6 +25,7 @@ from mirror_ppl.people.populations import POPULATIONS
 from mirror_ppl.people.recordings import Start, draw_starts, record, recorded
 from mirror_ppl.people.rescue_participants import RESCUE_POPULATIONS, simulated_firefighters
 from mirror_ppl.people.search_rescue import Firefighters
+from mirror_ppl.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
         UnknownNameError: there is no such domain, setting or population.
         ValueError: fewer than one person or round, or ``told`` is no probability.
     """
-    setting = setting or get_domain(domain).settings[-1]
+    setting = get_domain(domain).settings[-1] if setting is None else setting
     for name, number in (("people", people), ("rounds", rounds)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, not {number}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -75,15 +74,6 @@ def plot_comparison(comparison: Comparison) -> Picture:
     words = ["the best", "all rounds", "a person's rounds", "± standard error, paired"]
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False)
     return figure
-
-
-def save_comparison_picture(comparison: Comparison, path: Path) -> None:
-    """Write :func:`plot_comparison` in the format of the path's suffix, whole or not at all.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    plot_comparison(comparison).save(path)
 
 
 def _dot(ax: Axes, score: Score, y: float, colour: str, marker: str, size: float) -> None:

@@ -22,7 +22,13 @@ class Picture(Figure):
         Raises:
             OutputError: the file cannot be written.
         """
-        write_whole(path, lambda temporary: self.savefig(temporary, dpi=DOTS_PER_INCH))
+        write_whole(path, self.content(path.suffix[1:]))
+
+    def content(self, kind: str = "png") -> bytes:
+        """What a file of that kind (png, pdf, svg) would hold."""
+        content = BytesIO()
+        self.savefig(content, dpi=DOTS_PER_INCH, format=kind)
+        return content.getvalue()
 
     def _repr_png_(self) -> bytes:
         content = BytesIO()

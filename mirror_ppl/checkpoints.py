@@ -1,0 +1,53 @@
+"""Checkpoints of long work: what a run that was stopped goes on from."""
+
+import io
+import os
+from hashlib import sha256
+from typing import Any
+
+from mirror_ppl.errors import CheckpointError
+from mirror_ppl.files import read_whole, write_whole
+
+DIGEST = 32
+"""Bytes of the checksum at the end of a checkpoint."""
+
+
+def save_checkpoint(path: str | os.PathLike[str], run: Any, content: dict[str, Any]) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    Args:
+        path: the file.
+        run: what identifies the run.
+        content: tensors, plain values, and lists and dicts of them.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    import torch
+
+    buffer = io.BytesIO()
+    torch.save({"run": run, **content}, buffer)
+    # torch does not check all of what it reads.
+    buffer.write(sha256(buffer.getbuffer()).digest())
+    write_whole(path, buffer.getbuffer())
+
+
+def read_checkpoint(path: str | os.PathLike[str], run: Any) -> dict[str, Any]:
+    """Read what `save_checkpoint` wrote.
+
+    Raises:
+        CheckpointError: the file is damaged or of another run.
+    """
+    import torch
+
+    whole = read_whole(path, CheckpointError)
+    content, digest = whole[:-DIGEST], whole[-DIGEST:]
+    if sha256(content).digest() != digest:
+        raise CheckpointError(f"{path} is not a whole checkpoint of this program; remove it")
+    found = torch.load(io.BytesIO(content), weights_only=True)
+    if found["run"] != run:
+        raise CheckpointError(
+            f"{path} belongs to a run with other options, seed or recordings; remove it, or "
+            "write elsewhere"
+        )
+    return found

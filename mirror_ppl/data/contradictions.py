@@ -1,0 +1,171 @@
+"""Recordings held against the world that they are said to be of.
+
+Each observation has to be possible, and the action recorded at step t has to lead from the
+observation at time t to the one at time t + 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.data.schema import dimension_labels
+from mirror_ppl.domains import Observation, get_domain
+from mirror_ppl.errors import DemonstrationsError
+
+TOLERANCE = 1e-3
+"""Differences up to this, in the domain's units, are rounding."""
+ENOUGH_STEPS = 5
+"""Contradicting steps from which on it is told whether the actions look shifted."""
+
+
+@dataclass(frozen=True)
+class Contradictions:
+    """How many steps of a recording contradict each other.
+
+    Attributes:
+        steps: number of all steps, by person.
+        contradicting: number of those whose action does not lead to the next observation.
+    """
+
+    steps: Mapping[str, int]
+    contradicting: Mapping[str, int]
+
+    @property
+    def share(self) -> float:
+        """Contradicting steps of all people, as a share of all steps."""
+        return sum(self.contradicting.values()) / max(1, sum(self.steps.values()))
+
+    def as_data(self) -> dict[str, object]:
+        """Plain values for a summary."""
+        return {
+            "steps": sum(self.steps.values()),
+            "contradicting": sum(self.contradicting.values()),
+            "by_person": dict(self.contradicting),
+        }
+
+
+def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contradictions:
+    """Make sure that what was recorded can happen in the domain's world.
+
+    Args:
+        demonstrations: rounds of P people.
+        allowed: share of steps, from 0 to 1, that may contradict each other.
+
+    Returns:
+        How many steps do.
+
+    Raises:
+        DemonstrationsError: an observation cannot be, or too many steps contradict each other; says
+            where the first is, what was expected and what was found.
+    """
+    wrong = []
+    for person in range(demonstrations.num_people):  # one by one, to bound memory
+        observation = _observation(demonstrations, person)
+        _check_observations(demonstrations, person, observation)
+        wrong.append(_wrong(demonstrations, person, observation))
+    found = Contradictions(
+        dict(zip(demonstrations.people, demonstrations.mask.sum((1, 2)).tolist(), strict=True)),
+        dict(zip(demonstrations.people, [int(steps.sum()) for steps in wrong], strict=True)),
+    )
+    if found.share > allowed:
+        number, steps = sum(found.contradicting.values()), sum(found.steps.values())
+        message = f"{_first(demonstrations, wrong)}; {number} of {steps} steps "
+        message += f"({found.share:.1%}) contradict the next observation, {allowed:.1%} may"
+        raise DemonstrationsError(message + _shifted(demonstrations, wrong))
+    return found
+
+
+def _observation(demonstrations: Demonstrations, person: int) -> Observation:
+    """What there was to observe in one person's rounds, ``[B, T+1, ...]``; 0 in padding."""
+    values = {"ego": demonstrations.ego, **demonstrations.observations}
+    return {name: value[person].nan_to_num(0.0) for name, value in values.items()}
+
+
+def _check_observations(
+    demonstrations: Demonstrations, person: int, observation: Observation
+) -> None:
+    lengths = demonstrations.lengths[person][:, None]
+    times = torch.arange(demonstrations.ego.shape[2], device=lengths.device)
+    real = (times <= lengths) & (lengths > 0)
+    for rule, broken in get_domain(demonstrations.domain).faults(observation).items():
+        where = (broken & real).nonzero()
+        if len(where):
+            number, time = where[0].tolist()
+            raise DemonstrationsError(
+                f"person {demonstrations.people[person]!r}, round {number}, time {time}: {rule}"
+            )
+
+
+def _wrong(
+    demonstrations: Demonstrations, person: int, observation: Observation, shift: int = 0
+) -> Tensor:
+    """Steps ``[B, T]`` of a person whose action does not lead to the next observation.
+
+    With a shift, the action so many steps before; never where there is none.
+    """
+    domain, mask = get_domain(demonstrations.domain), demonstrations.mask[person]
+    actions = demonstrations.actions[person].clamp(min=0)
+    if shift:
+        actions, mask = torch.roll(actions, shift, -1), mask & torch.roll(mask, shift, -1)
+        mask[:, 0 if shift > 0 else -1] = False
+    now = {name: value[:, :-1] for name, value in observation.items()}
+    expected = domain.next_observation(now, actions)
+    differs = [
+        _differs(expected[name], value[:, 1:]).flatten(2).any(-1)
+        for name, value in observation.items()
+    ]
+    return torch.stack(differs).any(0) & mask
+
+
+def _differs(expected: Tensor, found: Tensor) -> Tensor:
+    return (expected - found).abs() > TOLERANCE  # never where nothing certain is expected
+
+
+def _first(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
+    """The first contradiction in words."""
+    domain = get_domain(demonstrations.domain)
+    person = next(place for place, steps in enumerate(wrong) if steps.any())
+    number, step = wrong[person].nonzero()[0].tolist()
+    observation = _observation(demonstrations, person)
+    action = demonstrations.actions[person, number, step]
+    now = {name: value[number, step] for name, value in observation.items()}
+    labels = dimension_labels(domain)
+    for name, expected in domain.next_observation(now, action).items():
+        found = observation[name][number, step + 1]
+        places = _differs(expected, found).nonzero()
+        if len(places):
+            place = tuple(places[0].tolist())
+            axes = ("ego_feature",) if name == "ego" else (f"{name}_item", f"{name}_feature")
+            what = [labels[axis][index] for axis, index in zip(axes, place, strict=True)]
+            return (
+                f"person {demonstrations.people[person]!r}, round {number}, step {step}: after "
+                f"action {int(action)} ({domain.actions[int(action)]}) the {name} "
+                f"{', '.join(what)} is expected to be {expected[place].item():g} at time "
+                f"{step + 1}, found {found[place].item():g}"
+            )
+    raise AssertionError("nothing contradicts at this step")
+
+
+def _shifted(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
+    """Whether most of the wrong steps would fit with the action of the step before or after."""
+    number = sum(int(steps.sum()) for steps in wrong)
+    if number < ENOUGH_STEPS:
+        return ""
+    for shift, word in ((1, "before"), (-1, "after")):
+        left = fitting = 0
+        for person, steps in enumerate(wrong):
+            still = _wrong(demonstrations, person, _observation(demonstrations, person), shift)
+            own = steps & torch.roll(demonstrations.mask[person], shift, -1)
+            left += int(still.sum())
+            fitting += int((own & ~still).sum())
+        if fitting > number / 2 and left < number / 2:
+            return (
+                f"; {fitting} of them fit with the action of the step {word}: the actions look "
+                "shifted by one step"
+            )
+    return ""

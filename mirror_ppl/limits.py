@@ -1,0 +1,106 @@
+"""Limits of numbers that users give, and of the memory that they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import nan
+from pathlib import Path
+from typing import Any
+
+from mirror_ppl.errors import OptionError
+
+MOST_SEED = 2**32 - 1
+LIMITS: Mapping[str, tuple[int, int]] = {
+    "seed": (0, MOST_SEED),
+    "people_seed": (0, MOST_SEED),
+    "people": (1, 1_000_000),
+    "rounds": (1, 10_000),
+    "train_rounds": (0, 1_000_000),
+    "explore": (0, 1_000),
+    "draws": (1, 100_000),
+    "steps": (1, 1_000_000),
+    "refine": (0, 1_000_000),
+    "phases": (1, 100_000),
+    "horizon": (1, 1_000),
+    "patience": (1, 1_000),
+    "played": (1, 10_000),
+    "seeds": (1, 10_000),
+    "jobs": (-1, 1_000),
+}
+"""Least and greatest value of whole numbers by the option's name, in every command alike."""
+
+
+def check_numbers(options: Any, *names: str, **least: int) -> None:
+    """Refuse whole numbers outside of their limits.
+
+    Args:
+        options: has them as attributes; ``None`` and tuples of several numbers are fine.
+        names: of the options.
+        least: names of options whose least value is another here.
+
+    Raises:
+        OptionError: one is less or greater; says what it may be.
+    """
+    for name in (*names, *least):
+        value = getattr(options, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is None:
+                continue
+            low, high = LIMITS[name]
+            low = least.get(name, low)
+            option = f"--{name.replace('_', '-')}"
+            if number < low:
+                raise OptionError(f"{option} must be at least {low}, not {number}")
+            if number > high:
+                raise OptionError(f"{option} must be at most {high}, not {number}")
+
+
+def share(text: str, option: str) -> float:
+    """A share from 0 to 1, of a percentage such as "2.5%".
+
+    Raises:
+        OptionError: it is none; says what is expected.
+    """
+    try:
+        percent = float(text.strip().removesuffix("%"))
+    except ValueError:
+        percent = nan
+    if not 0 <= percent <= 100:  # noqa: PLR2004 - per cent
+        raise OptionError(f'{option} must be from 0% to 100%, such as 2.5%, not "{text}"')
+    return percent / 100
+
+
+def require_memory(needed: int, what: str) -> None:
+    """Refuse what does not fit into the memory that is free.
+
+    Args:
+        needed: bytes.
+        what: for the message, such as "rounds of so many people".
+
+    Raises:
+        OptionError: there is less; says how much.
+    """
+    free = free_memory()
+    if free is not None and needed > free:
+        raise OptionError(
+            f"{what} would need about {needed / 2**30:,.1f} GB of memory, {free / 2**30:.1f} GB "
+            "are free"
+        )
+
+
+def free_memory() -> int | None:
+    """Bytes that this process may still use; None where nobody says."""
+    free = []
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        sizes = {line.split(":")[0]: int(line.split()[1]) for line in lines}
+        free.append(1024 * sizes["MemAvailable"])
+    except (OSError, ValueError, KeyError, IndexError):
+        pass
+    try:
+        group = Path("/sys/fs/cgroup")
+        most, used = ((group / f"memory.{name}").read_text() for name in ("max", "current"))
+        free.append(int(most) - int(used))
+    except (OSError, ValueError):  # no such limit
+        pass
+    return min(free, default=None)
