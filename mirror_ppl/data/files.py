@@ -13,8 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import as_path
 from mirror_ppl.data import schema
-from mirror_ppl.data.demonstrations import DESCRIPTION, Demonstrations
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.data.provenance import DESCRIPTION
 from mirror_ppl.data.schema import TOLD, TRUTH
 from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
@@ -82,7 +84,7 @@ def load_demonstrations(
         require_known(setting, "setting", get_domain(domain).settings, domain)
     elif domain is not None:
         get_domain(domain)
-    dataset = _read(Path(path))
+    dataset = _read(as_path(path))
     try:
         return from_dataset(dataset, domain, setting)
     except (DemonstrationsError, UnknownNameError) as error:
