@@ -97,12 +97,13 @@ def main(options: Options) -> None:
     from mirror_ppl.evaluation.fit_report import show_fit
     from mirror_ppl.files import prepare_output_folder, write_whole
     from mirror_ppl.inference.export import add_identifiability, save_inference_data
-    from mirror_ppl.inference.fitting import check_world, fit_people, split_rounds
+    from mirror_ppl.inference.fitting import fit_people, split_rounds
     from mirror_ppl.inference.guide_file import network_for
     from mirror_ppl.inference.guides import InferenceOptions
     from mirror_ppl.inference.identifiability import identify
     from mirror_ppl.inference.pooling import Pooling
     from mirror_ppl.inference.population_file import load_population
+    from mirror_ppl.inference.recorded import check_world
     from mirror_ppl.inference.svi import FitOptions
     from mirror_ppl.models.loading import check_contract, load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from mirror_ppl.checks import as_path
 from mirror_ppl.data import asset_path
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, MirrorError
@@ -69,6 +70,7 @@ def read_tensors(path: Path, kinds: Mapping[str, str]) -> tuple[dict[str, str], 
     Raises:
         AssetError: the file is missing or damaged, or something else.
     """
+    path = as_path(path)
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
