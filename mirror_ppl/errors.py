@@ -1,16 +1,54 @@
 """The exceptions that this project raises for what its user can put right.
 
 A command turns each of them into one line on stderr and exit status 2 (see `mirror_ppl.console`).
-Mistakes of the code itself stay what they are: `ValueError`, `TypeError` and so on.
+Mistakes of the code itself stay what they are: `ValueError`, `TypeError` and so on. Messages say
+what was expected and what was given, in one printable line (see `shown`).
 """
 
 from collections.abc import Iterable
 from difflib import get_close_matches
-from typing import Self
+from reprlib import repr as short_repr
+from typing import Any, Self
+
+MOST_CHARACTERS = 100
+"""Of a name that a person chooses, such as a person's id."""
+SHOWN = 40
+"""Characters of a longer text that a message shows."""
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it: short, printable, on one line.
+
+    Of a long text only the beginning, of an array its shape, of other objects their class.
+    """
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple):
+        if shape:
+            return f"{type(value).__name__} of shape {tuple(shape)}"
+        value = value.item()
+    if isinstance(value, str):
+        return repr(value) if len(value) <= SHOWN else f"{value[:SHOWN]!r}..."
+    if value is None or isinstance(value, bool | int | float | complex | slice):
+        return short_repr(value)
+    if isinstance(value, list | tuple) and all(isinstance(one, str | int | float) for one in value):
+        return short_repr(value)
+    return value.__name__ if isinstance(value, type) else type(value).__name__
+
+
+def is_name(value: object) -> bool:
+    """Whether a value can be a name: printable text of at most 100 characters, not empty."""
+    return isinstance(value, str) and value.isprintable() and 0 < len(value) <= MOST_CHARACTERS
 
 
 class MirrorError(Exception):
     """Parent of all the project's exceptions; raised only through its children."""
+
+
+class InputError(MirrorError, ValueError):
+    """Raised for an argument of a wrong kind, shape or value.
+
+    It is a `ValueError` besides, as Python's own functions raise it for such arguments.
+    """
 
 
 class DemonstrationsError(MirrorError):
@@ -46,7 +84,10 @@ class UnknownNameError(MirrorError):
         """
         names = sorted(known)
         place = f" in {where}" if where else ""
-        message = f'unknown {kind} "{name}"{place}; known: {", ".join(names) or "none"}'
+        own = f'"{name}"' if is_name(name) else shown(name)
+        message = f"unknown {kind} {own}{place}; known: {', '.join(names) or 'none'}"
+        if not isinstance(name, str):
+            return cls(message)
         lowered = {candidate.lower(): candidate for candidate in names}
         for close in get_close_matches(name.lower(), lowered, n=1):
             message += f'; perhaps you meant "{lowered[close]}"'

@@ -10,6 +10,7 @@ from typing import Any
 from mirror_ppl.errors import OptionError
 
 MOST_SEED = 2**32 - 1
+"""Seeds are numbers from 0 to this one, everywhere; what they are mixed with fits into 64 bits."""
 LIMITS: Mapping[str, tuple[int, int]] = {
     "seed": (0, MOST_SEED),
     "people_seed": (0, MOST_SEED),

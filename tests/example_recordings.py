@@ -31,7 +31,7 @@ def fields(lengths, names="abcdefgh", seed=0):
         "rewards": numbers(T),
         "scenarios": below(8),
         "truth": {"reach": torch.randn(P, generator=g), "bias": torch.full((P,), NAN)},
-        "action_entropy": numbers(T).abs(),
+        "action_entropy": 0.69 * torch.rand(P, B, T, generator=g),
         "provenance": {"command": "test", "seed": 3, "temperature": 0.1},
     }
 

@@ -1,13 +1,16 @@
 """Recordings: what is refused, what is kept, and what is made of them."""
 
 import dataclasses
+import math
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from example_recordings import NAN, RAGGED, fields
 
 from mirror_ppl.data import Demonstrations, concatenate
+from mirror_ppl.data.schema import A_NAME
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
 
 
@@ -121,7 +124,21 @@ BAD = {
     "entropy infinite": (
         put(["action_entropy"], (2, 2, 0), float("inf")),
         "person 'c', round 2, step 0: action_entropy is inf, "
-        "expected a finite number, or nan if unknown",
+        "expected from 0 to 0.6931 (log of 2 actions), or nan if unknown",
+    ),
+    "entropy negative": (
+        put(["action_entropy"], (2, 2, 0), -0.002),
+        "person 'c', round 2, step 0: action_entropy is -0.002, "
+        "expected from 0 to 0.6931 (log of 2 actions), or nan if unknown",
+    ),
+    "entropy of more actions than there are": (
+        put(["action_entropy"], (0, 0, 1), 0.695),
+        "person 'a', round 0, step 1: action_entropy is 0.695, "
+        "expected from 0 to 0.6931 (log of 2 actions), or nan if unknown",
+    ),
+    "truth infinite": (
+        put(["truth", "reach"], (1,), float("-inf")),
+        "person 'b': truth_reach is -inf, expected a finite number, or nan if unknown",
     ),
     "action too large": (
         put(["actions"], (2, 1, 3), 2),
@@ -197,11 +214,37 @@ BAD = {
         put(["people"], None, ("a", "b", "a")),
         "two people have the id 'a', expected unique ids",
     ),
-    "empty id": (put(["people"], None, ("a", "", "c")), "id is '', expected printable text"),
+    "empty id": (put(["people"], None, ("a", "", "c")), f"id is '', expected {A_NAME}"),
+    "id that is a number": (put(["people"], None, ("a", 7, "c")), f"id is 7, expected {A_NAME}"),
+    "id of two lines": (
+        put(["people"], None, ("a", "b\nb", "c")),
+        f"id is 'b\\nb', expected {A_NAME}",
+    ),
+    "id with half a character": (
+        put(["people"], None, ("a", "b\udc80", "c")),
+        f"id is 'b\\udc80', expected {A_NAME}",
+    ),
+    "long id": (
+        put(["people"], None, ("a", "b" * 101, "c")),
+        f"id is '{'b' * 40}'..., expected {A_NAME}",
+    ),
+    "ids that are one text": (put(["people"], None, "abc"), "must be a list of ids, not 'abc'"),
     "nobody": (put(["people"], None, ()), "there is nobody in it, expected at least one person"),
     "truth that files cannot name": (
         put(["truth"], None, {"a/b": torch.ones(3)}),
-        "truth has 'a/b', expected printable text without /",
+        f"truth has 'a/b', expected {A_NAME}, no /",
+    ),
+    "truth without a name": (
+        put(["truth"], None, {"": torch.ones(3)}),
+        f"truth has '', expected {A_NAME}, no /",
+    ),
+    "truth of a long name": (
+        put(["truth"], None, {"r" * 101: torch.ones(3)}),
+        f"truth has '{'r' * 40}'..., expected {A_NAME}, no /",
+    ),
+    "truth whose name is a number": (
+        put(["truth"], None, {3: torch.ones(3)}),
+        f"truth has 3, expected {A_NAME}, no /",
     ),
     "provenance that is a description": (
         put(["provenance"], None, {"domain": "x"}),
@@ -210,6 +253,30 @@ BAD = {
     "provenance that is a list": (
         put(["provenance"], None, {"seed": [1]}),
         "provenance seed is [1], expected text or a number",
+    ),
+    "provenance that is no dict": (
+        put(["provenance"], None, ["seed"]),
+        "provenance must be a dict, not ['seed']",
+    ),
+    "provenance nan": (
+        put(["provenance"], None, {"rate": NAN}),
+        "provenance rate is nan, expected a finite number",
+    ),
+    "provenance infinite": (
+        put(["provenance"], None, {"rate": np.float32("-inf")}),
+        "provenance rate is -inf, expected a finite number",
+    ),
+    "provenance of more than 64 bits": (
+        put(["provenance"], None, {"seed": 2**63}),
+        "provenance seed is 9223372036854775808, expected a whole number of 64 bits",
+    ),
+    "provenance that files cannot hold": (
+        put(["provenance"], None, {"command": "\udc80"}),
+        "provenance command is '\\udc80', expected text that can be written in UTF-8",
+    ),
+    "provenance whose name is a number": (
+        put(["provenance"], None, {3: 3}),
+        "provenance has 3, expected names as text",
     ),
 }
 
@@ -220,7 +287,21 @@ def test_bad_demonstrations_are_refused_in_one_line(given_fields, change, messag
     with pytest.raises(DemonstrationsError) as error:
         Demonstrations(**given_fields)
     assert str(error.value).endswith(message)
-    assert "\n" not in str(error.value)
+    assert str(error.value).isprintable()
+
+
+def test_values_at_the_edge_are_kept(given_fields):
+    """Rounding may take an entropy out of its range; an id may have 100 characters."""
+    entropies = torch.full((3, 3, 4), math.log(2) + 9e-4)
+    entropies[0] = -9e-4
+    given_fields |= {"action_entropy": entropies, "people": ("a", "b" * 100, "c d")}
+    given_fields["truth"]["r" * 100] = torch.tensor([1e30, NAN, -1e30])
+    given_fields["provenance"] = {"command": "a\nb", "seed": np.int64(3), "rate": np.float32(0.5)}
+    made = Demonstrations(**given_fields)
+    assert torch.equal(made.action_entropy[0, 0, :3], entropies[0, 0, :3])
+    assert made.people == ("a", "b" * 100, "c d")
+    assert made.provenance == {"command": "a\nb", "seed": 3, "rate": 0.5}
+    assert [type(value) for value in made.provenance.values()] == [str, int, float]
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import real_number, require_kind, require_methods, seed_number
 from mirror_ppl.communication.messages import Channels, Message
 from mirror_ppl.communication.minds import Person, Standing
 from mirror_ppl.communication.objectives import Objective, Value, Valued
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
 from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -251,6 +253,9 @@ class Communicator:
         sure: how many standard errors of its gain a message has to gain; 0 takes whatever is
             best on average.
         seed: of everything random; the same seed and round give the same decision.
+
+    Raises:
+        InputError: one of them is something else, or the objective is of another domain.
     """
 
     person: Person
@@ -260,19 +265,30 @@ class Communicator:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.sure >= 0:
-            raise ValueError(f"sure must be at least 0, not {self.sure}")
+        require_kind(self.person, Person, "person")
+        require_methods(self.objective, ["at"], "objective", "an objective")
+        require_methods(self.search, ["__call__"], "search", "a search")
+        # What is rolled forward, where an objective says so and that says of which domain it is.
+        world = getattr(getattr(self.objective, "world", None), "domain", None)
+        own = self.person.human.domain.name
+        if world is not None and world.name != own:
+            raise InputError(f"the objective must be of the world {own}, not of {world.name}")
+        object.__setattr__(self, "sure", real_number(self.sure, "sure", 0.0))
+        object.__setattr__(self, "seed", seed_number(self.seed))
 
     @torch.no_grad()
     def plan(self, past: RoundSoFar) -> Decision:
         """What to communicate now.
 
-        Silence is chosen where no message gains enough, and when the round is over.
+        Silence is chosen where no message gains enough, and when the round is over: after its last
+        step, or after all is done.
 
         Raises:
-            ValueError: the last observation or action of the round cannot be.
+            InputError: the round cannot be, at any of its steps; it has more steps than rounds of
+                the domain have, or goes on after all was done.
         """
         domain = self.person.human.domain
+        past = require_kind(past, RoundSoFar, "the round so far").to(self.person.device)
         past.check(domain)
         channels = Channels(domain)
         now = past.now

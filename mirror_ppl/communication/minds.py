@@ -19,15 +19,16 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from mirror_ppl.checks import require_kind
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility, map_state
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.prior import checked_draws
 from mirror_ppl.models.attention import AttentionValues, Proposal
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
-from mirror_ppl.models.sites import latent_sites
 from mirror_ppl.models.view import View
 
 COUNTED = 3
@@ -41,7 +42,7 @@ class Person:
 
     Args:
         human: the model of people.
-        draws: values ``[S, 1, 1, ...]`` of all its sites.
+        draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or what becomes one.
 
     Attributes:
         eyes: values ``[U]`` of the discrete sites, each combination that occurs in the draws once;
@@ -50,25 +51,25 @@ class Person:
 
     Raises:
         HumanModelError: there are no draws, or they are not those of the model's sites.
+        InputError: the draws are of several people, of another shape or kind, or have values that
+            the human model rules out.
     """
 
     def __init__(self, human: HumanModel, draws: Mapping[str, Tensor]) -> None:
-        self.human = human
-        self.draws = dict(draws)
-        if not draws or min(len(value) for value in draws.values()) == 0:
+        self.human = require_kind(human, HumanModel, "human")
+        none = isinstance(draws, Mapping) and not draws
+        self.draws = {} if none else checked_draws(human, draws, 1)
+        self.number = len(next(iter(self.draws.values()), ()))
+        if self.number == 0:
             raise HumanModelError("planning needs at least one posterior draw")
-        self.number = len(next(iter(draws.values())))
         with torch.no_grad(), self._conditioned(), poutine.trace() as trace:
             self.implants = human.prior()
-        missing = latent_sites(trace.trace)
-        if missing:
-            raise HumanModelError(f"there are no draws of the site {', '.join(missing)}")
         self._discrete = {
-            name: draws[name].reshape(self.number)
+            name: self.draws[name].reshape(self.number)
             for name, site in trace.trace.nodes.items()
-            if name in draws and site["fn"].has_enumerate_support
+            if name in self.draws and site["fn"].has_enumerate_support
         }
-        self.device = next(iter(draws.values())).device
+        self.device = next(iter(self.draws.values())).device
         self.eyes, self.eye = self._distinct_eyes(self._discrete, self.number)
         self.eye_count = int(self.eye.max()) + 1
 

@@ -14,6 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import require_methods, whole_number
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.minds import Looks, Standing
 from mirror_ppl.communication.worlds import Futures, World, robot_belief
@@ -83,8 +84,8 @@ class ExpectedUtility:
     beyond: bool = False
 
     def __post_init__(self) -> None:
-        if self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1, not {self.horizon}")
+        require_methods(self.world, ["futures"], "world", "a world such as SimulatorWorld(domain)")
+        object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
         if not 0 < self.discount <= 1:
             raise ValueError(f"discount must be above 0 and at most 1, not {self.discount}")
         if not 0 <= self.branch <= 1:

@@ -2,23 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import (
+    flags,
+    numbers,
+    require_keys,
+    require_methods,
+    require_shape,
+    whole_numbers,
+)
 from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.errors import InputError, shown
+
+EGO = "ego"
 
 
 @dataclass(frozen=True)
 class RoundSoFar:
     """A round up to the moment at which the person is about to act for the (t + 1)-th time.
 
+    Arrays may be tensors, numpy arrays or lists of any numeric kind, and are kept as tensors: what
+    there was to observe in torch's default dtype, actions as int64, what was told as bool (1 and 0
+    will do), all on the device of the ego's features.
+
     Attributes:
         observation: everything there was to observe at each step, as the robot saw it: ego
             ``[t + 1, E]``, each modality ``[t + 1, K, F]``.
         actions: what the person did, ``[t]``.
         told: what they were told at each step, by modality ``[t, K]``.
+
+    Raises:
+        InputError: these are no such arrays, or they do not go together. Whether they can be of a
+            domain is what `check` tells.
     """
 
     observation: Observation
@@ -26,32 +47,47 @@ class RoundSoFar:
     told: Visibility
 
     def __post_init__(self) -> None:
-        steps = len(self.actions)
-        for name, value in self.observation.items():
+        observation = _observation(self.observation)
+        device = observation[EGO].device
+        actions = whole_numbers(self.actions, "actions", device)
+        if actions.dim() != 1:
+            raise InputError(f"actions has shape {tuple(actions.shape)}, expected one dimension")
+        steps = len(actions)
+        modalities = [name for name in observation if name != EGO]
+        given = require_keys(self.told, modalities, "told")
+        told = {name: flags(given[name], f'told "{name}"', device) for name in given}
+        for name, value in observation.items():
             if len(value) != steps + 1:
-                raise ValueError(
+                raise InputError(
                     f'{steps} actions go with {steps + 1} observations; "{name}" has {len(value)}'
                 )
-        for name, value in self.told.items():
-            if len(value) != steps:
-                raise ValueError(
+        for name, value in told.items():
+            if value.dim() and len(value) != steps:
+                raise InputError(
                     f'{steps} actions go with as many steps of told "{name}", not {len(value)}'
                 )
+            require_shape(value, (steps, observation[name].shape[1]), f'told "{name}"')
+        for name, value in (("observation", observation), ("actions", actions), ("told", told)):
+            object.__setattr__(self, name, value)
 
     @classmethod
     def begin(cls, domain: Domain, observation: Observation) -> RoundSoFar:
         """A round of which there is only the first observation, ``[E]`` and ``[K, F]``.
 
         Raises:
-            ValueError: such an observation cannot be.
+            InputError: such an observation cannot be.
         """
-        device = observation["ego"].device
-        nothing = {
-            m.name: torch.zeros(0, len(m.items), dtype=torch.bool, device=device)
-            for m in domain.modalities
-        }
-        first = {name: value[None] for name, value in observation.items()}
-        past = cls(first, torch.zeros(0, dtype=torch.long, device=device), nothing)
+        require_methods(domain, ["observe", "faults"], "domain", "a domain")
+        shapes = _shapes(domain)
+        given = require_keys(observation, shapes, "the observation")
+        first = {name: numbers(value, _the(name)) for name, value in given.items()}
+        for name, value in first.items():
+            require_shape(value, shapes[name], _the(name))
+        past = cls(
+            {name: value[None] for name, value in first.items()},
+            torch.zeros(0, dtype=torch.long),
+            {m.name: torch.zeros(0, len(m.items), dtype=torch.bool) for m in domain.modalities},
+        )
         past.check(domain)
         return past
 
@@ -62,37 +98,67 @@ class RoundSoFar:
             told: what the person was told before they acted, ``[K]`` by modality.
             action: what they did.
             observation: what there is to observe now, ``[E]`` and ``[K, F]``.
+
+        Raises:
+            InputError: one of them is not of this kind and shape.
         """
-        done = torch.as_tensor(action, dtype=torch.long, device=self.actions.device).reshape(1)
+        device = self.actions.device
+        heard = require_keys(told, self.told, "told")
+        seen = require_keys(observation, self.observation, "the observation")
+        done = whole_numbers(action, "the action", device)
+        if done.numel() != 1:
+            raise InputError(f"the action has shape {tuple(done.shape)}, expected one number")
+        now, new = {}, {}
+        for name, before in self.observation.items():
+            now[name] = numbers(seen[name], _the(name), device)
+            require_shape(now[name], tuple(before.shape[1:]), _the(name))
+        for name, before in self.told.items():
+            new[name] = flags(heard[name], f'told "{name}"', device)
+            require_shape(new[name], tuple(before.shape[1:]), f'told "{name}"')
         return RoundSoFar(
-            {
-                name: torch.cat([value, observation[name][None]])
-                for name, value in self.observation.items()
-            },
-            torch.cat([self.actions, done]),
-            {name: torch.cat([value, told[name][None]]) for name, value in self.told.items()},
+            {name: torch.cat([value, now[name][None]]) for name, value in self.observation.items()},
+            torch.cat([self.actions, done.reshape(1)]),
+            {name: torch.cat([value, new[name][None]]) for name, value in self.told.items()},
         )
 
     def check(self, domain: Domain) -> None:
-        """Make sure that the last step can be one of this domain.
+        """Make sure that all of the round can be of this domain.
 
         Raises:
-            ValueError: its observation or action cannot be.
+            InputError: it is longer than the domain's rounds; or an observation, an action or what
+                was told cannot be.
         """
-        now = self.now
-        expected = {"ego": (len(domain.ego_features),)} | {
-            m.name: (len(m.items), len(m.features)) for m in domain.modalities
-        }
-        for name, shape in expected.items():
-            found = tuple(now[name].shape) if name in now else None
-            if found != shape:
-                raise ValueError(f'the observation of "{name}" has shape {found}, expected {shape}')
-        for rule, broken in domain.faults(now).items():
-            if broken:
-                raise ValueError(f"this observation cannot be: {rule}")
-        if self.time and not 0 <= int(self.actions[-1]) < len(domain.actions):
-            raise ValueError(
-                f"there is no action {int(self.actions[-1])}; actions count from 0 to "
+        if self.time > domain.horizon:
+            raise InputError(
+                f"the round has {self.time} steps, expected at most {domain.horizon}, as long as "
+                f"rounds of {domain.name} are"
+            )
+        shapes = _shapes(domain)
+        require_keys(self.observation, shapes, "the observation")
+        for name, shape in shapes.items():
+            value = self.observation[name]
+            require_shape(value, (self.time + 1, *shape), _the(name))
+            infinite = ~value.isfinite()
+            if infinite.any():
+                time, number = _first(value, infinite)
+                raise InputError(
+                    f"time {time}: {_the(name)} has {number:g}, expected finite numbers"
+                )
+        for rule, broken in domain.faults(self.observation).items():
+            if broken.any():
+                raise InputError(
+                    f"time {int(broken.nonzero()[0])}: this observation cannot be: {rule}"
+                )
+        over = domain.over(domain.state_behind(self.observation))
+        resumed = over[:-1] & ~over[1:]
+        if resumed.any():
+            time = int(resumed.nonzero()[0])
+            raise InputError(f"the round was over at time {time}, but goes on at time {time + 1}")
+        wrong = (self.actions < 0) | (self.actions >= len(domain.actions))
+        if wrong.any():
+            step, action = _first(self.actions, wrong)
+            raise InputError(
+                f"step {step}: there is no action {action}; actions count from 0 to "
                 f"{len(domain.actions) - 1}"
             )
 
@@ -105,3 +171,42 @@ class RoundSoFar:
     def now(self) -> Observation:
         """The last observation, ``[E]`` and ``[K, F]``."""
         return {name: value[-1] for name, value in self.observation.items()}
+
+    def to(self, device: torch.device) -> RoundSoFar:
+        """The same on another device."""
+        if self.actions.device == device:
+            return self
+        observation = {name: value.to(device) for name, value in self.observation.items()}
+        return RoundSoFar(observation, self.actions, self.told)
+
+
+def _the(name: str) -> str:
+    return f'the observation of "{name}"'
+
+
+def _shapes(domain: Domain) -> dict[str, tuple[int, ...]]:
+    """Of one observation of everything, by name."""
+    shapes = {m.name: (len(m.items), len(m.features)) for m in domain.modalities}
+    return {EGO: (len(domain.ego_features),), **shapes}
+
+
+def _observation(given: Any) -> Observation:
+    """Observations ``[t + 1, ...]`` as tensors on one device."""
+    if not isinstance(given, Mapping) or EGO not in given:
+        what = ", ".join(map(shown, given)) if isinstance(given, Mapping) else shown(given)
+        raise InputError(f'the observation must be a dict with "{EGO}" and modalities, not {what}')
+    result, device = {}, None
+    for name in (EGO, *(name for name in given if name != EGO)):
+        result[name] = numbers(given[name], _the(name), device)
+        device = result[EGO].device
+        expected = "(t + 1, E)" if name == EGO else "(t + 1, K, F)"
+        if result[name].dim() != expected.count(",") + 1:
+            raise InputError(
+                f"{_the(name)} has shape {tuple(result[name].shape)}, expected {expected}"
+            )
+    return result
+
+
+def _first(value: Tensor, bad: Tensor) -> tuple[int, float]:
+    """The first entry that is bad: where along the first dimension, and what."""
+    return int(bad.nonzero()[0, 0]), value[bad][0].item()

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import require_kind, require_methods, whole_number
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward
 from mirror_ppl.models.networks import Gaussian
@@ -211,6 +212,7 @@ class SimulatorWorld:
     draws = 1
 
     def __init__(self, domain: Domain) -> None:
+        require_methods(domain, ["transition", "state_behind"], "domain", "a domain")
         self.domain = domain
 
     def futures(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> Futures:
@@ -246,10 +248,9 @@ class SelfModelWorld:
     """
 
     def __init__(self, self_model: SelfModel, draws: int = 1) -> None:
-        if draws < 1:
-            raise ValueError(f"draws must be at least 1, not {draws}")
-        self.self_model = self_model
-        self.draws = draws
+        self.self_model = require_kind(self_model, SelfModel, "self_model")
+        self.domain = self_model.domain
+        self.draws = whole_number(draws, "draws", 1)
 
     def futures(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> Futures:
         """See :class:`World`."""

@@ -3,6 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
+from mirror_ppl.checks import as_path
 from mirror_ppl.data.demonstrations import Demonstrations, concatenate
 from mirror_ppl.data.files import (
     from_dataset,
@@ -20,7 +21,7 @@ def asset_path(name: str) -> Path:
         AssetError: there is none of that name; lists those that ship.
     """
     folder = Path(str(resources.files(__name__))) / "assets"
-    path = folder / name
+    path = folder / as_path(name, "name")
     if not path.is_file():
         shipped = sorted(
             file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()

@@ -86,6 +86,16 @@ def _observation(demonstrations: Demonstrations, person: int) -> Observation:
     return {name: value[person].nan_to_num(0.0) for name, value in values.items()}
 
 
+def check_observations(demonstrations: Demonstrations) -> None:
+    """Make sure that each observation can be in the domain's world.
+
+    Raises:
+        DemonstrationsError: one cannot; says which, and which rule it breaks.
+    """
+    for person in range(demonstrations.num_people):
+        _check_observations(demonstrations, person, _observation(demonstrations, person))
+
+
 def _check_observations(
     demonstrations: Demonstrations, person: int, observation: Observation
 ) -> None:

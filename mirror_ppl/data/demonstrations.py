@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import as_tensor, listed, require_keys, whole_number
+from mirror_ppl.console import usable_device
 from mirror_ppl.data import schema
+from mirror_ppl.data.provenance import checked_provenance
 from mirror_ppl.data.schema import NO_INDEX, TOLD, TRUTH
 from mirror_ppl.domains import Observation, get_domain, require_known
-from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.errors import DemonstrationsError, is_name, shown
 
 OPTIONAL = {"reward": "rewards", "scenario": "scenarios", "action_entropy": "action_entropy"}
 """Variables that may be absent, and the fields that hold them."""
-DESCRIPTION = ("title", "Conventions", "format", "format_version", "domain", "setting")
-"""Attributes of a file that describe it; all others tell where the recordings come from."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -25,13 +27,13 @@ class Demonstrations:
 
     People may have different numbers of rounds (or none), rounds different lengths. Arrays are as
     large as the largest needs; the rest of them is padding. Rounds, steps and times count from 0.
-    Arrays are copied and brought into one form on creation, whatever numeric dtype they have and
-    whatever stands in their padding.
+    Arrays (tensors, numpy arrays or lists) are copied and brought into one form on creation,
+    whatever numeric dtype they have and whatever stands in their padding.
 
     Args:
         domain: name of the domain.
         setting: name of the domain's setting that the rounds took place in.
-        people: P ids, unique.
+        people: P ids, unique, printable, of at most 100 characters.
         ego: the ego's features ``[P, B, T+1, E]``, in the domain's units; NaN in padding.
         observations: for each modality all that could have been observed, ``[P, B, T+1, K, F]``, in
             the domain's units; NaN in padding. What of it the person saw is not recorded.
@@ -44,8 +46,8 @@ class Demonstrations:
         scenarios: indices of scenarios ``[P, B]``; -1 in padding and where unknown.
         truth: values ``[P]`` of implants by name, known of simulated people only; NaN where
             unknown.
-        action_entropy: entropy in nats of the choice that a simulated person made, ``[P, B, T]``;
-            NaN in padding and where unknown.
+        action_entropy: entropy in nats of the choice that a simulated person made, ``[P, B, T]``,
+            from 0 to the logarithm of the number of actions; NaN in padding and where unknown.
         provenance: where the recordings come from: command, seed, population, version.
 
     Raises:
@@ -73,19 +75,19 @@ class Demonstrations:
         domain = get_domain(self.domain)
         require_known(self.setting, "setting", domain.settings, domain.name)
         modalities = {modality.name: modality for modality in domain.modalities}
-        _check_names("observations", self.observations, modalities, all_of_them=True)
-        _check_names("told", self.told, modalities, all_of_them=False)
-        for name in self.truth:
-            if not name.isprintable() or "/" in name:
-                raise DemonstrationsError(f"truth has {name!r}, expected printable text without /")
-        _check_provenance(self.provenance)
-        variables = self.variables()
+        require_keys(self.observations, modalities, "observations", DemonstrationsError)
+        require_keys(self.told, modalities, "told", DemonstrationsError, all_of_them=False)
+        _check_truths(self.truth)
+        people = listed(self.people, "people", "ids", DemonstrationsError)
+        provenance = checked_provenance(self.provenance)
+        variables: dict[str, Any] = self.variables()
+        actions = as_tensor(self.actions, "action", DemonstrationsError)
         for name, modality in modalities.items():
-            nothing = torch.zeros(*self.actions.shape, len(modality.items), dtype=torch.bool)
+            nothing = torch.zeros(*actions.shape, len(modality.items), dtype=torch.bool)
             variables.setdefault(TOLD + name, nothing)
-        variables = schema.checked(domain, self.people, variables)
+        variables = schema.checked(domain, people, variables)
         fields = {
-            "people": tuple(self.people),
+            "people": tuple(map(str, people)),
             "ego": variables["ego"],
             "observations": {name: variables[name] for name in modalities},
             "actions": variables["action"],
@@ -93,7 +95,7 @@ class Demonstrations:
             "lengths": variables["length"],
             "told": {name: variables[TOLD + name] for name in modalities},
             "truth": {name: variables[TRUTH + name] for name in self.truth},
-            "provenance": dict(self.provenance),
+            "provenance": provenance,
         }
         fields |= {OPTIONAL[name]: variables[name] for name in OPTIONAL.keys() & variables.keys()}
         for name, value in fields.items():
@@ -105,7 +107,7 @@ class Demonstrations:
         domain: str,
         setting: str,
         people: Sequence[str],
-        variables: Mapping[str, Tensor],
+        variables: Mapping[str, Any],
         provenance: Mapping[str, str | int | float] | None = None,
     ) -> Demonstrations:
         """Demonstrations of arrays that are called as in files, the inverse of `variables`.
@@ -118,18 +120,21 @@ class Demonstrations:
             DemonstrationsError: as for the class; or a required variable is missing.
         """
         modalities = [modality.name for modality in get_domain(domain).modalities]
+        if not isinstance(variables, Mapping):
+            raise DemonstrationsError(f"variables must be a dict of arrays, not {shown(variables)}")
         for name in schema.required_variables(get_domain(domain)):
             if name not in variables:
                 raise DemonstrationsError(f"the variable {name} is missing")
-        actions = variables["action"]
+        actions = as_tensor(variables["action"], "action", DemonstrationsError)
         # Wrong shapes are left to the check of the class, which knows what to say about them.
         number, rounds, steps = actions.shape if actions.dim() == 3 else (0, 0, 0)
         counts = variables.get("round_count", torch.full((number,), rounds))
+        counts = as_tensor(counts, "round_count", DemonstrationsError)
         every = steps * (torch.arange(rounds) < counts.reshape(-1, 1).cpu())
         return cls(
             domain=domain,
             setting=setting,
-            people=tuple(people),
+            people=people,  # pyright: ignore[reportArgumentType] - the class makes a tuple of it
             ego=variables["ego"],
             observations={name: variables[name] for name in modalities},
             actions=actions,
@@ -214,11 +219,11 @@ class Demonstrations:
 
         Raises:
             UnknownNameError: there is nobody of that id.
-            DemonstrationsError: an index is out of range, somebody is named twice, or the list is
-                empty.
+            DemonstrationsError: an index is out of range or no index, somebody is named twice, or
+                the list is empty or no list.
         """
         chosen = []
-        for person in people:
+        for person in listed(people, "people", "ids or indices", DemonstrationsError):
             if isinstance(person, str):
                 chosen.append(self.people.index(require_known(person, "person", self.people)))
             else:
@@ -236,13 +241,15 @@ class Demonstrations:
                 those that they have. People who have none of them stay, with no rounds.
 
         Raises:
-            DemonstrationsError: a number is negative, or beyond everybody's rounds.
+            DemonstrationsError: a number is negative, beyond everybody's rounds, or no number.
         """
         counts = self.round_counts.tolist()
         if isinstance(rounds, slice):
+            _check_slice(rounds)
             kept = [list(range(count)[rounds]) for count in counts]
         else:
-            numbers = [_in_range("round", number, max(counts)) for number in rounds]
+            numbers = listed(rounds, "rounds", "numbers, or a slice", DemonstrationsError)
+            numbers = [_in_range("round", number, max(counts)) for number in numbers]
             kept = [[number for number in numbers if number < count] for count in counts]
         most = max(1, *map(len, kept))
         index = torch.tensor([row + [0] * (most - len(row)) for row in kept])
@@ -258,7 +265,12 @@ class Demonstrations:
         return self._like(variables, self.people)
 
     def to(self, device: torch.device | str) -> Demonstrations:
-        """The same on another device."""
+        """The same on another device.
+
+        Raises:
+            UnknownNameError: there is no such device here.
+        """
+        usable_device(str(device))
         variables = {name: value.to(device) for name, value in self.variables().items()}
         return self.from_variables(
             self.domain, self.setting, self.people, variables, self.provenance
@@ -280,16 +292,20 @@ class Demonstrations:
         return self.from_variables(self.domain, self.setting, people, fitted, self.provenance)
 
 
-def concatenate(parts: Sequence[Demonstrations]) -> Demonstrations:
+def concatenate(parts: Iterable[Demonstrations]) -> Demonstrations:
     """The people of all parts, in order, on the first part's device.
 
     Scenarios, truths and entropies that a part lacks become unknown. Rewards are kept if every part
     has them. Of the provenance, what all parts agree on is kept.
 
     Raises:
-        DemonstrationsError: there is no part, the parts are of different domains or settings, or an
-            id occurs twice.
+        DemonstrationsError: there is no part, or something else; the parts are of different domains
+            or settings, or an id occurs twice.
     """
+    parts = listed(parts, "parts", "demonstrations", DemonstrationsError)
+    for part in parts:
+        if not isinstance(part, Demonstrations):
+            raise DemonstrationsError(f"parts must be demonstrations, not {shown(part)}")
     if not parts:
         raise DemonstrationsError("there are no demonstrations to put together")
     first = parts[0]
@@ -350,26 +366,27 @@ def _identical(one: Tensor, other: Tensor) -> bool:
     return bool(((one == other) | (one.isnan() & other.isnan())).all())
 
 
-def _in_range(kind: str, number: int, end: int) -> int:
+def _in_range(kind: str, value: Any, end: int) -> int:
+    number = whole_number(value, f"the number of a {kind}", error=DemonstrationsError)
     if not 0 <= number < end:
         raise DemonstrationsError(
             f"there is no {kind} {number}, expected one of {end}, counted from 0"
         )
-    return int(number)
+    return number
 
 
-def _check_names(
-    field_name: str, given: Mapping[str, Tensor], known: Collection[str], *, all_of_them: bool
-) -> None:
-    if set(given) - set(known) or (all_of_them and set(known) - set(given)):
+def _check_slice(rounds: slice) -> None:
+    try:
+        range(0)[rounds]
+    except (TypeError, ValueError) as error:
         raise DemonstrationsError(
-            f"{field_name} has {', '.join(given) or 'nothing'}, expected {', '.join(known)}"
-        )
+            f"rounds must be a slice of whole numbers, not {shown(rounds)} ({error})"
+        ) from error
 
 
-def _check_provenance(provenance: Mapping[str, str | int | float]) -> None:
-    for name, value in provenance.items():
-        if name in DESCRIPTION:
-            raise DemonstrationsError(f"provenance has {name}, which is not a matter of origin")
-        if not isinstance(value, str | int | float) or isinstance(value, bool):
-            raise DemonstrationsError(f"provenance {name} is {value!r}, expected text or a number")
+def _check_truths(truth: Any) -> None:
+    if not isinstance(truth, Mapping):
+        raise DemonstrationsError(f"truth must be a dict of values by name, not {shown(truth)}")
+    for name in truth:
+        if not is_name(name) or "/" in name:
+            raise DemonstrationsError(f"truth has {shown(name)}, expected {schema.A_NAME}, no /")

@@ -12,8 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import as_path
 from mirror_ppl.data import schema
-from mirror_ppl.data.demonstrations import DESCRIPTION, Demonstrations
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.data.provenance import DESCRIPTION
 from mirror_ppl.data.schema import TOLD, TRUTH
 from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
@@ -74,6 +76,7 @@ def load_demonstrations(
         require_known(setting, "setting", get_domain(domain).settings, domain)
     elif domain is not None:
         get_domain(domain)
+    path = as_path(path)
     dataset = read_netcdf(path, DemonstrationsError)["/"]
     try:
         return from_dataset(dataset, domain, setting)

@@ -6,14 +6,17 @@ A recording is a set of arrays, called by the same names in memory and in files 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import as_tensor
 from mirror_ppl.domains import Domain
-from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.errors import MOST_CHARACTERS, DemonstrationsError, is_name, shown
 
 TOLD = "told_"
 """Prefix of what was communicated through a modality."""
@@ -21,6 +24,10 @@ TRUTH = "truth_"
 """Prefix of the true value of an implant."""
 NO_INDEX = -1
 """Stands for the actions and scenarios of padding, and for scenarios that are unknown."""
+ROUNDING = 1e-3
+"""By how much an entropy may be out of its range."""
+A_NAME = f"printable text of at most {MOST_CHARACTERS} characters"
+"""What ids and names of truths have to be."""
 
 
 def variable_dimensions(domain: Domain) -> dict[str, tuple[str, ...]]:
@@ -58,15 +65,16 @@ def dimension_labels(domain: Domain) -> dict[str, tuple[str, ...]]:
 
 
 def checked(
-    domain: Domain, people: Sequence[str], variables: Mapping[str, Tensor]
+    domain: Domain, people: Sequence[str], variables: Mapping[str, Any]
 ) -> dict[str, Tensor]:
     """Check a recording and bring it into its one form.
 
     Args:
         domain: where it was made.
         people: ids of the P people.
-        variables: arrays by name, of any numeric dtype: ``round_count``, ``length``, what
-            `required_variables` lists, and any of the others.
+        variables: arrays by name, tensors or what `mirror_ppl.checks.as_tensor` takes, of any
+            numeric dtype: ``round_count``, ``length``, what `required_variables` lists, and any of
+            the others.
 
     Returns:
         Copies on the device of ``action``. Numbers are in torch's default dtype and NaN in padding;
@@ -80,12 +88,13 @@ def checked(
     dimensions = variable_dimensions(domain)
     dimensions |= {name: ("person",) for name in variables if name.startswith(TRUTH)}
     places = _Places(tuple(people), dimensions, dimension_labels(domain))
-    sizes = places.sizes(variables["action"])
-    device = variables["action"].device
+    action = as_tensor(variables["action"], "action", DemonstrationsError)
+    sizes = places.sizes(action)
+    device = action.device
     given: dict[str, Tensor] = {}
     for name, value in variables.items():
-        places.check_shape(name, value, sizes)
-        given[name] = value.detach().to(device)
+        given[name] = as_tensor(value, name, DemonstrationsError).to(device)
+        places.check_shape(name, given[name], sizes)
 
     counts = places.whole("round_count", given, None, 0, sizes["round"])
     lengths = places.whole("length", given, None, 0, sizes["step"])
@@ -108,6 +117,8 @@ def checked(
             continue
         if name.startswith(TRUTH):
             result[name] = value.to(dtype, copy=True)
+            expected = "a finite number, or nan if unknown"
+            places.refuse(name, result[name].isinf(), result[name], expected)
             continue
         inside = real[next(key for key in reversed(dimensions[name]) if key in real)]
         if name == "action":
@@ -121,6 +132,8 @@ def checked(
             result[name] = scenarios.masked_fill(~inside, NO_INDEX)
         elif name.startswith(TOLD):
             result[name] = places.whole(name, given, inside, 0, 1).bool()
+        elif name == "action_entropy":
+            result[name] = places.entropies(name, value.to(dtype), inside, len(domain.actions))
         else:
             result[name] = places.numbers(name, value.to(dtype), inside)
     return result
@@ -131,8 +144,8 @@ def _check_people(people: Sequence[str]) -> None:
         raise DemonstrationsError("there is nobody in it, expected at least one person")
     seen = set()
     for person in people:
-        if not isinstance(person, str) or not person or not person.isprintable():
-            raise DemonstrationsError(f"person's id is {person!r}, expected printable text")
+        if not is_name(person):
+            raise DemonstrationsError(f"person's id is {shown(person)}, expected {A_NAME}")
         if person in seen:
             raise DemonstrationsError(f"two people have the id {person!r}, expected unique ids")
         seen.add(person)
@@ -202,10 +215,15 @@ class _Places:
     def numbers(self, name: str, value: Tensor, inside: Tensor) -> Tensor:
         """Finite numbers; outside of ``inside`` anything goes and becomes NaN."""
         inside = _over_items(inside, value)
-        if name == "action_entropy":
-            self.refuse(name, inside & value.isinf(), value, "a finite number, or nan if unknown")
-        else:
-            self.refuse(name, inside & ~value.isfinite(), value, "a finite number")
+        self.refuse(name, inside & ~value.isfinite(), value, "a finite number")
+        return value.masked_fill(~inside, torch.nan)
+
+    def entropies(self, name: str, value: Tensor, inside: Tensor, actions: int) -> Tensor:
+        """Entropies in nats of a choice among so many actions, or NaN; outside they become NaN."""
+        most = math.log(actions)
+        possible = (value >= -ROUNDING) & (value <= most + ROUNDING)
+        expected = f"from 0 to {most:.4g} (log of {actions} actions), or nan if unknown"
+        self.refuse(name, inside & ~possible & ~value.isnan(), value, expected)
         return value.masked_fill(~inside, torch.nan)
 
 

@@ -312,7 +312,7 @@ def require_known(name: str, kind: str, known: Sequence[str], where: str = "") -
     Raises:
         UnknownNameError: listing the known names.
     """
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         raise UnknownNameError.of(kind, name, known, where)
     return name
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl import __version__
+from mirror_ppl.checks import as_path, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
@@ -22,7 +23,8 @@ from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.pooling import Pooling, Population
 from mirror_ppl.inference.predictive import predict_actions
-from mirror_ppl.inference.prior import draw_prior
+from mirror_ppl.inference.prior import checked_draws, draw_prior
+from mirror_ppl.inference.recorded import check_rounds
 from mirror_ppl.inference.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.inference.views import build_view_table
@@ -75,12 +77,15 @@ def split_rounds(
         Training rounds, and the held-out ones or ``None`` if none are left.
 
     Raises:
+        InputError: these are no demonstrations, or no number of rounds.
         DemonstrationsError: there are fewer rounds than asked for.
     """
+    require_kind(demonstrations, Demonstrations, "demonstrations")
     rounds = int(demonstrations.round_counts.max())
     paper = rounds >= TEST_ROUNDS.stop
     if train_rounds is None:
         train_rounds = TRAIN_ROUNDS if paper else max(1, -(-3 * rounds // 4))
+    train_rounds = whole_number(train_rounds, "train_rounds")
     if not 0 <= train_rounds <= rounds:
         raise DemonstrationsError(f"cannot train on {train_rounds} of {rounds} rounds")
     paper = paper and train_rounds <= TEST_ROUNDS.start
@@ -98,7 +103,14 @@ def predict_rounds(
         human: the model of people.
         rounds: of P people.
         draws: of their implants ``[S, P, 1, ...]``.
+
+    Raises:
+        InputError: the rounds are of another domain, or the draws are none of these people.
+        DemonstrationsError: the rounds cannot be in the domain's world.
+        HumanModelError: the draws are not those of the model's sites.
     """
+    check_rounds(human, rounds)
+    draws = checked_draws(human, draws, rounds.num_people)
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     # Only what some draw sees is looked at: exact views, without screening or merging.
     candidates = [
@@ -135,12 +147,17 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         population: that the people are from, if it is known from others.
 
     Raises:
-        DemonstrationsError: there are too few rounds, or they cannot be of the domain's world (see
+        InputError: an argument of another kind, or rounds of another domain.
+        DemonstrationsError: too few rounds, or rounds that cannot be in the domain's world (see
             :func:`mirror_ppl.data.contradictions.check_world`).
         HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
         CheckpointError: the checkpoint is damaged or of another run.
     """
+    check_rounds(human, demonstrations)
+    require_kind(options, InferenceOptions, "options")
     contradictions = check_world(demonstrations, options.allow_contradictions)
+    seed = seed_number(seed)
+    checkpoint = None if checkpoint is None else as_path(checkpoint, "checkpoint")
     train, test = split_rounds(demonstrations, train_rounds)
     people = train.num_people
     human.learn_world(train)

@@ -25,13 +25,16 @@ from torch import Tensor
 
 from mirror_ppl import __version__
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
+from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.data.contradictions import check_world
+from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.nuts import sample_nuts
 from mirror_ppl.inference.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.inference.prior import Draws, sample_sites
+from mirror_ppl.inference.recorded import check_rounds
 from mirror_ppl.inference.second_look import LIKELY_DRAWS, looks_twice, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
@@ -100,14 +103,10 @@ class InferenceOptions:
             raise UnknownNameError.of("guide", self.guide, GUIDES)
         if self.pooling not in POOLINGS:
             raise UnknownNameError.of("pooling", self.pooling, POOLINGS)
-        if self.draws < 1:
-            raise ValueError(f"draws must be at least 1, not {self.draws}")
-        if not 0 <= self.allow_contradictions <= 1:
-            raise ValueError(
-                f"allow_contradictions must be from 0 to 1, not {self.allow_contradictions}"
-            )
-        if self.refine < 0:
-            raise ValueError(f"refine must be at least 0, not {self.refine}")
+        object.__setattr__(self, "draws", whole_number(self.draws, "draws", 1))
+        object.__setattr__(self, "refine", whole_number(self.refine, "refine", 0))
+        share = real_number(self.allow_contradictions, "allow_contradictions", 0, 1)
+        object.__setattr__(self, "allow_contradictions", share)
         if self.refine and self.guide not in ("amortized", "exact"):
             raise ValueError(f"refining starts at what amortized or exact found, not {self.guide}")
 
@@ -139,12 +138,27 @@ def infer(
     Raises:
         HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
         CheckpointError: the checkpoint is damaged or of another run.
-        ValueError: people are to be pooled whose population is known.
+        InputError: an argument of another kind, rounds of another domain, no network of the
+            amortized guide, or people are to be pooled whose population is known.
+        DemonstrationsError: the rounds cannot be in the domain's world.
     """
+    check_rounds(human, demonstrations)
+    require_kind(options, InferenceOptions, "options")
+    check_world(demonstrations, options.allow_contradictions)
+    seed = seed_number(seed)
+    if network is not None:
+        require_kind(network, AmortizedGuide, "network")
+    if population is not None:
+        require_kind(population, Population, "population")
+    if checkpoint is not None:
+        checkpoint = as_path(checkpoint[0], "checkpoint"), checkpoint[1]
     if options.pooling == "none" and population is None:
         return _each(human, demonstrations, options, seed, network, report, checkpoint)
     if options.pooling != "none" and population is not None:
-        raise ValueError("people from a known population are not pooled")
+        raise InputError(
+            f"people from a known population are not pooled: pooling must be none, not "
+            f"{options.pooling}"
+        )
     many = replace(options, draws=max(options.draws, OWN_DRAWS[options.guide]))
     own = _each(human, demonstrations, many, seed, network, report, checkpoint)
     pooling = Pooling(human)
@@ -169,7 +183,7 @@ def _each(
         if options.guide == "exact":
             network = None
         elif network is None:
-            raise ValueError("the amortized guide needs its network")
+            raise InputError("the amortized guide needs its network, not None; see load_guide")
         found = _by_importance(human, demonstrations, options, seed, network, report, checkpoint)
         if not options.refine:
             return found

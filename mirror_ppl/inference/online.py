@@ -7,10 +7,14 @@ from time import monotonic
 
 import torch
 
+from mirror_ppl.checks import real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.data.contradictions import check_world
+from mirror_ppl.errors import InputError
 from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.prior import Draws, sample_sites
+from mirror_ppl.inference.recorded import check_rounds
 from mirror_ppl.inference.sampler import Weighted, scalar_sites
 from mirror_ppl.inference.second_look import Round, looks_twice, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
@@ -29,8 +33,11 @@ class OnlinePosterior:
         network: a trained guide (see :func:`mirror_ppl.inference.guide_file.load_guide`); without,
             draws are those of ``exact``, which takes longer at each asking.
         seed: of everything random. The same rounds in the same order give the same draws.
+        allow_contradictions: share of the steps that are added at once, from 0 to 1, that may
+            contradict the next observation.
 
     Raises:
+        InputError: one of these is of another kind.
         HumanModelError: what people see cannot be marginalized, or reaches their actions otherwise
             than through beliefs.
 
@@ -41,11 +48,16 @@ class OnlinePosterior:
     """
 
     def __init__(
-        self, human: HumanModel, network: AmortizedGuide | None = None, seed: int = 0
+        self,
+        human: HumanModel,
+        network: AmortizedGuide | None = None,
+        seed: int = 0,
+        allow_contradictions: float = 0.0,
     ) -> None:
-        self.human = human
-        self.network = network
-        self.seed = seed
+        self.human = require_kind(human, HumanModel, "human")
+        self.network = None if network is None else require_kind(network, AmortizedGuide, "network")
+        self.seed = seed_number(seed)
+        self.allow_contradictions = real_number(allow_contradictions, "allow_contradictions", 0, 1)
         self._rounds: list[Round] = []
         self.pareto_k = float("nan")
         self.seconds = 0.0, 0.0
@@ -67,14 +79,11 @@ class OnlinePosterior:
             demonstrations: of one person, of any number of rounds.
 
         Raises:
-            ValueError: they are of more than one person, or of another domain.
+            InputError: they are no demonstrations, of more than one person, or of another domain.
+            DemonstrationsError: they cannot be in the domain's world.
         """
-        if demonstrations.domain != self.human.domain.name:
-            raise ValueError(
-                f"the rounds are of {demonstrations.domain}, not of {self.human.domain.name}"
-            )
-        if demonstrations.num_people != 1:
-            raise ValueError(f"the rounds are of {demonstrations.num_people} people, not one")
+        check_rounds(self.human, demonstrations, people=1)
+        check_world(demonstrations, self.allow_contradictions)
         began = monotonic()
         if int(demonstrations.round_counts[0]):
             for one_round in rounds_of(demonstrations, 0):
@@ -86,10 +95,14 @@ class OnlinePosterior:
         """Posterior draws ``[S, 1, 1, ...]`` of all sites, as ``Person`` takes them.
 
         Raises:
-            ValueError: there was no round yet; see :func:`mirror_ppl.inference.prior.draw_prior`.
+            InputError: the number is none, or there was no round yet; see
+                :func:`mirror_ppl.inference.prior.draw_prior`.
         """
+        number = whole_number(number, "number", 1)
         if not self.rounds:
-            raise ValueError("there was no round yet; what is known is the prior")
+            raise InputError(
+                "there was no round yet; what is known is the prior: expected one round or more"
+            )
         began = monotonic()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed * 1_000_003 + self.rounds)

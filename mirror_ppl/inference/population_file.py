@@ -15,6 +15,7 @@ import numpy as np
 import torch
 import xarray as xr
 
+from mirror_ppl.checks import as_path
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.export import az, in_units, is_reach
 from mirror_ppl.inference.pooling import Pooling, Population
@@ -82,6 +83,7 @@ def load_population(path: Path, pooling: Pooling, setting: str | None = None) ->
         PosteriorError: the file is missing or damaged, holds no population, or is of another human
             model, self-model, version of the domain or setting.
     """
+    path = as_path(path)
     group = read_results(path, "population")["population"]
     attributes = {str(key): str(value) for key, value in group.attrs.items()}
     check_origin(path, attributes, pooling.human)

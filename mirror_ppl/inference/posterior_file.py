@@ -11,6 +11,7 @@ import torch
 import xarray as xr
 from torch import Tensor
 
+from mirror_ppl.checks import as_path, require_kind, whole_number
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.export import is_reach
@@ -47,10 +48,12 @@ class PosteriorFile:
         Raises:
             PosteriorError: the posterior is of another human model, self-model or version of the
                 domain, holds fewer draws than asked for, or values that cannot be.
+            InputError: the human model or the number is something else.
         """
+        require_kind(human, HumanModel, "human")
         check_origin(self.path, self.attributes, human)
         held = len(next(iter(self.values.values())))
-        number = held if number is None else number
+        number = held if number is None else whole_number(number, "number", 0)
         if number > held:
             raise PosteriorError(f"{self.path}: holds {held} draws, not {number}")
         chosen = np.linspace(0, held - 1, number).round().astype(int)
@@ -132,6 +135,7 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
         PosteriorError: the file is missing or damaged, holds no draws, or is of another domain.
         UnknownNameError: it is of a domain that there is not.
     """
+    path = as_path(path)
     group = read_results(path, "posterior")["posterior"]
     try:
         attributes = {str(name): str(value) for name, value in group.attrs.items()}

@@ -10,7 +10,10 @@ import pyro
 import torch
 from pyro import poutine
 from torch import Tensor
+from torch.distributions.constraints import Constraint
 
+from mirror_ppl.checks import as_tensor, require_kind, seed_number, whole_number
+from mirror_ppl.errors import HumanModelError, InputError, shown
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
 
@@ -63,7 +66,89 @@ def values_of(nodes: Mapping[str, Any]) -> Draws:
 
 
 def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
-    """Draws ``[S, P, 1, ...]`` of the prior of all sites, in the order of the program."""
+    """Draws ``[S, P, 1, ...]`` of the prior of all sites, in the order of the program.
+
+    Args:
+        human: the model of people.
+        people: number of people P.
+        number: number of draws S of each.
+        seed: of everything random.
+
+    Raises:
+        InputError: one of them is something else; there have to be a person and a draw.
+    """
+    require_kind(human, HumanModel, "human")
+    people, number = whole_number(people, "people", 1), whole_number(number, "number", 1)
+    seed = seed_number(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return values_of(sample_sites(human, people, number))
+
+
+@torch.no_grad()
+def checked_draws(human: HumanModel, draws: Any, people: int) -> Draws:
+    """Draws as the human model samples them, on its device.
+
+    Args:
+        human: the model of people.
+        draws: tensors, numpy arrays or lists ``[S, P, 1, ...]`` by site.
+        people: number of people P that they have to be of.
+
+    Raises:
+        InputError: they are no such arrays, of another number of people, or have values that the
+            human model rules out.
+        HumanModelError: there are none, or they are not those of the model's sites.
+    """
+    if not isinstance(draws, Mapping):
+        raise InputError(f"draws must be a dict of arrays by site, not {shown(draws)}")
+    with torch.random.fork_rng(devices=[]):
+        sites = sample_sites(human, people)
+    if missing := [name for name in sites if name not in draws]:
+        raise HumanModelError(f"there are no draws of the site {', '.join(missing)}")
+    if more := [shown(name) for name in draws if name not in sites]:
+        raise HumanModelError(
+            f"there are draws of {', '.join(more)}, expected those of the sites {', '.join(sites)}"
+        )
+    given = {name: as_tensor(draws[name], f'"{name}"') for name in sites}
+    number = next((len(value) for value in given.values() if value.dim()), 0)
+    own = {}
+    for name, value in given.items():
+        example = sites[name]["value"]
+        expected = (number, people, 1, *sites[name]["fn"].event_shape)
+        if value.dim() > 1 and value.shape[1] != people:
+            raise InputError(f'draws of "{name}" are of {value.shape[1]} people, expected {people}')
+        if tuple(value.shape) != expected:
+            raise InputError(
+                f'draws of "{name}" have shape {tuple(value.shape)}, expected {expected}: draws, '
+                "people, 1, and those of the site"
+            )
+        own[name] = value.to(example.device, example.dtype)
+        changed = own[name] != value.to(example.device)
+        if not example.is_floating_point() and changed.any():
+            raise InputError(
+                f'draws of "{name}" have {value[changed.to(value.device)][0]:g}, expected whole '
+                "numbers"
+            )
+    if number == 0:
+        return own
+    # Under these draws, for what a site can be may hang on others.
+    nodes = sample_sites(human, people, number, own)
+    for name, value in own.items():
+        possible = _possible(nodes[name]["fn"].support, value)
+        infinite = ~value.isfinite()
+        if infinite.any() or not possible.all():
+            bad = infinite if infinite.any() else ~possible
+            raise InputError(
+                f'draws of "{name}" have {value[bad].flatten()[0]:g}, expected only what the human '
+                "model can sample"
+            )
+    return own
+
+
+def _possible(support: Constraint, value: Tensor) -> Tensor:
+    """Whether values can be sampled, or are the limit of such, as a consistency of 0 is."""
+    possible = support.check(value)
+    if value.is_floating_point():
+        for limit in (torch.inf, -torch.inf):
+            possible = possible | support.check(value.nextafter(torch.full_like(value, limit)))
+    return possible

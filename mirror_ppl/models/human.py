@@ -32,6 +32,7 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
+from mirror_ppl.checks import require_kind
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
@@ -52,7 +53,7 @@ class HumanModel(nn.Module):
     """The probabilistic model of people.
 
     Args:
-        self_model: the robot's networks; they are frozen here.
+        self_model: the robot's networks; they are frozen here. Anything else is an `InputError`.
 
     Batch dimensions of implants are ``[..., P, 1]``: people at -2, and -1 left for their rounds or
     views. Weights and the like follow as event dimensions.
@@ -77,6 +78,7 @@ class HumanModel(nn.Module):
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__()
+        require_kind(self_model, SelfModel, "self_model")
         self.self_model = self_model.eval().requires_grad_(False)
 
     @property

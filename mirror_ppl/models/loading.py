@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from collections.abc import Mapping
 from difflib import get_close_matches
@@ -13,6 +14,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from mirror_ppl.checks import require_kind
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.searcher import Searcher
@@ -52,7 +54,9 @@ def file_of(specification: str | None) -> Path | None:
     return Path(specification.rpartition(":")[0])
 
 
-def load_human_model(specification: str | None, self_model: SelfModel) -> HumanModel:
+def load_human_model(
+    specification: str | os.PathLike[str] | None, self_model: SelfModel
+) -> HumanModel:
     """Make a human model.
 
     Args:
@@ -63,7 +67,12 @@ def load_human_model(specification: str | None, self_model: SelfModel) -> HumanM
     Raises:
         HumanModelError: the file or class is missing, does not import, or is not a human model.
     """
+    if isinstance(specification, os.PathLike):
+        specification = os.fspath(specification)
+    if specification is not None:
+        require_kind(specification, str, "specification")
     if specification is None or specification in VARIANTS:
+        require_kind(self_model, SelfModel, "self_model")
         name = specification or MIRROR
         return OWN.get(self_model.domain.name, {}).get(name, VARIANTS[name])(self_model)
     path_text, colon, name = specification.rpartition(":")

@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from mirror_ppl.checks import as_path
 from mirror_ppl.data import asset_path
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, MirrorError
@@ -81,6 +82,7 @@ def read_tensors(path: Path, kinds: Mapping[str, str]) -> tuple[dict[str, str], 
     Raises:
         AssetError: the file is missing or damaged, or something else.
     """
+    path = as_path(path)
     content = read_whole(path, AssetError)
     try:
         tensors = load(content)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import torch
 
+from mirror_ppl.checks import real_number, seed_number, whole_number
+from mirror_ppl.console import usable_device
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
@@ -63,9 +65,11 @@ def simulated_people(
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
+        InputError: fewer than one person, or no seed.
     """
     own = PEOPLE[require_known(domain, "domain", tuple(PEOPLE))]
     require_known(population, "population", own.populations, domain)
+    people, seed = whole_number(people, "people", 1), seed_number(seed)
     return own.simulated(setting, population, people, seed, device)
 
 
@@ -106,15 +110,13 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
         ``notices_...`` for each terminal (probability of finding it at a step).
 
     Raises:
-        UnknownNameError: there is no such domain, setting or population.
-        ValueError: fewer than one person or round, or ``told`` is no probability.
+        UnknownNameError: there is no such domain, setting, population or device.
+        InputError: fewer than one person or round, no seed, or ``told`` is no probability.
     """
     setting = get_domain(domain).settings[-1] if setting is None else setting
-    for name, number in (("people", people), ("rounds", rounds)):
-        if number < 1:
-            raise ValueError(f"{name} must be at least 1, not {number}")
-    if not 0 <= told <= 1:
-        raise ValueError(f"told must be from 0 to 1, not {told}")
+    people, rounds = whole_number(people, "people", 1), whole_number(rounds, "rounds", 1)
+    seed, told = seed_number(seed), real_number(told, "told", 0, 1)
+    usable_device(str(device))
     own = simulated_people(domain, setting, population, people, seed, device)
     return recorded(own, setting, population, rounds, seed, device, progress, told)
 
