@@ -50,7 +50,8 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
             pyro.plate("person", table.people, dim=-PLATES),
         ):
             implants = human.prior()
-            sight = table.sight_of(implants).expand(table.people, table.rounds)
+            # Rounds that a person does not have are as their first view, whoever else is there.
+            sight = table.sight_of(implants).clamp(min=0).expand(table.people, table.rounds)
             if table.attention is not None:
                 results.append(_attentive(human, implants, table, table.attention, sight))
                 continue
