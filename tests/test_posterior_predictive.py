@@ -56,6 +56,18 @@ def draws(human):
     return draw_prior(human, PEOPLE, 6, 1), draw_prior(human, PEOPLE, 4, 2)
 
 
+@pytest.fixture(scope="module")
+def learned(human, train, draws):
+    """Log-probabilities of all people's actions at once."""
+    return predict_rounds(human, train, draws[0])
+
+
+@pytest.fixture(scope="module")
+def whole(human, train, test, draws):
+    """Predictions of all people at once."""
+    return predict_people(human, (train, test), draws, 3)
+
+
 @pytest.mark.parametrize(
     ("people", "ends"), [(1, [1]), (2, [2]), (3, [3]), (4, [4]), (5, [3, 5]), (7, [3, 7])]
 )
@@ -66,10 +78,9 @@ def test_a_person_who_is_left_over_joins_the_last_group(monkeypatch, people, end
     assert [some.stop for some in groups] == ends
 
 
-def test_groups_predict_as_all_people_at_once(monkeypatch, human, train, draws):
+def test_groups_predict_as_all_people_at_once(monkeypatch, human, train, draws, learned):
     """Bit for bit, in the padding too, and with the views of no more people in memory."""
-    whole = predict_rounds(human, train, draws[0])
-    assert whole.shape == (6, PEOPLE, 4, 15, 2)
+    assert learned.shape == (6, PEOPLE, 4, 15, 2)
     built, build = [], posterior_predictive.build_view_table
 
     def spy(human, rounds, *args, **kwargs):
@@ -78,7 +89,7 @@ def test_groups_predict_as_all_people_at_once(monkeypatch, human, train, draws):
 
     monkeypatch.setattr(posterior_predictive, "build_view_table", spy)
     monkeypatch.setattr(posterior_predictive, "PEOPLE_AT_ONCE", AT_ONCE)
-    assert torch.equal(predict_rounds(human, train, draws[0]), whole)
+    assert torch.equal(predict_rounds(human, train, draws[0]), learned)
     assert built == [8, 2]
 
 
@@ -96,13 +107,15 @@ def test_groups_predict_as_all_people_at_once_where_attention_differs(
     torch.testing.assert_close(found[mask], whole[mask], rtol=1e-5, atol=1e-5)
 
 
-def test_results_of_groups_are_those_of_all_people_at_once(monkeypatch, human, train, test, draws):
-    whole = predict_people(human, (train, test), draws, 3)
-    learned, held_out = (predict_rounds(human, rounds, draws[0]) for rounds in (train, test))
+def test_results_are_of_these_predictions(human, train, test, draws, learned, whole):
+    held_out = predict_rounds(human, test, draws[0])
     assert torch.equal(whole.log_likelihood, chosen_log_probability(learned, train).sum(-1))
     assert torch.equal(whole.held_out, held_out.exp())
     assert whole.scores == score(held_out, test)
     assert whole.posterior.shape == (6, PEOPLE, 4, 15) and whole.prior.shape == (4, PEOPLE, 4, 15)
+
+
+def test_results_of_groups_are_those_of_all_people(monkeypatch, human, train, test, draws, whole):
     reports = []
     monkeypatch.setattr(posterior_predictive, "PEOPLE_AT_ONCE", AT_ONCE)
     found = predict_people(human, (train, test), draws, 3, lambda *told: reports.append(told))
@@ -112,21 +125,13 @@ def test_results_of_groups_are_those_of_all_people_at_once(monkeypatch, human, t
     assert reports == [("predict", done, PEOPLE, "people") for done in (0, 8, 10)]
 
 
-def test_nothing_held_out_is_not_predicted(human, train, draws):
-    found = predict_people(human, (train, None), draws, 3)
+def test_predictive_draws_do_not_depend_on_other_people(human, train, draws, whole):
+    alone = train.select_people([0, 1])
+    some = tuple({name: value[:, :2] for name, value in own.items()} for own in draws)
+    found = predict_people(human, (alone, None), some, 3)
     assert found.held_out is None and found.scores is None
-
-
-def test_predictive_draws_do_not_depend_on_other_people(human, train, draws):
-    alone = train.select_people([0, 1, 2])
-    some = tuple({name: value[:, :3] for name, value in own.items()} for own in draws)
-    found, whole = (
-        predict_people(human, (rounds, None), own, 3)
-        for rounds, own in ((alone, some), (train, draws))
-    )
-    for group in ("posterior", "prior"):
-        mask = alone.mask
-        assert torch.equal(getattr(found, group)[:, mask], getattr(whole, group)[:, :3][:, mask])
+    assert torch.equal(found.posterior, whole.posterior[:, :2])
+    assert torch.equal(found.prior, whole.prior[:, :2])
     again = predict_people(human, (alone, None), some, 4)
     assert not torch.equal(again.posterior, found.posterior)
 
