@@ -39,8 +39,8 @@ from mirror_ppl.evaluation.study_report import difference
 from mirror_ppl.evaluation.study_summary import paired
 from mirror_ppl.evaluation.tables import TextTable, page
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.fitting import predict_rounds
 from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.posterior_predictive import predict_rounds
 from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
 from mirror_ppl.inference.summary import predictive, score
 from mirror_ppl.models.distributions import GaussianChain

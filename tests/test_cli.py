@@ -29,7 +29,7 @@ from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.evaluation import self_model as evaluation
 from mirror_ppl.inference.export import in_units
 from mirror_ppl.inference.fitting import split_rounds
-from mirror_ppl.inference.summary import summarize
+from mirror_ppl.inference.summary import score, summarize
 from mirror_ppl.models.weights import load_self_model
 
 RESULTS = {"open.png", "posterior.nc", "samples.png", "sight.png", "summary.json"}
@@ -504,7 +504,7 @@ def test_summary_by_hand():
     # Two draws: of the actions 1 and 0, probabilities 0.9 and 0.2, or 0.5 and 0.6.
     chances = torch.tensor([[[0.1, 0.9], [0.2, 0.8]], [[0.5, 0.5], [0.6, 0.4]]])
     log_probabilities = chances.log()[:, None, None].expand(2, 2, 1, 2, 2)
-    first, second = summarize(draws, train, test, {"test": log_probabilities})
+    first, second = summarize(draws, train, score(log_probabilities, test))
     assert first["id"] == "a"
     assert (first["rounds"], second["rounds"]) == (1, 1)
     assert first["implants"] == {"bias": {"median": 9.0, "q05": 0.0, "q95": 18.0, "truth": 0.25}}
@@ -516,9 +516,9 @@ def test_summary_by_hand():
     assert first["test"]["accuracy"] == 0.5
     assert first["test"]["floor"] == pytest.approx(0.3)
     assert second["test"] is None
-    assert summarize(draws, train, None, {})[0]["test"] is None
+    assert summarize(draws, train, None)[0]["test"] is None
     unknown = Demonstrations(**given | {"action_entropy": None})
-    assert summarize(draws, train, unknown, {"test": log_probabilities})[0]["test"]["floor"] is None
+    assert score(log_probabilities, unknown)[0]["floor"] is None
 
 
 def test_bins_are_told_in_cells():

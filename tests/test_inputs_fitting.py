@@ -11,13 +11,14 @@ from example_recordings import RAGGED, fields
 from refused import refused
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.inference.fitting import fit_people, predict_rounds, split_rounds
+from mirror_ppl.inference.fitting import fit_people, split_rounds
 from mirror_ppl.inference.guide_file import load_guide, shipped_guide
 from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.inference.pooling import Pooling
 from mirror_ppl.inference.population_file import load_population
 from mirror_ppl.inference.posterior_file import PosteriorFile, load_posterior
+from mirror_ppl.inference.posterior_predictive import predict_rounds
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model

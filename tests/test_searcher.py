@@ -403,7 +403,7 @@ def test_of_rules_the_most_probable_one_is_told():
         "rule_type_b": torch.tensor([[9], [9], [9], [2]]),
         "lapse": torch.tensor([[0.1], [0.2], [0.3], [0.4]]),
     }
-    (person,) = summarize(draws, train, None, {}, human.value_names)
+    (person,) = summarize(draws, train, None, human.value_names)
     assert person["implants"]["rule_type_b"] == {
         "most_probable": names[9], "probability": 0.75, "truth": None
     }  # fmt: skip

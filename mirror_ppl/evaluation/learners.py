@@ -31,10 +31,10 @@ from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, listeners
-from mirror_ppl.inference.fitting import predict_rounds
 from mirror_ppl.inference.guide_file import network_for
 from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.pooling import Population
+from mirror_ppl.inference.posterior_predictive import predict_rounds
 from mirror_ppl.inference.summary import predictive
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model

@@ -30,6 +30,7 @@ from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.identifiability import Identifiability
+from mirror_ppl.inference.posterior_predictive import Predictions
 from mirror_ppl.models.implants import SIGHT
 
 with warnings.catch_warnings():
@@ -57,9 +58,8 @@ def to_inference_data(
     test: Demonstrations | None,
     posterior: Mapping[str, Tensor],
     prior: Mapping[str, Tensor],
-    predicted: Mapping[str, Tensor],
+    predicted: Predictions,
     attributes: Mapping[str, str | int | float],
-    generator: torch.Generator,
 ) -> az.InferenceData:
     """Collect everything about a fit.
 
@@ -68,34 +68,25 @@ def to_inference_data(
         test: held-out rounds, if there are any.
         posterior: draws ``[S, P, 1, ...]``.
         prior: draws ``[S', P, 1, ...]``.
-        predicted: log-probabilities of actions ``[S, P, B, T, A]``: ``"posterior"`` and
-            ``"prior"`` of the training rounds, ``"test"`` of the held-out rounds under the
-            posterior.
+        predicted: actions.
         attributes: what the file should say of itself.
-        generator: source of the predictive draws.
     """
     domain = get_domain(train.domain)
 
     def group(values: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
         return {name: value.numpy()[None] for name, value in values.items()}
 
-    def drawn(log_probabilities: Tensor) -> dict[str, np.ndarray]:
-        flat = log_probabilities.exp().flatten(0, -2)
-        action = torch.multinomial(flat, 1, generator=generator)
-        return {"action": action.reshape(1, *log_probabilities.shape[:-1]).numpy().astype("int8")}
-
-    chosen = chosen_log_probability(predicted["posterior"], train)
     held_out = {}
-    if test is not None:
-        held_out["predictions"] = {"action_probability": predicted["test"].exp().numpy()[None]}
+    if test is not None and predicted.held_out is not None:
+        held_out["predictions"] = group({"action_probability": predicted.held_out})
         held_out["predictions_constant_data"] = _constants(test)
     data = az.from_dict(
         posterior=group(in_units(domain, posterior)),
         prior=group(in_units(domain, prior)),
-        posterior_predictive=drawn(predicted["posterior"]),
-        prior_predictive=drawn(predicted["prior"]),
+        posterior_predictive=group({"action": predicted.posterior}),
+        prior_predictive=group({"action": predicted.prior}),
         observed_data={"action": train.actions.numpy().astype("int8")},
-        log_likelihood={"action": chosen.sum(-1).numpy()[None]},
+        log_likelihood=group({"action": predicted.log_likelihood}),
         constant_data=_constants(train),
         **held_out,
         coords={
@@ -152,13 +143,6 @@ def add_identifiability(
     for name in group.data_vars:
         group[name].attrs["units"] = "nats"
     data.add_groups({"identifiability": group})
-
-
-def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) -> Tensor:
-    """Log-probability ``[S, P, B, T]`` of what was done; 0 in padding."""
-    actions = rounds.actions.clamp(min=0).expand(log_probabilities.shape[:-1])
-    chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
-    return torch.where(rounds.mask, chosen, 0.0)
 
 
 def save_inference_data(data: az.InferenceData, path: Path) -> None:

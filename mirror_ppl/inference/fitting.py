@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import torch
-from torch import Tensor
 
 from mirror_ppl import __version__
 from mirror_ppl.checks import as_path, require_kind, seed_number, whole_number
@@ -19,25 +15,20 @@ from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.amortized import AmortizedGuide
-from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.pooling import Pooling, Population
-from mirror_ppl.inference.predictive import predict_actions
-from mirror_ppl.inference.prior import checked_draws, draw_prior
+from mirror_ppl.inference.posterior_predictive import predict_people
+from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.recorded import check_rounds
 from mirror_ppl.inference.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.svi import Report, silent
-from mirror_ppl.inference.views import build_view_table
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import combination_number
 from mirror_ppl.models.weights import fingerprint
 
 if TYPE_CHECKING:
     import arviz as az
 
 PRIOR_DRAWS = 100
-PREDICTED_VALUES = 128
-"""Values of attention that predictions average over, where it differs from round to round."""
 TRAIN_ROUNDS, TEST_ROUNDS = 20, range(30, 36)
 """Rounds 1-20 train and 31-36 test (21-30 are for validation, 37-40 spare), counted from 0."""
 
@@ -94,34 +85,6 @@ def split_rounds(
     return train, demonstrations.select_rounds(test) if test else None
 
 
-def predict_rounds(
-    human: HumanModel, rounds: Demonstrations, draws: Mapping[str, Tensor]
-) -> Tensor:
-    """Log-probabilities ``[S, P, B, T, A]`` of actions, each given what was done before it.
-
-    Args:
-        human: the model of people.
-        rounds: of P people.
-        draws: of their implants ``[S, P, 1, ...]``.
-
-    Raises:
-        InputError: the rounds are of another domain, or the draws are none of these people.
-        DemonstrationsError: the rounds cannot be in the domain's world.
-        HumanModelError: the draws are not those of the model's sites.
-    """
-    check_rounds(human, rounds)
-    draws = checked_draws(human, draws, rounds.num_people)
-    sizes = {site: len(support) for site, support in perceived_sites(human).items()}
-    # Only what some draw sees is looked at: exact views, without screening or merging.
-    candidates = [
-        combination_number({site: draws[site][:, person, 0] for site in sizes}, sizes).unique()
-        for person in range(rounds.num_people)
-    ]
-    own = dict(draws)
-    table = build_view_table(human, rounds, candidates, likely=own, values=PREDICTED_VALUES)
-    return predict_actions(human, table, own)
-
-
 def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     human: HumanModel,
     demonstrations: Demonstrations,
@@ -167,17 +130,11 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
             checkpoint,
             run_identity(human, network, [options, population is None, _recorded(train), seed]),
         )
-    posterior = infer(human, train, options, seed, network, report, run, population)
+    # All rounds were checked together.
+    checked = replace(options, allow_contradictions=1.0)
+    posterior = infer(human, train, checked, seed, network, report, run, population)
     prior = draw_prior(human, people, PRIOR_DRAWS, seed)
-    report("predict", 0, 3, "")
-    log_probabilities = {"posterior": predict_rounds(human, train, posterior.draws).cpu()}
-    report("predict", 1, 3, "")
-    log_probabilities["prior"] = predict_rounds(human, train, prior).cpu()
-    report("predict", 2, 3, "")
-    if test is not None:
-        log_probabilities["test"] = predict_rounds(human, test, posterior.draws).cpu()
-    report("predict", 3, 3, "")
-
+    predicted = predict_people(human, (train, test), (posterior.draws, prior), seed, report)
     # Results live where everybody can read them.
     learned = train
     train, test = train.to("cpu"), None if test is None else test.to("cpu")
@@ -188,26 +145,15 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     from mirror_ppl.inference.export import in_units, to_inference_data
     from mirror_ppl.inference.population_file import add_population
 
-    domain = get_domain(train.domain)
-    attributes = {
-        "domain": domain.name,
-        "domain_version": domain.version,
-        "setting": train.setting,
-        "human_model": type(human).__name__,
-        "self_model": fingerprint(human.self_model),
-        "guide": options.guide,
-        "refined": options.refine,
-        "pooling": options.pooling if population is None else "known population",
-        "version": __version__,
-        "seed": seed,
-    } | {f"recorded_{name}": value for name, value in train.provenance.items()}
-    generator = torch.Generator().manual_seed(seed)
-    data = to_inference_data(train, test, drawn, prior, log_probabilities, attributes, generator)
+    pooling = options.pooling if population is None else "known population"
+    attributes = _attributes(human, train, options, pooling, seed)
+    data = to_inference_data(train, test, drawn, prior, predicted, attributes)
     newcomer = {}
     if posterior.population is not None:
         newcomer = add_population(data, Pooling(human), posterior.population, attributes, seed)
         newcomer = {"newcomer": summarize_newcomer(newcomer, human.value_names)}
-    found = summarize(in_units(domain, drawn), train, test, log_probabilities, human.value_names)
+    drawn = in_units(get_domain(train.domain), drawn)
+    found = summarize(drawn, train, predicted.scores, human.value_names)
     if posterior.pareto_k is not None:
         for person, value in zip(found, posterior.pareto_k.tolist(), strict=True):
             person["pareto_k"] = value if isfinite(value) else None
@@ -221,6 +167,26 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     }
     summary |= newcomer
     return Fit(learned, posterior, data, summary)
+
+
+def _attributes(
+    human: HumanModel, train: Demonstrations, options: InferenceOptions, pooling: str, seed: int
+) -> dict[str, str | int | float]:
+    """What ``posterior.nc`` and ``summary.json`` say of themselves."""
+    domain = get_domain(train.domain)
+    own = {
+        "domain": domain.name,
+        "domain_version": domain.version,
+        "setting": train.setting,
+        "human_model": type(human).__name__,
+        "self_model": fingerprint(human.self_model),
+        "guide": options.guide,
+        "refined": options.refine,
+        "pooling": pooling,
+        "version": __version__,
+        "seed": seed,
+    }
+    return own | {f"recorded_{name}": value for name, value in train.provenance.items()}
 
 
 def _recorded(train: Demonstrations) -> str:

@@ -144,7 +144,8 @@ def infer(
     """
     check_rounds(human, demonstrations)
     require_kind(options, InferenceOptions, "options")
-    check_world(demonstrations, options.allow_contradictions)
+    if options.allow_contradictions < 1:
+        check_world(demonstrations, options.allow_contradictions)
     seed = seed_number(seed)
     if network is not None:
         require_kind(network, AmortizedGuide, "network")
@@ -293,7 +294,8 @@ def _by_importance(
                 saved = monotonic()
         order = sample_sites(human, 1)
     report("infer", people, people, "people")
-    draws = {name: torch.cat([own[name] for own in done.draws], 1) for name in order}
+    # Site after site, so that draws of pooled people, which are many, are not in memory twice.
+    draws = {name: torch.cat([own.pop(name) for own in done.draws], 1) for name in order}
     return Inferred(draws, torch.tensor(done.pareto_k))
 
 

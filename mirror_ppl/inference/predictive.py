@@ -50,7 +50,8 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
             pyro.plate("person", table.people, dim=-PLATES),
         ):
             implants = human.prior()
-            sight = table.sight_of(implants).expand(table.people, table.rounds)
+            # Rounds that a person does not have are as their first view, whoever else is there.
+            sight = table.sight_of(implants).clamp(min=0).expand(table.people, table.rounds)
             if table.attention is not None:
                 results.append(_attentive(human, implants, table, table.attention, sight))
                 continue
@@ -103,25 +104,26 @@ def _chained(
     actions = each.shape[-1]
     shape = (number, table.people, table.rounds, steps, actions)
     found = each.new_full(shape, -math.log(actions))  # in padding
-    by_level = [chain.chances(chances, place) for place in range(len(chain.levels))]
-    for person, place in table.real.nonzero().tolist():
-        so_far = each.new_full((number, chain.sights), NEVER)
-        so_far.scatter_(1, sight[:, person, place, None], 0.0)
-        for level, own in zip(chain.levels, by_level, strict=True):
-            (states,) = (level.rounds[person] == place).nonzero(as_tuple=True)
-            real = level.value[person, states] != NO_VALUE  # [H, K]
-            moments = table.moments[person, level.view[person, states][real]]  # [E, T]
-            log_chance = own[:, person, states] + so_far[:, states, None]
-            log_chance = log_chance[:, real]  # [S, E]
-            now = (moments != NO_VIEW).any(0)
-            if now.any():
-                done, predicted = _along(
-                    moments[:, now], chosen[:, person], each[:, person], log_chance
-                )
-                found[:, person, place, now] = predicted
-                log_chance = log_chance + done
-            following = level.following[person, states][real]
-            so_far = _gathered(log_chance, following)
+    for person in range(table.people):
+        alone = chain.of_person(person)
+        own = chances[:, person : person + 1]
+        by_level = [alone.chances(own, level)[:, 0] for level in range(len(alone.levels))]
+        for place in table.real[person].nonzero().flatten().tolist():
+            so_far = each.new_full((number, chain.sights), NEVER)
+            so_far.scatter_(1, sight[:, person, place, None], 0.0)
+            for level, likely in zip(alone.levels, by_level, strict=True):
+                (states,) = (level.rounds[0] == place).nonzero(as_tuple=True)
+                real = level.value[0, states] != NO_VALUE  # [H, K]
+                moments = table.moments[person, level.view[0, states][real]]  # [E, T]
+                log_chance = (likely[:, states] + so_far[:, states, None])[:, real]  # [S, E]
+                now = (moments != NO_VIEW).any(0)
+                if now.any():
+                    done, predicted = _along(
+                        moments[:, now], chosen[:, person], each[:, person], log_chance
+                    )
+                    found[:, person, place, now] = predicted
+                    log_chance = log_chance + done
+                so_far = _gathered(log_chance, level.following[0, states][real])
     return found
 
 

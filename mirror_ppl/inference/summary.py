@@ -17,8 +17,7 @@ QUANTILES = {"median": 0.5, "q05": 0.05, "q95": 0.95}
 def summarize(
     draws: Mapping[str, Tensor],
     train: Demonstrations,
-    test: Demonstrations | None,
-    log_probabilities: Mapping[str, Tensor],
+    scores: Sequence[dict[str, Any] | None] | None,
     value_names: Mapping[str, Sequence[str]] | None = None,
 ) -> list[dict[str, Any]]:
     """One entry a person: ``id``, ``rounds``, ``implants`` and ``test``.
@@ -26,8 +25,7 @@ def summarize(
     Args:
         draws: posterior draws ``[S, P, ...]``; implants that are one number a person are told of.
         train: rounds that were learned from.
-        test: held-out rounds, if there are any.
-        log_probabilities: of actions ``[S, P, B, T, A]``, ``"test"`` being those of ``test``.
+        scores: of each person's held-out rounds, see :func:`score`, if there are such rounds.
         value_names: see `HumanModel.value_names`.
 
     Returns:
@@ -38,7 +36,6 @@ def summarize(
         without held-out rounds.
     """
     scalars = {name: value for name, value in draws.items() if value.dim() == 2}  # noqa: PLR2004
-    held_out = None if test is None else score(log_probabilities["test"], test)
     return [
         {
             "id": name,
@@ -48,7 +45,7 @@ def summarize(
                 | {"truth": _truth(train, site, person)}
                 for site, value in scalars.items()
             },
-            "test": None if held_out is None else held_out[person],
+            "test": None if scores is None else scores[person],
         }
         for person, name in enumerate(train.people)
     ]
@@ -71,7 +68,15 @@ def predictive(log_probabilities: Tensor) -> Tensor:
 
 
 def score(log_probabilities: Tensor, rounds: Demonstrations) -> list[dict[str, Any] | None]:
-    """Negative log-likelihood, accuracy and floor of each person's actions."""
+    """Negative log-likelihood, accuracy and floor of each person's actions.
+
+    Args:
+        log_probabilities: of actions ``[S, P, B, T, A]``.
+        rounds: of P people.
+
+    Returns:
+        One entry a person; ``None`` for those without rounds.
+    """
     mixed = predictive(log_probabilities)
     actions = rounds.actions.clamp(min=0)
     chosen = mixed.gather(-1, actions[..., None]).squeeze(-1)
