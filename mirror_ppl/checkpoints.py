@@ -43,7 +43,7 @@ def read_checkpoint(path: str | os.PathLike[str], run: Any) -> dict[str, Any]:
     whole = read_whole(path, CheckpointError)
     content, digest = whole[:-DIGEST], whole[-DIGEST:]
     if sha256(content).digest() != digest:
-        raise CheckpointError(f"{path} is not a whole checkpoint of this program; remove it")
+        raise CheckpointError(f"{path} is not a checkpoint of this program; remove it")
     found = torch.load(io.BytesIO(content), weights_only=True)
     if found["run"] != run:
         raise CheckpointError(

@@ -509,8 +509,16 @@ def test_a_file_that_is_not_there(paths, tmp_path, capsys):
     assert message.startswith(f"{tmp_path / 'posterior.nc'}: there is no such file")
 
 
-@pytest.mark.parametrize("damage", ["no netCDF", "empty", "cut off", "recordings"])
-def test_a_damaged_file(paths, tmp_path, capsys, damage):
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        ("no netCDF", "is not a netCDF file"),
+        ("empty", "is not a netCDF file"),
+        ("cut off", "is truncated or damaged ("),
+        ("recordings", "holds no posterior"),
+    ],
+)
+def test_a_damaged_file(paths, tmp_path, capsys, damage, told):
     content = {
         "no netCDF": b"this is text\nof two lines",
         "empty": b"",
@@ -520,7 +528,7 @@ def test_a_damaged_file(paths, tmp_path, capsys, damage):
     broken = tmp_path / "broken.nc"
     broken.write_bytes(content)
     message = refused(capsys, tmp_path, paths[0], broken)
-    assert message.startswith(f"{broken}: cannot be read as a posterior (")
+    assert message.startswith(f"{broken}: {told}")
 
 
 @pytest.mark.parametrize("by", ["loo", "heldout"])

@@ -162,9 +162,12 @@ def test_what_the_prior_rules_out_stays_ruled_out(toy):
     ("args", "message"),
     [
         (("--pooling", "full"), 'unknown pooling "full"; known: none, partial'),
-        (("--prior-from", "nowhere.nc"), "nowhere.nc: there is no such file; fit --pooling"),
+        (
+            ("--prior-from", "nowhere.nc"),
+            "nowhere.nc: there is no such file; python -m mirror_ppl.fit --pooling",
+        ),
         (("--prior-from", "some.nc"), "some.nc: holds no population"),
-        (("--prior-from", "toy.py"), "toy.py: cannot be read as a posterior"),
+        (("--prior-from", "toy.py"), "toy.py: is not a netCDF file"),
         (("--prior-from", "pooled/posterior.nc"), "is of human model Toy, not mirror"),
         (("--prior-from", "x.nc", "--pooling", "partial"), "leave out --pooling"),
         (("--train-rounds", "-1"), "--train-rounds must be at least 0, not -1"),

@@ -169,12 +169,19 @@ def test_a_file_that_is_not_there(tmp_path):
     assert str(error.value) == (
         f"{tmp_path / 'none.nc'}: there is no such file; python -m mirror_ppl.fit makes one"
     )
-    with pytest.raises(PosteriorError, match="there is no such file"):
+    with pytest.raises(PosteriorError, match="is not a regular file"):
         load_posterior(tmp_path)  # a folder
 
 
-@pytest.mark.parametrize("damage", ["no netCDF", "empty", "cut off"])
-def test_a_damaged_file(path, damage):
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ("no netCDF", "is not a netCDF file"),
+        ("empty", "is not a netCDF file"),
+        ("cut off", "is truncated or damaged ("),
+    ],
+)
+def test_a_damaged_file(path, damage, message):
     content = {
         "no netCDF": b"this is text",
         "empty": b"",
@@ -183,14 +190,14 @@ def test_a_damaged_file(path, damage):
     path.write_bytes(content)
     with pytest.raises(PosteriorError) as error:
         load_posterior(path)
-    assert str(error.value).startswith(f"{path}: cannot be read as a posterior (")
+    assert str(error.value).startswith(f"{path}: {message}")
 
 
 def test_a_netcdf_file_that_is_no_posterior():
     recordings = asset_path("driving_fog_paper.nc")
     with pytest.raises(
         PosteriorError,
-        match=r"driving_fog_paper.nc: cannot be read as a posterior \(it holds none; python",
+        match=r"driving_fog_paper.nc: holds no posterior; python -m mirror_ppl.fit makes one",
     ):
         load_posterior(recordings)
 

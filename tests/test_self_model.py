@@ -427,7 +427,7 @@ def test_weights_survive_a_round_trip(tmp_path):
 
 def test_damaged_weights_are_refused(tmp_path):
     path = tmp_path / "a.safetensors"
-    with pytest.raises(AssetError, match=r"a\.safetensors: cannot be read"):
+    with pytest.raises(AssetError, match=r"a\.safetensors: there is no such file"):
         load_self_model(path)
     save_self_model(SelfModel(DRIVING), path, CARD)
     content = path.read_bytes()

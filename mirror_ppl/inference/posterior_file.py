@@ -93,12 +93,13 @@ def read_results(path: Path, *groups: str) -> dict[str, xr.Dataset]:
     Raises:
         PosteriorError: the file is missing or damaged, or lacks the first of the groups.
     """
+    pooled = " --pooling partial" if groups[0] == "population" else ""
+    hint = f"python -m mirror_ppl.fit{pooled} makes one"
     if not path.exists():
-        raise PosteriorError(f"{path}: there is no such file; python -m mirror_ppl.fit makes one")
+        raise PosteriorError(f"{path}: there is no such file; {hint}")
     data = read_netcdf(path, PosteriorError, groups)
     if groups[0] not in data:
-        how = "--pooling partial makes one" if groups[0] == "population" else "makes one"
-        raise PosteriorError(f"{path}: holds no {groups[0]}; python -m mirror_ppl.fit {how}")
+        raise PosteriorError(f"{path}: holds no {groups[0]}; {hint}")
     return data
 
 

@@ -128,7 +128,7 @@ def plot_coverage(calibration: Calibration) -> Picture:
                 lw=1.5,
                 capsize=3,
             )
-        ax.set_title(fill(_name(site), 28), fontsize=11, parse_math=False)
+        ax.set_title(fill(_name(site), 28), fontsize=11)
         ax.set_xticks(place, [f"{rounds}" for rounds in coverage["rounds"].values])
         ax.set_xlim(-0.4, len(place) - 0.6)
         ax.set_ylim(max(0.0, min(lowest, 0.4)), 1.02)
@@ -172,7 +172,6 @@ def _panels(figure: Picture, calibration: Calibration) -> Iterator[tuple[Axes, n
             ha="right",
             va="center",
             fontsize=11,
-            parse_math=False,
         )
         for ax, number in zip(row, rounds, strict=True):
             if site == sites[0]:

@@ -71,7 +71,7 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
     silence = BLUE if decision.chosen == 0 else GREY
     ax.plot([0], [drawn.index(0)], "s", color=silence, ms=9, mec="white", clip_on=False, zorder=4)
     lines = ["\n".join(textwrap.wrap(name, WRAP, break_on_hyphens=False)) for name in names]
-    ax.set_yticks(place, lines, fontsize=9, parse_math=False)
+    ax.set_yticks(place, lines, fontsize=9)
     for text, colour in zip(ax.get_yticklabels(), colours, strict=True):
         if colour == BLUE:
             text.set(color=BLUE, fontweight="bold")

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from mirror_ppl.evaluation.comparison import Comparison, Score
-from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.picture import Picture, displayable, label_of
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY
 
 WRAP = 30
@@ -45,11 +45,11 @@ def plot_comparison(comparison: Comparison) -> Picture:
             if score is not None:
                 _dot(ax, score, top + distance, GREY, "o", 4.5)
         _dot(ax, model.total, top, BLUE, "D", 8)
-    ax.set_yticks(tops, names, parse_math=False)
+    ax.set_yticks(tops, [displayable(name) for name in names])
     if step == PERSON:  # else there is no room for their names
         places = [top + distance for top in tops[1:] for distance in below]
-        shown = [person[:WRAP] for person in comparison.people] * (len(models) - 1)
-        ax.set_yticks(places, shown, minor=True, fontsize=7, parse_math=False)
+        shown = [label_of(person) for person in comparison.people] * (len(models) - 1)
+        ax.set_yticks(places, shown, minor=True, fontsize=7)
     ax.set_ylim(down - GAP / 2, -GAP - LINE / 2)
     for model, top in zip(models, tops, strict=True):
         _column(ax, f"{model.total.elpd:z.4f}", top)

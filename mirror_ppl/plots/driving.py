@@ -20,7 +20,7 @@ from matplotlib.patheffects import Normal, Stroke
 
 from mirror_ppl.domains.driving import ROAD_END
 from mirror_ppl.models.implants import SIGHT
-from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLUE, TRUE, draws, of_person, people, truth
 
 if TYPE_CHECKING:
@@ -129,8 +129,8 @@ def plot_sight(data: az.InferenceData, person: str, ax: Axes | None = None) -> A
     ax.set_xticks(DISTANCES[::2], [str(abs(distance)) for distance in DISTANCES[::2]])
     ax.set_yticks([0.5, 1.5], [f"{lane} lane" for lane in LANES])
     ax.tick_params(length=0)
-    ax.set_xlabel("cells behind   $\\leftarrow$   |   $\\rightarrow$   cells ahead")
-    ax.set_title(person, loc="left", fontweight="bold", fontsize=11, parse_math=False)
+    ax.set_xlabel("cells behind   \N{LEFTWARDS ARROW}   |   \N{RIGHTWARDS ARROW}   cells ahead")
+    ax.set_title(label_of(person), loc="left", fontweight="bold", fontsize=11)
     return ax
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.patches import Patch
 
 from mirror_ppl.plots.implants import TITLES
-from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
         axes[0].barh(rows, whole, 0.75, left, color=colour, lw=0)
         axes[0].barh(rows, hanging, 0.75, left, color="none", hatch="//////", edgecolor=BLACK, lw=0)
         left = left + whole
-    axes[0].set_yticks(rows, people, parse_math=False)
+    axes[0].set_yticks(rows, [label_of(person) for person in people])
     axes[0].set_ylim(len(people) - 0.5, -0.5)
     axes[0].set_xlim(0, max(0.1, 1.05 * float(left.max())))
     axes[0].set_xlabel("nats open, of each by itself")
@@ -79,7 +79,7 @@ def _scenarios(ax, information: np.ndarray, scenarios: list[str]) -> None:
             colour = "white" if value > 0.6 * most else BLACK
             ax.text(column, row, f"{value:.2f}", ha="center", va="center", color=colour, fontsize=8)
     names = [textwrap.fill(name, WRAP, break_on_hyphens=False) for name in scenarios]
-    ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9, parse_math=False)
+    ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9)
     ax.set_yticks([])
     ax.set_title("What one more round would tell (nats)", fontsize=12)
     ax.spines[:].set_visible(False)

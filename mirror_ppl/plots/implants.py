@@ -91,7 +91,6 @@ def plot_implants(data: az.InferenceData, person: str) -> Picture:
         f"What is known of {person}, before and after seeing them act",
         fontsize=13,
         fontweight="bold",
-        parse_math=False,
     )
     order = [label for label in ("prior", "posterior", "truth") if label in handles]
     room = len(grid.flat) > len(names)

@@ -1,20 +1,39 @@
 """Figures that notebooks show."""
 
+import warnings
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
+from matplotlib import font_manager, rc_context
 from matplotlib.figure import Figure
+from matplotlib.ft2font import FT2Font
+from matplotlib.text import Text
 
 from mirror_ppl.files import write_whole
 
 DOTS_PER_INCH = 120
+LONGEST = 40
+"""Characters of a name that are shown."""
 
 
 class Picture(Figure):
     """A matplotlib figure that belongs to no backend, and that a notebook shows all the same.
 
-    It need not be closed: nothing but its user refers to it.
+    It need not be closed: nothing but its user refers to it. All text is shown as it is, dollars
+    and backslashes too; characters that no font has are shown by their number.
     """
+
+    def draw(self, renderer: Any) -> None:
+        """Draw it; see `matplotlib.figure.Figure.draw`."""
+        for text in self.findobj(Text):
+            assert isinstance(text, Text)
+            text.set_parse_math(False)
+            text.set_text(displayable(text.get_text(), text.get_fontproperties()))
+        with rc_context({"text.parse_math": False}), warnings.catch_warnings():
+            # Of labels of ticks, whose texts are made while they are drawn.
+            warnings.filterwarnings("ignore", "Glyph .* missing from font")
+            super().draw(renderer)
 
     def save(self, path: Path) -> None:
         """Write it in the format of the path's suffix, whole or not at all.
@@ -34,3 +53,26 @@ class Picture(Figure):
         content = BytesIO()
         self.savefig(content, format="png")
         return content.getvalue()
+
+
+def displayable(text: str, font: font_manager.FontProperties | None = None) -> str:
+    """The text with characters that the font lacks as their numbers, such as [U+1F600]."""
+    if text.isascii():
+        return text
+    font = font or font_manager.FontProperties()
+    known: set[int] = set()
+    for family in font.get_family():
+        own = font.copy()
+        own.set_family(family)
+        known |= FT2Font(font_manager.findfont(own)).get_charmap().keys()
+    return "".join(
+        character if ord(character) in known or character.isspace() else f"[U+{ord(character):04X}]"
+        for character in text
+    )
+
+
+def label_of(name: str) -> str:
+    """A person's id, or another name, as the label of a tick; of a long one the beginning."""
+    return displayable(
+        name if len(name) <= LONGEST else name[: LONGEST - 1] + "\N{HORIZONTAL ELLIPSIS}"
+    )

@@ -129,7 +129,7 @@ def plot_frames(
             road, mind = grid[2 * row : 2 * row + 2, column]
             _draw_road(road, past, step, cells)
             headline = _headline(person.human.domain, past, step)
-            road.set_title(headline, loc="left", fontsize=10, parse_math=False)
+            road.set_title(headline, loc="left", fontsize=10)
             _draw_mind(mind, share_seen(person, int(past.observation["ego"][step, 0])))
             places = _places(past, step, cells)
             for car, place in places.items():
@@ -150,12 +150,12 @@ def plot_frames(
             textcoords="offset points",
             fontsize=12,
             fontweight="bold",
-            parse_math=False,
         )
         ticks = range(-cells + cells % 2, cells + 1, 2)
         grid[-1, column].set_xticks(ticks, [str(abs(x)) for x in ticks])
         grid[-1, column].set_xlabel(
-            "cells behind   $\\leftarrow$   |   $\\rightarrow$   cells ahead", fontsize=9
+            "cells behind   \N{LEFTWARDS ARROW}   |   \N{RIGHTWARDS ARROW}   cells ahead",
+            fontsize=9,
         )
     _explain(figure, list(grid.flat), knowledge is not None)
     return figure

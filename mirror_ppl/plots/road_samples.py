@@ -21,7 +21,7 @@ from mirror_ppl.plots.driving import (
     seen_of_draws,
     true_sight,
 )
-from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import explain, label_columns, people
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def samples_picture(data: az.InferenceData) -> Picture:
         chosen = np.linspace(0, drawn.sizes["sample"] - 1, SAMPLES).round().astype(int)
         for ax, number in zip(panels, chosen, strict=True):
             _draw(ax, drawn[number])
-        row[0].set_ylabel(person, fontsize=9, rotation=0, ha="right", va="center")
+        row[0].set_ylabel(label_of(person), fontsize=9, rotation=0, ha="right", va="center")
     label_columns(grid[0], columns)
     explain(
         figure,

@@ -15,7 +15,7 @@ from scipy.stats import beta
 from mirror_ppl.domains.driving import CAR_LANES, ROAD_END, SWITCH
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.plots.driving import DARK_TO_LIGHT, DISTANCES, sight_probability
-from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import (
     BLUE,
     OBSERVED,
@@ -81,7 +81,7 @@ def plot_round(
         entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=4, frameon=False)
     kind = "held-out round" if held_out else "round"
-    figure.suptitle(f"{person}, {kind} {round}", fontsize=13, fontweight="bold", parse_math=False)
+    figure.suptitle(f"{label_of(person)}, {kind} {round}", fontsize=13, fontweight="bold")
     return figure
 
 
@@ -174,7 +174,7 @@ def plot_predictive_check(data: az.InferenceData) -> Picture:
         right.plot(rates["predicted"], rates["observed"], "o-", color=colour, ms=6, lw=0.8)
     observed = lane_changes(data, "observed_data").mean("round")
     left.plot(observed, place, "o", color=OBSERVED, ms=6, label="observed")
-    left.set_yticks(place, everybody, parse_math=False)
+    left.set_yticks(place, [label_of(person) for person in everybody])
     left.invert_yaxis()
     left.set_xlabel("lane changes a round, averaged over a person's rounds")
     right.plot([0, 1], [0, 1], color=OBSERVED, lw=1, ls=":", zorder=0)

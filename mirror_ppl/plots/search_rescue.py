@@ -12,7 +12,7 @@ from matplotlib.patches import Circle
 from mirror_ppl.domains.rescue_house import PORTION, SIDE, as_image
 from mirror_ppl.domains.search_rescue import RescueState, SearchRescue
 from mirror_ppl.models.implants import SIGHT
-from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import (
     BLUE,
     draws,
@@ -87,7 +87,7 @@ def sight_picture(data: az.InferenceData) -> Picture:
         chosen = np.linspace(0, len(drawn) - 1, SAMPLES).round().astype(int)
         for ax, value in zip(panels, drawn[chosen], strict=True):
             _draw(ax, _seen(np.array([value]))[0], _cells(value))
-        row[0].set_ylabel(person, fontsize=10)
+        row[0].set_ylabel(label_of(person), fontsize=10)
     label_columns(grid[0], columns)
     explain(
         figure,
