@@ -78,7 +78,7 @@ class Options:
     """Write every decision with its audit, one JSON object a line, over what is there."""
     human_model: str | None = None
     """The human model that the posterior is of, if it is another: one-radius and so on, or one of
-    your own, path/to/file.py:Class."""
+    your own, path/to/file.py:Class, whose code is run."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     population: str | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,7 +90,7 @@ def _require_different(posteriors: tuple[Path, ...]) -> None:
 
     seen = set()
     for path in posteriors:
-        real = posterior_path(path).resolve()
+        real = os.path.realpath(posterior_path(path))
         if real in seen:
             raise OptionError(f"{path} is given twice")
         seen.add(real)

@@ -57,7 +57,7 @@ class Options:
     mirror-svi, mirror-population, perceptual-only, policy-only, no-implants, bc,
     bc-everything, sqil, sqil-everything, logistic (and mirror-nuts, if asked for), or of
     assistance and relevance mirror (which also plans as mirror-kl), bc, sqil, none, all, oracle.
-    path/to/file.py:Class is a human model of your own."""
+    path/to/file.py:Class is a human model of your own, whose code is run."""
     rounds: tuple[int, ...] = (1, 2, 5, 10, 20)
     """Numbers of rounds that are learned from, from 1 to 20; the most only, for relevance."""
     played: int = 5

@@ -218,15 +218,18 @@ def require_files_of_their_own(
     Raises:
         OutputError: one is named twice, or is there and is not a regular file.
     """
-    taken = {path.resolve(): option for option, paths in inputs.items() for path in paths if path}
+    taken = {
+        os.path.realpath(path): option for option, paths in inputs.items() for path in paths if path
+    }
     result = []
     for option, path in outputs.items():
         if path is None:
             continue
-        if path.resolve() in taken:
-            raise OutputError(f"cannot write {path}: it is what {taken[path.resolve()]} names")
+        real = os.path.realpath(path)
+        if real in taken:
+            raise OutputError(f"cannot write {path}: it is what {taken[real]} names")
         _require_file(path, path)
-        taken[path.resolve()] = option
+        taken[real] = option
         result.append(path)
     return result
 

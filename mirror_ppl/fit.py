@@ -44,7 +44,7 @@ class Options:
     recordings with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
     human_model: str | None = None
     """Another human model: one-radius, per-item, perceptual-only, policy-only or no-implants, or
-    one of your own, path/to/file.py:Class (see docs/extending.md)."""
+    one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     guide: str = "exact"

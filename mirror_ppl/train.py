@@ -53,7 +53,7 @@ class Options:
     """Of a guide: people to learn from, simulated in the true domain."""
     human_model: str | None = None
     """Of a guide: another human model: one-radius, per-item, perceptual-only and so on, or
-    one of your own, path/to/file.py:Class (see docs/extending.md)."""
+    one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
     self_model: Path | None = None
     """Of a guide: weights of the robot's self-model; those that ship unless given."""
     seed: int = 0

@@ -65,7 +65,7 @@ def test_rounds_and_models_have_to_be_such_and_of_one_world(door, one, elsewhere
     refused(lambda: door("mirror", one), "human must be of the class HumanModel, not 'mirror'")
     refused(lambda: door(human(), "a.nc"), "must be of the class Demonstrations, not 'a.nc'")
     refused(lambda: door(human(), elsewhere), "the rounds are of bomb_defusal, not of driving")
-    refused(lambda: door(human(), impossible), "person a, round 0, time 0: ego lane has to be 0")
+    refused(lambda: door(human(), impossible), "person 'a', round 0, time 0: ego lane has to be 0")
 
 
 def test_rounds_of_several_people_are_not_added(two):

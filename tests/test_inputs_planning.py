@@ -369,7 +369,7 @@ OTHERS = {
     "half a seed": ({"seed": 1.5}, "seed must be a whole number, not 1.5"),
     "a large seed": (
         {"seed": 2**60},
-        "seed must be from -8796093022208 to 8796093022208, not 1152",
+        "seed must be from 0 to 4294967295, not 1152",
     ),
 }
 

@@ -20,6 +20,7 @@ padding.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -170,7 +171,7 @@ class _Rounds:
 
 def posterior_path(path: Path) -> Path:
     """The posterior file that a file or a fit's folder stands for."""
-    return path / FILE if path.is_dir() else path
+    return path / FILE if os.path.isdir(path) else path
 
 
 def read_fit(path: Path, by: str = "loo") -> FitFile:

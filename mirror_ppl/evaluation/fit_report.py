@@ -36,7 +36,9 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         f"What each person {what} and how they decide: {summary['domain']}, {summary['setting']}",
         "median [90% interval] truth, if known; NLL in nats an action, floor: their own entropy",
     )
-    people = summary["people"]
+    people, wrong = summary["people"], summary["contradictions"]
+    if wrong["contradicting"]:
+        print(f"{wrong['contradicting']} of {wrong['steps']} steps contradict the next observation")
     doubtful = [
         person["id"] for person in people if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
     ]

@@ -31,6 +31,7 @@ from torch import Tensor
 from mirror_ppl import __version__
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
+from mirror_ppl.errors import PosteriorError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.guides import Inferred
 from mirror_ppl.inference.prior import Draws, sample_sites
@@ -39,6 +40,7 @@ from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.netcdf import read_netcdf
 from mirror_ppl.workers import run_tasks
 
 PRIOR_PEOPLE = 4000
@@ -245,10 +247,10 @@ def _batch(
 def _kept(path: Path, run: str) -> xr.Dataset | None:
     """What an earlier run left, if it was a run of the same thing."""
     try:
-        data = xr.load_dataset(path, engine="h5netcdf")
-        return data if data.attrs.pop("run") == run else None
-    except (OSError, ValueError, KeyError):
+        data = read_netcdf(path, PosteriorError)["/"]
+    except PosteriorError:
         return None
+    return data if data.attrs.pop("run", None) == run else None
 
 
 def _seed(generator: torch.Generator) -> int:

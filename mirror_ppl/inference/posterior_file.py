@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +96,7 @@ def read_results(path: Path, *groups: str) -> dict[str, xr.Dataset]:
     """
     pooled = " --pooling partial" if groups[0] == "population" else ""
     hint = f"python -m mirror_ppl.fit{pooled} makes one"
-    if not path.exists():
+    if not os.path.exists(path):
         raise PosteriorError(f"{path}: there is no such file; {hint}")
     data = read_netcdf(path, PosteriorError, groups)
     if groups[0] not in data:

@@ -13,7 +13,6 @@ import itertools
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from scipy.stats import entropy
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.uniformity import ecdf_p_value, histogram_p_value
+from mirror_ppl.netcdf import read_netcdf
 
 FAILURE_RATE = 1e-3
 """How often a right posterior may be rejected, for each site and number of rounds."""
@@ -167,10 +167,8 @@ class Calibration:
         Raises:
             PosteriorError: the file is missing or damaged, or holds something else.
         """
-        if not Path(path).is_file():
-            raise PosteriorError(f"{path}: there is no such file")
+        data = read_netcdf(path, PosteriorError)["/"]
         try:
-            data = xr.load_dataset(path, engine="h5netcdf")
             calibration = cls(data, float(data.attrs.pop("failure_rate")))
             calibration.table()  # reads everything that has to be there
         except Exception as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.checks import require_kind
+from mirror_ppl.domains import Domain
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.searcher import Searcher
@@ -25,6 +26,15 @@ from mirror_ppl.models.span_contract import check_spans_hold
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.user_code import describe, remember_file
 
+AXES = (
+    *("chain", "draw", "person", "round", "test_round", "step", "time", "direction", "sample"),
+    *("action", "action_name", "action_probability", "action_entropy", "observed_action", "ego"),
+    *("ego_feature", "site", "scenario", "residual_input", "residual_unit"),
+    "residual_unit_and_bias",
+)
+"""Names of dimensions and other variables in posterior files."""
+PREFIXES = ("told_", "truth_")
+"""With which names of variables of recordings begin."""
 MIRROR = "mirror"
 """The package's own model; which it is depends on the domain."""
 OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
@@ -83,7 +93,7 @@ def load_human_model(
             f"{', '.join(VARIANTS)}" + "".join(f'; perhaps you meant "{name}"' for name in close)
         )
     path = Path(path_text)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise HumanModelError(f"{path}: there is no such file")
     module_name = f"_human_model_{path.stem}"
     spec = importlib.util.spec_from_file_location(module_name, path)
@@ -174,6 +184,7 @@ def check_contract(human: HumanModel) -> None:
             total = log_probabilities.exp().sum(-1)
             if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
                 raise HumanModelError("act has to return log-probabilities: they do not sum to 1")
+        _check_names(domain, [*latent_sites(trace.trace), *attention])
         method = "spans"
         if human.chained:
             check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
@@ -208,6 +219,19 @@ def _attention(human: HumanModel, implants: Implants, people: int) -> dict[str, 
         if not site["fn"].has_enumerate_support:
             raise HumanModelError(f'"{name}" of attend has no finite support')
     return {name: site["value"].flatten()[:people].expand(people) for name, site in sites.items()}
+
+
+def _check_names(domain: Domain, sites: Iterable[str]) -> None:
+    """Refuse names of sites that posterior files have for something else, or cannot have."""
+    taken = {*AXES, *(f"{m.name}_item" for m in domain.modalities)}
+    taken |= {part for m in domain.modalities for part in (m.name, f"{m.name}_feature")}
+    for name in sites:
+        if not name.isprintable() or name != name.strip() or set(name) & {"/"}:
+            raise HumanModelError(f'"{name}" cannot be the name of a site: use plain words')
+        if name in taken or name.startswith(PREFIXES):
+            raise HumanModelError(
+                f'"{name}" cannot be the name of a site: posterior files call something else so'
+            )
 
 
 def _check_sites(trace: poutine.Trace, people: int) -> None:
