@@ -101,6 +101,8 @@ def _run(
     try:
         return main(options) or 0
     except SystemExit as end:
+        if isinstance(end.__context__, BrokenPipeError):  # rich ends the program then
+            raise end.__context__ from end
         raise HumanModelError(describe(end)) from end
 
 
@@ -131,7 +133,7 @@ def _ending(error: BaseException) -> tuple[int, str] | None:
     if passed_user_code(error):
         return EXIT_BAD_INPUT, f"error: {describe(error)}"
     if isinstance(error, OSError) and error.errno in NO_ROOM:
-        return EXIT_BAD_INPUT, f"error: cannot write: {error}"
+        return EXIT_BAD_INPUT, f"error: cannot write: {error.strerror or error}"
     if isinstance(error, MemoryError) or any(sign in str(error) for sign in NO_MEMORY):
         return EXIT_BAD_INPUT, f"error: there is too little memory ({' '.join(str(error).split())})"
     return None

@@ -5,15 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
+from typing import TYPE_CHECKING
 
 from mirror_ppl.console import run, usable_device
 from mirror_ppl.errors import OptionError
-from mirror_ppl.limits import check_numbers, share
+from mirror_ppl.limits import check_numbers, require_memory, share
 from mirror_ppl.progress import Stages
+
+if TYPE_CHECKING:
+    from mirror_ppl.data import Demonstrations
 
 PROGRAM = "python -m mirror_ppl.fit"
 DOMAIN, POPULATION = "driving", "paper"
 CHECKPOINT = "fit.checkpoint"
+COPIES = 4
+"""Of log-probabilities of actions, while they are worked out and drawn from."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
@@ -98,7 +104,7 @@ def main(options: Options) -> None:
     from mirror_ppl.evaluation.fit_report import show_fit
     from mirror_ppl.files import json_text, output_folder, write_together
     from mirror_ppl.inference.export import add_identifiability, netcdf_content
-    from mirror_ppl.inference.fitting import fit_people, split_rounds
+    from mirror_ppl.inference.fitting import fit_people
     from mirror_ppl.inference.guide_file import network_for
     from mirror_ppl.inference.guides import InferenceOptions
     from mirror_ppl.inference.identifiability import identify
@@ -129,7 +135,7 @@ def main(options: Options) -> None:
     if options.prior_from is not None:
         pooling = Pooling(human)
         population = load_population(options.prior_from, pooling, demonstrations.setting)
-    split_rounds(demonstrations, options.train_rounds)
+    _require_memory(demonstrations, options)
     results = ("summary.json", "posterior.nc", "open.png", *FILES)
     with output_folder(options.out, (*results, CHECKPOINT)) as folder, Stages() as stages:
         result = fit_people(
@@ -181,6 +187,21 @@ def main(options: Options) -> None:
         print(f"{folder / name}: {shows}")
     if "open.png" in drawn:
         print(f"{folder / 'open.png'}: what is open about what they see, and what would tell")
+
+
+def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
+    """Refuse what will not fit, before any work is done."""
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.inference.fitting import split_rounds
+    from mirror_ppl.inference.posterior_predictive import PEOPLE_AT_ONCE
+
+    parts = [part for part in split_rounds(demonstrations, options.train_rounds) if part]
+    actions = len(get_domain(demonstrations.domain).actions)
+    steps = sum(part.actions[0].numel() for part in parts)
+    people = demonstrations.num_people
+    # Probabilities of actions are kept of held-out rounds; of some people there are copies.
+    values = options.draws * steps * actions * (people + COPIES * min(people, PEOPLE_AT_ONCE))
+    require_memory(4 * values, "so many draws of predictions")
 
 
 def _recordings(options: Options):
