@@ -108,9 +108,9 @@ def _run(
 
 def _argument_error(box: str, prog: str) -> str:
     """What tyro says in a box, in one line."""
-    lines = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
-    text = "\n".join(lines)
-    parts = [" ".join(part.split()) for part in re.split("─{3,}", text)]
+    # Between a title and the last line; drawn by plain characters where there are no others.
+    text = "\n".join(line.strip("│| ") for line in box.splitlines()[1:-1])
+    parts = [" ".join(part.split()) for part in re.split("[─-]{3,}", text) if part.strip()]
     meant = [word for part in parts if part.startswith("Perhaps") for word in part.split()]
     options = dict.fromkeys(word.rstrip(",") for word in meant if word.startswith("--"))
     message = parts[0].rstrip(".")

@@ -73,6 +73,8 @@ def _read(content: bytes, engine: str, groups: tuple[str, ...]) -> dict[str, xr.
 
     if engine == "h5netcdf":
         groups = _checked_groups(content, groups)
+    else:  # which has no groups
+        groups = tuple(group for group in groups if group == "/")
     found = {}
     with warnings.catch_warnings():
         # What is odd about a file of others, but can be read, is nothing to bother anybody with.

@@ -1,0 +1,104 @@
+"""netCDF files that are damaged, large only in what they say, or no files at all."""
+
+import io
+import os
+import time
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from mirror_ppl import netcdf
+from mirror_ppl.data import load_demonstrations, save_demonstrations
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.errors import DemonstrationsError, PosteriorError
+from mirror_ppl.netcdf import read_netcdf
+
+
+def refused(path):
+    with pytest.raises(PosteriorError) as error:
+        read_netcdf(path, PosteriorError)
+    assert str(error.value).isprintable()
+    return str(error.value)
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
+def test_groups_are_read(tmp_path, engine):
+    path = tmp_path / "a.nc"
+    data = xr.Dataset({"x": ("y", np.arange(3.0))}, attrs={"units": "seconds since"})
+    data.to_netcdf(path, engine=engine)
+    assert read_netcdf(path, PosteriorError)["/"].identical(data)
+    assert read_netcdf(str(path), PosteriorError, ("other",)) == {}
+
+
+def test_what_declares_more_than_can_be_in_it_is_refused_before_memory_is_taken(tmp_path):
+    path = tmp_path / "a.nc"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("action", (10, 10**6, 100), "f8", chunks=(1, 1000, 100))
+    assert path.stat().st_size < 20_000
+    began = time.monotonic()
+    assert "it declares 8,000,000,000 bytes, but has" in refused(path)
+    assert time.monotonic() - began < 10
+
+
+def test_reading_that_does_not_end_or_crashes_is_noticed(tmp_path, monkeypatch):
+    path = tmp_path / "a.nc"
+    xr.Dataset({"x": ("y", np.arange(3.0))}).to_netcdf(path, engine="h5netcdf")
+    monkeypatch.setattr(netcdf, "SECONDS", 0.3)
+    parent, read = os.getpid(), netcdf._read
+
+    def endless(*args):
+        while os.getpid() != parent:
+            pass
+        pytest.fail("the process itself should not try")
+
+    def crash(*args):
+        assert os.getpid() != parent
+        os.abort()
+
+    for fault in (endless, crash):
+        monkeypatch.setattr(netcdf, "_read", fault)
+        assert refused(path) == f"{path}: is truncated or damaged (it cannot be read to its end)"
+    monkeypatch.setattr(netcdf, "_read", read)
+    read_netcdf(path, PosteriorError)
+
+
+def test_a_zeroed_heap_does_not_hang(tmp_path):
+    """The HDF5 library looks for the end of such a heap for ever."""
+    path = tmp_path / "a.nc"
+    save_demonstrations(path, simple())
+    content = bytearray(path.read_bytes())
+    begin = content.index(b"GCOL")
+    refusals = 0
+    for offset in range(8, 400, 56):
+        damaged = bytearray(content)
+        damaged[begin + offset : begin + offset + 64] = bytes(64)
+        path.write_bytes(damaged)
+        began = time.monotonic()
+        try:
+            load_demonstrations(path)
+        except DemonstrationsError as error:
+            refusals += 1
+            assert str(error).isprintable()
+        assert time.monotonic() - began < 60
+    assert refusals
+
+
+def simple():
+    from example_recordings import fields
+
+    return Demonstrations(**fields([[3, 2], [1]]))
+
+
+def test_names_that_are_no_utf8(tmp_path):
+    path = tmp_path / "a.nc"
+    save_demonstrations(path, simple())
+    with xr.open_dataset(path, engine="h5netcdf") as data:
+        data = data.load()
+    data["person"] = np.array([b"caf\xe9", b"ok"])
+    content = io.BytesIO(data.drop_encoding().to_netcdf(engine="scipy"))
+    path.write_bytes(content.getvalue())
+    with pytest.raises(DemonstrationsError) as error:
+        load_demonstrations(path)
+    assert str(error.value).isprintable()
