@@ -12,7 +12,6 @@ import os
 import re
 import resource
 import shlex
-import shutil
 import signal
 import sys
 import tempfile
@@ -23,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._command_lines import line, prepare
-from benchmarks._judging import ANOTHER, EQUAL, REFUSED, SLOW, Verdict
+from benchmarks._judging import ANOTHER, EQUAL, REFUSED, SLOW, Verdict, seconds_of
 
 CUT_AFTER, HANG_AFTER = 14.0, 25.0
 """Seconds of the processor after which a command is at work, and of the clock without work."""
@@ -72,7 +71,7 @@ def _run(
         clock = time.monotonic() - began
         if ended:
             return os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, clock
-        seconds = _seconds(child)
+        seconds = seconds_of(child)
         if seconds > CUT_AFTER or clock > 3 * HANG_AFTER or (clock > HANG_AFTER and seconds < 1):
             os.killpg(child, signal.SIGKILL)
             os.waitpid(child, 0)
@@ -164,14 +163,3 @@ def _content(folder: Path) -> dict[str, str]:
         else:
             found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
-
-
-def _seconds(child: int) -> float:
-    """Of the processor, that a process used."""
-    words = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def clean(place: Path) -> None:
-    """Remove a folder in which something may be locked."""
-    shutil.rmtree(place, ignore_errors=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import resource
 import sys
 import tempfile
@@ -25,8 +26,10 @@ GOOD = (REFUSED, EQUAL, ANOTHER)
 """What may become of a case: refused in a line, accepted as it was, or rightly as another."""
 SLOW, MOST_MEMORY = 10.0, 500.0
 """Seconds and MB that a case may take."""
-PATIENCE = 40.0
-"""Seconds after which a process is ended; making a case counts."""
+PATIENCE, MOST_WORK = 60.0, 15.0
+"""Seconds of the clock and of the processor after which a case is ended; making it counts."""
+ASKED, MOST_ANYWHERE = re.compile(r"Unable to allocate ([\d.]+) (\w+)"), 200.0
+"""What numpy says, and GB beyond which no machine has so much: that is refused at once."""
 ROOM = 4 * 2**30
 """Bytes that a process may ask for beyond what it has; more is no memory of this machine's."""
 
@@ -73,6 +76,9 @@ def measured(call: Callable[[], Any]) -> Outcome:
     before = _memory("VmRSS")
     with tempfile.TemporaryFile() as spoken, warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
+        # As outside of tests, where Python shows these to nobody.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", PendingDeprecationWarning)
         sys.stderr.flush()
         kept = os.dup(2)
         os.dup2(spoken.fileno(), 2)
@@ -151,14 +157,14 @@ class _Worker:
         )
         self.process.start()
         theirs.close()
-        self.since = monotonic()
+        self.since, self.worked = monotonic(), 0.0
 
     def verdicts(self) -> Iterator[tuple[int, Verdict]]:
         """What has come since the last time."""
         try:
             while self.pipe.poll():
                 verdict = self.pipe.recv()
-                self.since = monotonic()
+                self.since, self.worked = monotonic(), seconds_of(self.process.pid or 0)
                 yield self.left.pop(0), verdict
         except EOFError:
             self.process.join()
@@ -167,10 +173,16 @@ class _Worker:
                 status = self.process.exitcode
                 yield self.left.pop(0), Verdict("crash", f"status {status}", f"status {status}")
             return
-        if monotonic() - self.since > PATIENCE:
+        if self._too_long():
             self.process.kill()
             self.ended = True
-            yield self.left.pop(0), Verdict("hang", "no answer", seconds=PATIENCE)
+            yield self.left.pop(0), Verdict("hang", "no answer", seconds=self._worked())
+
+    def _too_long(self) -> bool:
+        return monotonic() - self.since > PATIENCE or self._worked() > MOST_WORK
+
+    def _worked(self) -> float:
+        return seconds_of(self.process.pid or 0) - self.worked
 
 
 def _judge_all(work: Callable[[int], Verdict], numbers: list[int], pipe: Connection) -> None:
@@ -186,6 +198,15 @@ def _judge_all(work: Callable[[int], Verdict], numbers: list[int], pipe: Connect
         pipe.send(verdict)
 
 
+def seconds_of(process: int) -> float:
+    """Seconds of the processor that a process used; 0 if it has ended."""
+    try:
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def _memory(which: str) -> float:
     """MB of this process: of now (VmRSS), or the most since it was last reset (VmHWM)."""
     for line in Path("/proc/self/status").read_text().splitlines():
@@ -195,8 +216,12 @@ def _memory(which: str) -> float:
 
 
 def _no_memory(error: BaseException | None) -> bool:
+    """Whether so much memory was asked for that another machine would have given it."""
     while error is not None:
-        if isinstance(error, MemoryError) or "alloc" in str(error).lower():
+        asked = ASKED.search(str(error))
+        if asked and asked[2][0] in "KMG":
+            return asked[2][0] != "G" or float(asked[1]) < MOST_ANYWHERE
+        if not asked and (isinstance(error, MemoryError) or "alloc" in str(error).lower()):
             return True
         error = error.__cause__ or error.__context__
     return False

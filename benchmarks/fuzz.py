@@ -33,7 +33,7 @@ import torch
 
 import mirror_ppl
 from benchmarks import _recording_cases, _result_cases
-from benchmarks._judging import PATIENCE, Verdict, run_cases
+from benchmarks._judging import MOST_WORK, Verdict, run_cases
 
 PARTS = ("recordings", "results", "commands")
 NUMBERS = {"recordings": 10_000, "results": 2000, "commands": 500}
@@ -170,7 +170,8 @@ def main() -> int:
     out = options.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
     wanted = {part: getattr(options, part) for part in PARTS}
-    if options.show or wanted["results"] or wanted["commands"]:
+    parts = [options.show[0]] if options.show else [part for part in PARTS if wanted[part]]
+    if parts != ["recordings"]:
         # What was fitted with other weights is no undamaged file of this package.
         _result_cases.make_sources(out / f"sources-{package()}")
     (out / "sources").unlink(missing_ok=True)
@@ -182,7 +183,7 @@ def main() -> int:
         if number:
             verdicts = judge_all(part, number, out, options.seed, options.jobs)
             faults += report(part, verdicts, out, options.seed)
-    print(f"\n{faults} faults; cases that gave no answer for {PATIENCE:.0f} s were ended")
+    print(f"\n{faults} faults; cases at work for {MOST_WORK:.0f} s were ended")
     return 1 if faults else 0
 
 
