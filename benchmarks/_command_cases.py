@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import os
+import pkgutil
 import re
 import resource
 import shlex
@@ -24,7 +25,7 @@ import numpy as np
 from benchmarks._command_lines import line, prepare
 from benchmarks._judging import ANOTHER, EQUAL, REFUSED, SLOW, Verdict, seconds_of
 
-CUT_AFTER, HANG_AFTER = 14.0, 25.0
+CUT_AFTER, HANG_AFTER = 11.0, 25.0
 """Seconds of the processor after which a command is at work, and of the clock without work."""
 LARGEST = 300 * 2**20
 """Bytes of a file."""
@@ -33,6 +34,17 @@ BROKEN = 99
 PROGRESS = re.compile(r"^[\w -]+: \d+(/\d+)?\b.*, (\d+ (h|min|s) ?)+(, .* left)?$")
 NOTICE = re.compile(r" (is|are) left out: ")
 TEMPORARY = re.compile(r"(^|/)\.|checkpoint|\.parts|\.lock|\.tmp")
+
+
+def preload() -> None:
+    """Import all of the package, so that copies of this process need not."""
+    import tyro
+
+    import mirror_ppl
+
+    for found in pkgutil.walk_packages(mirror_ppl.__path__, "mirror_ppl."):
+        importlib.import_module(found.name)
+    del tyro
 
 
 def judge(sources: Path, seed: int, number: int, keep: Path | None = None) -> Verdict:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -32,6 +32,7 @@ from mirror_ppl.people import simulate
 DOMAINS = ("driving", "search_rescue", "bomb_defusal")
 CHECKED, PLAIN, CLASSIC = "checked", "plain", "classic"
 """How a file is written: netCDF-4 by the package, netCDF-4 without checksums, netCDF-3."""
+WAYS = CHECKED, PLAIN, CLASSIC
 PACKED = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
 CANNOT = (KeyError, ValueError, TypeError, IndexError, OverflowError, AttributeError, OSError)
 """What a damage raises where it cannot be done, often because of another one before."""
@@ -119,11 +120,11 @@ def file_of(number: int, how: str) -> bytes:
         return path.read_bytes()
 
 
-def make(seed: int, number: int) -> Case:
-    """A case, by its number."""
+def make(seed: int, number: int, ways: Sequence[str] = WAYS, originals: int = ORIGINALS) -> Case:
+    """A case, by its number; of the first recordings, written in one of some ways."""
     random = np.random.default_rng([seed, 1, number])
-    chosen = int(random.integers(ORIGINALS))
-    how = str(random.choice([CHECKED, PLAIN, CLASSIC]))
+    chosen = int(random.integers(originals))
+    how = str(random.choice(ways))
     kind = random.choice(["bytes", "edits", "structure"], p=[0.4, 0.45, 0.15])
     if kind == "edits":
         return _edited(random, chosen, how)
@@ -212,7 +213,11 @@ def load(path: Path) -> Demonstrations:
 
 def judge(seed: int, number: int, keep: Path | None = None) -> Verdict:
     """Make a case and judge it; a file that shows a fault is kept in a folder."""
-    case = make(seed, number)
+    return judge_case(make(seed, number), number, keep)
+
+
+def judge_case(case: Case, number: int = 0, keep: Path | None = None) -> Verdict:
+    """Judge a case; a file that shows a fault is kept in a folder."""
     folder = Path(tempfile.gettempdir()) if keep is None else keep
     path = folder / f"recording-{number}-{os.getpid()}.nc"
     path.write_bytes(case.content)

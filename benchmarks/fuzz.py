@@ -49,6 +49,7 @@ def work_of(part: str, out: Path, seed: int, keep: Path | None) -> Callable[[int
         return partial(_result_cases.judge, out / "sources", seed, keep=keep)
     from benchmarks import _command_cases
 
+    _command_cases.preload()
     return partial(_command_cases.judge, out / "sources", seed, keep=keep)
 
 
