@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import hashlib
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -31,9 +30,9 @@ from typing import Any
 
 import torch
 
-import mirror_ppl
 from benchmarks import _recording_cases, _result_cases
 from benchmarks._judging import MOST_WORK, Verdict, run_cases
+from benchmarks._state import package
 
 PARTS = ("recordings", "results", "commands")
 NUMBERS = {"recordings": 10_000, "results": 2000, "commands": 500}
@@ -51,15 +50,6 @@ def work_of(part: str, out: Path, seed: int, keep: Path | None) -> Callable[[int
 
     _command_cases.preload()
     return partial(_command_cases.judge, out / "sources", seed, keep=keep)
-
-
-def package() -> str:
-    """What tells this state of the package from others."""
-    digest = hashlib.sha256()
-    root = Path(mirror_ppl.__file__).parent
-    for path in sorted([*root.rglob("*.py"), *root.rglob("*.safetensors")]):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:8]
 
 
 def judge_all(part: str, number: int, out: Path, seed: int, jobs: int) -> dict[int, Verdict]:

@@ -28,8 +28,8 @@ from time import monotonic, sleep
 import numpy as np
 
 from benchmarks._same_results import differences, names_in, orphans
+from benchmarks._state import ROOT, package
 
-ROOT = Path(__file__).resolve().parent.parent
 MARK = "MIRROR_PPL_KILLS"
 """Environment variable by which processes of a run are found."""
 SOON, LATER = 3.0, 10.0
@@ -38,20 +38,22 @@ FIRST = 1.5
 """Seconds of every run without a signal: in them Python itself starts."""
 LONGEST = 600.0
 """Seconds after which a run counts as hung."""
-QUICK = "--demos", "people.nc", "--out", "out", "--explore", "2"
+FIT = "fit", "--demos", "people.nc", "--train-rounds", "4", "--out", "out", "--explore", "0"
 COMMANDS: dict[str, tuple[str, ...]] = {
-    "fit": ("fit", *QUICK, "--draws", "200"),
-    "fit svi": ("fit", *QUICK, "--guide", "svi", "--steps", "60", "--draws", "50"),
-    "fit pooled": ("fit", *QUICK, "--pooling", "partial", "--draws", "50"),
-    "train": ("train", "--phases", "4", "--steps", "20", "--out", "out/w.safetensors"),
+    "fit": (*FIT, "--draws", "50"),
+    "fit svi": (*FIT, "--guide", "svi", "--steps", "60", "--draws", "20"),
+    "fit pooled": (*FIT, "--pooling", "partial", "--draws", "20"),
+    "train": ("train", "--phases", "3", "--steps", "5", "--out", "out/w.safetensors"),
     "train guide": ("train", "--what", "guide", "--people", "10", "--out", "out/g.safetensors"),
-    "assist": ("assist", "--posterior", "posterior.nc", "--rounds", "3", "--draws", "16")
-    + ("--communicator", "mirror", "none", "all", "--json", "out/a.json", "--log", "out/a.log"),
-    "calibrate": ("calibrate", "--people", "15", "--rounds", "1", "2", "--draws", "20")
-    + ("--jobs", "2", "--out", "out"),
-    "evaluate": ("evaluate", "prediction", "--people", "2", "--seeds", "2", "--rounds", "1", "2")
-    + ("--models", "mirror", "bc", "logistic", "--setting", "fog", "--jobs", "2", "--out", "out"),
+    "assist": ("assist", "--posterior", "posterior.nc", "--rounds", "2", "--draws", "8")
+    + ("--people", "2", "--communicator", "mirror", "none", "all", "--jobs", "2")
+    + ("--json", "out/a.json", "--log", "out/a.log"),
+    "calibrate": ("calibrate", "--people", "10", "--rounds", "1", "--draws", "10", "--jobs", "2")
+    + ("--out", "out"),
+    "evaluate": ("evaluate", "prediction", "--people", "1", "--seeds", "2", "--rounds", "1", "2")
+    + ("--models", "bc", "logistic", "--setting", "fog", "--jobs", "2", "--out", "out"),
 }
+"""Of some 10 to 30 seconds where nothing else is at work."""
 SIGNALS = {
     "SIGKILL": (signal.SIGKILL, False),
     "SIGTERM": (signal.SIGTERM, False),
@@ -137,7 +139,10 @@ class Run:
 
 def uninterrupted(name: str, out: Path, inputs: Path) -> tuple[Path, float]:
     """The folder of a run that nobody interrupts, and the seconds that it took."""
-    folder = out / f"{name.replace(' ', '-')}-whole"
+    folder = out / name.replace(" ", "-")
+    noted = folder.with_suffix(".seconds")
+    if noted.is_file():
+        return folder, float(noted.read_text())
     _fresh(folder, inputs)
     run = Run(COMMANDS[name], folder)
     status = run.wait(LONGEST)
@@ -146,6 +151,8 @@ def uninterrupted(name: str, out: Path, inputs: Path) -> tuple[Path, float]:
     run.gone()
     if status not in _good(name):
         raise SystemExit(f"{name} ends with {status} when nobody interrupts it: {said[-1:]}")
+    noted.write_text(f"{seconds}")
+    print(f"{name}: {seconds:.0f} s without interruption", flush=True)
     return folder, seconds
 
 
@@ -241,11 +248,11 @@ def main() -> int:
     options = parser.parse_args()
     random = np.random.default_rng(options.seed)
     out = options.out.resolve()
-    shutil.rmtree(out, ignore_errors=True)
-    make_inputs(out / "inputs")
-    wholes = {name: uninterrupted(name, out, out / "inputs") for name in options.commands}
-    for name, (_, seconds) in wholes.items():
-        print(f"{name}: {seconds:.0f} s without interruption", flush=True)
+    # What this package left without interruption is kept from one run to the next.
+    inputs, kept = out / f"inputs-{package()}", out / f"whole-{package()}"
+    make_inputs(inputs)
+    kept.mkdir(exist_ok=True)
+    wholes = {name: uninterrupted(name, kept, inputs) for name in options.commands}
     tallies: dict[tuple[str, str], Tally] = {}
     for number in range(options.kills):
         name = options.commands[number % len(options.commands)]
@@ -254,7 +261,7 @@ def main() -> int:
         moments = FIRST + random.random(1 + (random.random() < SECOND)) * max(0.5, seconds - FIRST)
         tally = tallies.setdefault((name, kind), Tally())
         folder = out / f"{name.replace(' ', '-')}-{number}"
-        _fresh(folder, out / "inputs")
+        _fresh(folder, inputs)
         known = len(tally.faults)
         kill_and_go_on(name, kind, moments.tolist(), folder, whole, tally)
         for fault in tally.faults[known:]:
