@@ -26,7 +26,7 @@ GOOD = (REFUSED, EQUAL, ANOTHER)
 """What may become of a case: refused in a line, accepted as it was, or rightly as another."""
 SLOW, MOST_MEMORY = 10.0, 500.0
 """Seconds and MB that a case may take."""
-PATIENCE, MOST_WORK = 60.0, 15.0
+PATIENCE, MOST_WORK = 180.0, 15.0
 """Seconds of the clock and of the processor after which a case is ended; making it counts."""
 ASKED, MOST_ANYWHERE = re.compile(r"Unable to allocate ([\d.]+) (\w+)"), 200.0
 """What numpy says, and GB beyond which no machine has so much: that is refused at once."""

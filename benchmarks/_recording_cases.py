@@ -25,8 +25,9 @@ from mirror_ppl.data import (
     save_demonstrations,
     to_dataset,
 )
+from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference import fitting
+from mirror_ppl.inference.fitting import split_rounds
 from mirror_ppl.people import simulate
 
 DOMAINS = ("driving", "search_rescue", "bomb_defusal")
@@ -206,8 +207,8 @@ def _name(number: int) -> str:
 def load(path: Path) -> Demonstrations:
     """What a fit does with recordings before it infers anything."""
     recordings = load_demonstrations(path)
-    getattr(fitting, "check_world")(recordings)  # noqa: B009
-    fitting.split_rounds(recordings)
+    check_world(recordings)
+    split_rounds(recordings)
     return recordings
 
 
