@@ -10,9 +10,14 @@ import faulthandler
 import io
 import os
 import signal
+import subprocess
+import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import cache
+from time import monotonic, sleep
 from typing import TYPE_CHECKING
 
 from mirror_ppl.errors import MirrorError
@@ -31,6 +36,21 @@ SMALL = 2**24
 SECONDS, BYTES_PER_SECOND = 3.0, 2**24
 """Time of a processor after which reading counts as endless: for any file, and for so many bytes
 more."""
+START, SLOW = 20.0, 20.0
+"""Seconds that another process may take to start, and how much slower a busy machine may be."""
+READ_ALL = """
+import io, sys
+sys.path[:] = sys.argv[1:]
+import h5py
+def read(name, part):
+    list(part.attrs.items())
+    if isinstance(part, h5py.Dataset) and part.size is not None and part.size < 10**8:
+        part[()]
+with h5py.File(io.BytesIO(sys.stdin.buffer.read())) as file:
+    list(file.attrs.items())
+    file.visititems(read)
+"""
+"""A program that reads all of a netCDF-4 file."""
 
 
 def read_netcdf(
@@ -51,14 +71,14 @@ def read_netcdf(
     engine = next((name for magic, name in ENGINES.items() if content.startswith(magic)), None)
     if engine is None:
         raise failure(f"{path}: is not a netCDF file")
-    import xarray  # noqa: F401 - here, as the other process would import it in vain
-
+    if engine == "h5netcdf":
+        _import_libraries()
     wanted = tuple(groups)
 
     def read() -> dict[str, xr.Dataset]:
         return _read(content, engine, wanted)
 
-    if engine == "h5netcdf" and not _ends(read, SECONDS + len(content) / BYTES_PER_SECOND):
+    if engine == "h5netcdf" and not _ends(read, content):
         raise failure(f"{path}: is truncated or damaged (it cannot be read to its end)")
     try:
         return read()
@@ -66,6 +86,15 @@ def read_netcdf(
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise failure(f"{path}: is truncated or damaged ({reason})") from error
+
+
+@cache
+def _import_libraries() -> None:
+    """Here, as other processes would import them time and again."""
+    import h5netcdf  # noqa: F401
+    from xarray.backends import list_engines
+
+    list_engines()
 
 
 def _read(content: bytes, engine: str, groups: tuple[str, ...]) -> dict[str, xr.Dataset]:
@@ -112,24 +141,48 @@ def _checked_groups(content: bytes, groups: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(group for group in groups if isinstance(file.get(group), h5py.Group))
 
 
-def _ends(read: Callable[[], object], seconds: float) -> bool:
+def _ends(read: Callable[[], object], content: bytes) -> bool:
     """Whether reading comes to an end, with a result or an exception, in another process."""
-    if not hasattr(os, "fork"):
-        return True
+    seconds = SECONDS + len(content) / BYTES_PER_SECOND
+    if hasattr(os, "fork") and threading.active_count() == 1:
+        return _forked(read, seconds)
+    # A copy of a process with threads may wait for ever for what another thread holds. A new one
+    # takes longer to start.
+    try:
+        command = [sys.executable, "-c", READ_ALL, *sys.path]
+        done = subprocess.run(
+            command, input=content, capture_output=True, timeout=START + SLOW * seconds, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode >= 0
+
+
+def _forked(read: Callable[[], object], seconds: float) -> bool:
     with warnings.catch_warnings():
-        # The child does nothing but read, so that threads of the parent do not matter.
-        warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.simplefilter("ignore", DeprecationWarning)  # of threads that are not Python's
         child = os.fork()
     if not child:
         _try(read, seconds)
     try:
-        _, status = os.waitpid(child, 0)
+        deadline, pause = monotonic() + START + SLOW * seconds, 0.001
+        while monotonic() < deadline:
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                return os.WIFEXITED(status)
+            sleep(pause)
+            pause = min(2 * pause, 0.05)
     except BaseException:
-        with suppress(OSError):
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
+        _end(child)
         raise
-    return os.WIFEXITED(status)
+    _end(child)
+    return False
+
+
+def _end(child: int) -> None:
+    with suppress(OSError):
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
 
 
 def _try(read: Callable[[], object], seconds: float) -> None:
