@@ -173,7 +173,7 @@ def test_files_that_are_no_posterior_are_refused(tmp_path, capsys):
     (tmp_path / "broken.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))
     assert command(assist, "--posterior", tmp_path / "broken.nc") == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "broken.nc: cannot be read as a posterior" in error
+    assert error.count("\n") == 1 and "broken.nc: is truncated or damaged" in error
     assert command(assist, "--posterior", tmp_path / "none.nc") == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "none.nc: there is no such file" in error

@@ -247,11 +247,11 @@ def test_recordings_that_cannot_be_read_are_refused(folder, tmp_path, capsys):
     (tmp_path / "text.nc").write_text("person,action\n")
     (tmp_path / "empty.nc").touch()
     for name, message in {
-        "missing.nc": "No such file",
+        "missing.nc": "there is no such file",
         "truncated.nc": "truncated or damaged",
         "text.nc": "not a netCDF file",
         "empty.nc": "not a netCDF file",
-        ".": "cannot be read",
+        ".": "is not a regular file",
     }.items():
         args = "--demos", tmp_path / name, "--out", tmp_path / "out"
         assert message in refused(capsys, tmp_path, fit, *args)

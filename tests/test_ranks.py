@@ -143,7 +143,7 @@ def test_files_that_are_no_calibration(rng, tmp_path):
     with pytest.raises(PosteriorError, match="there is no such file"):
         Calibration.load(path)
     path.write_bytes(b"nothing")
-    with pytest.raises(PosteriorError, match="cannot be read as a calibration"):
+    with pytest.raises(PosteriorError, match="is not a netCDF file"):
         Calibration.load(path)
     data = gaussian(rng, 5)
     replace(data, data=data.data.drop_vars("prior_width")).save(path)

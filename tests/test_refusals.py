@@ -11,19 +11,19 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
-@pytest.mark.parametrize("rate", [float("nan"), float("inf"), 0.0, -1.0])
+@pytest.mark.parametrize("rate", [float("nan"), float("inf"), 0.0, -1.0, 1e30])
 @pytest.mark.parametrize(
     ("options", "error"), [(SelfModelOptions, ValueError), (train.Options, OptionError)]
 )
-def test_a_learning_rate_is_a_positive_number(options, error, rate):
-    with pytest.raises(error, match="must be a positive number"):
+def test_a_learning_rate_is_above_0_and_at_most_1(options, error, rate):
+    with pytest.raises(error, match="must be above 0 and at most 1"):
         options(learning_rate=rate)
 
 
 def test_a_human_model_that_exits_is_an_error_and_not_an_end(tmp_path):
     file = tmp_path / "leaving.py"
     file.write_text("import sys\nsys.exit(7)\n")
-    with pytest.raises(HumanModelError, match="does not import: SystemExit: 7"):
+    with pytest.raises(HumanModelError, match="does not import: .*sys.exit\\(7\\)"):
         load_human_model(f"{file}:Leaving", None)
 
 

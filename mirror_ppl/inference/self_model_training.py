@@ -16,7 +16,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Any, Self
 
@@ -98,8 +97,10 @@ class SelfModelOptions:
         for name in ("phases", "rounds", "steps", "batch", "stride"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not (self.learning_rate > 0 and isfinite(self.learning_rate)):
-            raise ValueError(f"learning_rate must be a positive number, not {self.learning_rate}")
+        if not 0 < self.learning_rate <= 1:
+            raise ValueError(
+                f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
+            )
         if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:
             raise ValueError(
                 f"kinds must be {len(KINDS)} numbers, not negative and not all 0, not {self.kinds}"

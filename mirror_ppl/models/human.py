@@ -32,7 +32,7 @@ import torch
 from pyro import poutine
 from torch import Tensor, nn
 
-from mirror_ppl.checks import require_kind
+from mirror_ppl.checks import require_methods
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
@@ -78,7 +78,7 @@ class HumanModel(nn.Module):
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__()
-        require_kind(self_model, SelfModel, "self_model")
+        require_methods(self_model, ["action_values"], "self_model", "a self-model")
         self.self_model = self_model.eval().requires_grad_(False)
 
     @property
