@@ -221,7 +221,7 @@ def _no_memory(error: BaseException | None) -> bool:
         asked = ASKED.search(str(error))
         if asked and asked[2][0] in "KMG":
             return asked[2][0] != "G" or float(asked[1]) < MOST_ANYWHERE
-        if not asked and (isinstance(error, MemoryError) or "alloc" in str(error).lower()):
+        if not asked and (isinstance(error, MemoryError) or "allocate" in str(error).lower()):
             return True
         error = error.__cause__ or error.__context__
     return False

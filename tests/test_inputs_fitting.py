@@ -264,8 +264,11 @@ def test_files_of_models_are_named_by_text_or_path(tmp_path):
         (lambda: load_posterior(3), "path must be the path of a file, not 3"),
         (lambda: load_population(3, Pooling(human())), "path must be the path of a file, not 3"),
         (lambda: load_human_model(3, human().self_model), "must be of the class str, not 3"),
-        (lambda: load_human_model("mirror", 3), "self_model must be a self-model, with the method action_values, not 3"),
-        (lambda: HumanModel(3), "self_model must be a self-model, with the method action_values, not 3"),
+        (lambda: load_human_model("mirror", 3), "self_model must be of the class SelfModel, not 3"),
+        (
+            lambda: HumanModel(3),
+            "self_model must be a self-model, with the method action_values, not 3",
+        ),
     ],
 )
 def test_what_is_no_file_or_network_is_refused(call, message):
