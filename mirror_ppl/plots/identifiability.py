@@ -20,6 +20,8 @@ ROW = 0.34
 """Inches of a person."""
 TITLED = 3.8
 """Inches that a title takes."""
+LEAST_WIDTH, CHARACTER = 4.4, 0.09
+"""Inches of the left panel without ids, and of a character of an id."""
 WRAP = 22
 MOST_PEOPLE = 60
 
@@ -37,8 +39,10 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
     people = [str(person) for person in group["person"].values]
     scenarios = [str(name) for name in group["scenario"].values]
     sites = [str(name) for name in group["site"].values]
-    # Room for what stands below: names of scenarios, or the legend.
-    widths = [5.2, max(TITLED, 0.75 * len(scenarios))][: 1 + bool(scenarios)]
+    labels = [label_of(person) for person in people]
+    # Room for long ids, and for what stands below: names of scenarios, or the legend.
+    least = LEAST_WIDTH + CHARACTER * max(map(len, labels))
+    widths = [least, max(TITLED, 0.75 * len(scenarios))][: 1 + bool(scenarios)]
     figure = Picture(figsize=(sum(widths), ROW * len(people) + 3.4), layout="constrained")
     axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
     rows = np.arange(len(people))
@@ -50,7 +54,7 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
         axes[0].barh(rows, whole, 0.75, left, color=colour, lw=0)
         axes[0].barh(rows, hanging, 0.75, left, color="none", hatch="//////", edgecolor=BLACK, lw=0)
         left = left + whole
-    axes[0].set_yticks(rows, [label_of(person) for person in people])
+    axes[0].set_yticks(rows, labels)
     axes[0].set_ylim(len(people) - 0.5, -0.5)
     axes[0].set_xlim(0, max(0.1, 1.05 * float(left.max())))
     axes[0].set_xlabel("nats open, of each by itself")
