@@ -17,7 +17,7 @@ from benchmarks._damage_datasets import STRANGE
 from mirror_ppl.models.weights import shipped_weights
 
 COMMANDS = ("fit", "assist", "calibrate", "compare", "evaluate", "train", "simulate", "")
-"""Of the package; the last is `python -m mirror_ppl` itself."""
+"""The commands that are tried; the last is `python -m mirror_ppl` itself."""
 QUICK_FIT = ("--demos", "driving.nc", "--train-rounds", "1", "--draws", "10", "--explore", "0")
 SMALL: dict[str, tuple[tuple[str, ...], ...]] = {
     "fit": (

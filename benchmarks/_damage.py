@@ -13,7 +13,7 @@ Random = np.random.Generator
 
 
 def _place(random: Random, size: int) -> int:
-    """Somewhere in a file; every other time near its beginning, where the structure is told."""
+    """Somewhere in a file; every other time near its beginning, where the structure stands."""
     near = random.random() < 0.5
     return int(random.integers(min(size, 4096) if near else size))
 

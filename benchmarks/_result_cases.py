@@ -35,7 +35,7 @@ POOLED = "pooled"
 QUICK = ("--guide", "exact", "--draws", "20", "--train-rounds", "2", "--explore", "0")
 GUIDES = {"driving_guide": None, "driving_guide_per_item": "per-item"}
 WHOLE = 5
-"""Of six versions of a posterior the one that has all groups, which is slow to read."""
+"""One of six versions of a posterior: with all groups, which is slow to read."""
 KINDS = ("posterior", "population", "self-model", "guide")
 
 

@@ -5,7 +5,7 @@
 Small recordings, posteriors, populations and weights are damaged, in their bytes and in what they
 hold, and read as the commands read them. Command lines are put together of good, bad and extreme
 values and run in folders of their own. Good is what is refused in one line, or accepted and equal
-to the original, or another file that somebody might have made so. Everything else is a fault:
+to the original, or another file that a user might have made. Everything else is a fault:
 another exception, more than 10 seconds or 500 MB, a process that dies, a change that goes in
 unnoticed, a recording that cannot have happened, anything left behind by a refused command.
 

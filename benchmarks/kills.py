@@ -53,7 +53,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "evaluate": ("evaluate", "prediction", "--people", "1", "--seeds", "2", "--rounds", "1", "2")
     + ("--models", "bc", "logistic", "--setting", "fog", "--jobs", "2", "--out", "out"),
 }
-"""Of some 10 to 30 seconds where nothing else is at work."""
+"""Each takes some 10 to 30 seconds where nothing else is at work."""
 SIGNALS = {
     "SIGKILL": (signal.SIGKILL, False),
     "SIGTERM": (signal.SIGTERM, False),
