@@ -4,6 +4,8 @@ import sys
 from collections.abc import Sequence
 
 from mirror_ppl import __version__
+from mirror_ppl.console import guarded
+from mirror_ppl.errors import OptionError
 
 PROGRAM = "python -m mirror_ppl"
 
@@ -42,10 +44,9 @@ def main(args: Sequence[str]) -> int:
             print(f"error: a command is called as {PROGRAM}.{name}", file=sys.stderr)
             return 2
         case [*_, last]:
-            print(f'error: unknown argument "{last}"; try {PROGRAM} --help', file=sys.stderr)
-            return 2
+            raise OptionError(f'unknown argument "{last}"; try {PROGRAM} --help')
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(guarded(lambda: main(sys.argv[1:])))

@@ -114,7 +114,7 @@ def main(options: Options) -> None:
     from mirror_ppl.evaluation.assistance import COMMUNICATORS, RATES_FROM, PlannerOptions
     from mirror_ppl.evaluation.assistance_cells import Pairing, run_cells
     from mirror_ppl.evaluation.assistance_summary import summarize_assistance
-    from mirror_ppl.files import lock_of, output_folder, remove_abandoned, write_together
+    from mirror_ppl.files import lock_of, output_folder, write_together
 
     chosen = options.communicator or COMMUNICATORS
     for name in chosen:
@@ -173,9 +173,9 @@ def main(options: Options) -> None:
     playing = len({*chosen} | ({RATES_FROM} if "random" in chosen else set()))
     with ExitStack() as stack:
         for path in outputs:
-            stack.enter_context(output_folder(path.parent, [path.name], lock_of(path)))
-        if parts is not None:
-            remove_abandoned(parts)
+            own = [parts.name] if parts is not None and path == kept else []
+            results = output_folder(path.parent, [path.name], lock_of(path), own)
+            stack.enter_context(results)
         progress = stack.enter_context(Progress("assist", number * playing))
         played = run_cells(pairing, chosen, number, options.jobs, parts, progress.update)
         summary = summarize_assistance(played, options.seed)
@@ -196,7 +196,7 @@ def _contents(
 ) -> dict[Path, str]:
     """What is written: a summary as data, and every decision."""
     from mirror_ppl.evaluation.assistance_summary import compare
-    from mirror_ppl.files import json_text
+    from mirror_ppl.files import json_text, plain
 
     contents = {}
     if options.json is not None:
@@ -219,7 +219,8 @@ def _contents(
         contents[options.json] = json_text(results)
     if options.log is not None:
         lines = [
-            json.dumps({"communicator": name, "person": posterior.people[person]} | entry) + "\n"
+            json.dumps(plain({"communicator": name, "person": posterior.people[person]} | entry))
+            + "\n"
             for name, people in played.items()
             for person, one in enumerate(people)
             for entry in one.log

@@ -86,7 +86,7 @@ def main(options: Options) -> int:
     """
     from mirror_ppl.data import asset_path, load_demonstrations
     from mirror_ppl.domains import get_domain, require_known
-    from mirror_ppl.files import output_folder, remove_abandoned, write_together
+    from mirror_ppl.files import output_folder, write_together
     from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
     from mirror_ppl.inference.guide_file import network_for
     from mirror_ppl.inference.guides import GUIDES, InferenceOptions, run_identity
@@ -111,10 +111,9 @@ def main(options: Options) -> int:
     what = [settings, setting, options.seed, trial]
     identity = run_identity(human, network, what)
     pictures = {"ranks.png": plot_ranks, "ecdf.png": plot_ecdf, "coverage.png": plot_coverage}
-    results = output_folder(options.out, ["calibration.nc", *pictures])
+    results = output_folder(options.out, ["calibration.nc", *pictures], parts=["parts"])
     with results as folder, Progress("calibrate", options.people) as progress:
         parts = folder / "parts"
-        remove_abandoned(parts)
         calibration = calibrate(
             human,
             partial(_infer, human, settings, network),

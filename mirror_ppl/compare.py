@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -63,7 +64,7 @@ def main(options: Options) -> None:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
     from mirror_ppl.evaluation.comparison import compare_fits, label_models, read_fit
-    from mirror_ppl.files import json_text, write_together
+    from mirror_ppl.files import json_text, lock_of, output_folder, write_together
     from mirror_ppl.plots.comparison import plot_comparison
 
     _check_outputs(options)
@@ -76,7 +77,10 @@ def main(options: Options) -> None:
     if options.figure is not None:
         picture = plot_comparison(comparison)
         contents[options.figure] = picture.content(options.figure.suffix[1:].lower())
-    write_together(contents)
+    with ExitStack() as stack:
+        for path in contents:
+            stack.enter_context(output_folder(path.parent, [path.name], lock_of(path)))
+        write_together(contents)
     _show(comparison)
     what = ((options.json, "the numbers, also of each person"), (options.figure, "the differences"))
     for path, content in what:

@@ -23,7 +23,7 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 128 + 2
 EXIT_BROKEN_PIPE = 128 + 13
 EXIT_TERMINATED = 128 + 15
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 """Errors of writing that are not the code's."""
 NO_MEMORY = ("can't allocate memory", "CUDA out of memory")
 """How torch says that there is too little memory."""
@@ -58,10 +58,15 @@ def run(
         130 after an interruption and 143 after SIGTERM; 141 when the reader of stdout went away.
         Other exceptions are mistakes of the code and pass through.
     """
+    return guarded(lambda: _run(options_class, main, prog, description, args, threads))
+
+
+def guarded(call: Callable[[], int]) -> int:
+    """The exit status of a call: its own, or that of how it ended; see `run`."""
     _open_streams()
     with _terminable():
         try:
-            status = _run(options_class, main, prog, description, args, threads)
+            status = call()
             sys.stdout.flush()
             return status
         except (KeyboardInterrupt, Exception) as error:
@@ -110,7 +115,8 @@ def _argument_error(box: str, prog: str) -> str:
     """What tyro says in a box, in one line."""
     # Between a title and the last line; drawn by plain characters where there are no others.
     text = "\n".join(line.strip("│| ") for line in box.splitlines()[1:-1])
-    parts = [" ".join(part.split()) for part in re.split("[─-]{3,}", text) if part.strip()]
+    parts = [" ".join(part.split()) for part in re.split(r"(?m)^\s*[─-]{3,}\s*$", text)]
+    parts = [part for part in parts if part] or [" ".join(box.split())]
     meant = [word for part in parts if part.startswith("Perhaps") for word in part.split()]
     options = dict.fromkeys(word.rstrip(",") for word in meant if word.startswith("--"))
     message = parts[0].rstrip(".")
@@ -133,9 +139,10 @@ def _ending(error: BaseException) -> tuple[int, str] | None:
     if passed_user_code(error):
         return EXIT_BAD_INPUT, f"error: {describe(error)}"
     if isinstance(error, OSError) and error.errno in NO_ROOM:
-        return EXIT_BAD_INPUT, f"error: cannot write: {error.strerror or error}"
+        where = f": {error.filename}" if error.filename else ""
+        return EXIT_BAD_INPUT, f"error: cannot write: {error.strerror or error}{where}"
     if isinstance(error, MemoryError) or any(sign in str(error) for sign in NO_MEMORY):
-        return EXIT_BAD_INPUT, f"error: there is too little memory ({' '.join(str(error).split())})"
+        return EXIT_BAD_INPUT, f"error: there is too little memory {' '.join(str(error).split())}"
     return None
 
 
@@ -202,7 +209,7 @@ def usable_device(name: str) -> str:
 
 
 def console_for_tables(width: int) -> "Console":
-    """A console as wide as the terminal, or as told where there is none.
+    """A console as wide as the terminal, or of a given width where there is none.
 
     It shows names as they are, whatever brackets or colons are in them.
     """

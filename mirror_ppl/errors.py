@@ -116,6 +116,10 @@ class OutputError(MirrorError):
     """Raised for a file or folder that cannot be created or written."""
 
 
+class WorkerError(MirrorError):
+    """Raised where a process that shares the work was ended from outside."""
+
+
 class CheckpointError(MirrorError):
     """Raised for a checkpoint from which work cannot be resumed.
 

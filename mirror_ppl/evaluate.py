@@ -110,16 +110,16 @@ def main(options: Options) -> int:
     from mirror_ppl.evaluation.study_report import REPORTS
     from mirror_ppl.evaluation.sweep import run_cells
     from mirror_ppl.evaluation.tables import comma_separated, page
-    from mirror_ppl.files import json_text, output_folder, remove_abandoned, write_together
+    from mirror_ppl.files import json_text, output_folder, write_together
 
     cells = _cells(options)
     work = predict if options.study == "prediction" else assist
     path = options.out / f"{options.study}.csv"
     kinds = (".csv", ".md", ".json", ".png")
-    results = output_folder(path.parent, [path.with_suffix(kind).name for kind in kinds])
+    names = [path.with_suffix(kind).name for kind in kinds]
+    results = output_folder(path.parent, names, parts=["parts"])
     with results as folder, Progress(options.study, len(cells)) as progress:
         parts = folder / "parts"
-        remove_abandoned(parts)
         outcomes = run_cells(
             cells,
             work,

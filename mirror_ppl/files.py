@@ -14,6 +14,7 @@ from platform import node
 from typing import Any, BinaryIO
 
 from mirror_ppl.errors import MirrorError, OutputError
+from mirror_ppl.limits import free_memory
 
 try:
     import fcntl
@@ -53,8 +54,10 @@ def write_together(
     """Write several files, all of them or none, each whole.
 
     Temporary files in the same folders are filled, and then take the files' places. Folders that
-    are missing are created. On any failure, interruption included, old files are untouched and
-    nothing new is left behind; what a killed process leaves is removed by the next `output_folder`.
+    are missing are created. On any failure, interruption included, old files are as before and
+    nothing new is left behind. A process that is killed in the moment in which files take their
+    places may leave some of the new ones, each whole; temporary files that it leaves are removed by
+    the next `output_folder`.
 
     Content is made in memory first: libraries that write files themselves report a full disk in
     many ways, one of which is to crash.
@@ -68,6 +71,8 @@ def write_together(
     """
     ready: list[tuple[Path, BinaryIO, Path]] = []
     made: list[Path] = []
+    old: dict[Path, Path] = {}
+    placed: list[Path] = []
     path: str | os.PathLike[str] = ""
     try:
         for path, content in contents.items():
@@ -81,12 +86,26 @@ def write_together(
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
-        for old in remove:
-            old.unlink(missing_ok=True)
+        stale = [Path(os.path.realpath(file)) for file in remove]
+        for target in {*stale, *(target for _, _, target in ready)}:
+            with suppress(OSError):  # there is none, or the file system has no links
+                backup = _temporary_beside(target)
+                os.link(target, backup)
+                old[target] = backup
+        for path in stale:
+            path.unlink(missing_ok=True)
         for temporary, _, target in ready:
             path = target
+            placed.append(target)
             temporary.replace(target)
     except BaseException as error:
+        for target in placed:
+            if target not in old:
+                with suppress(OSError):
+                    target.unlink(missing_ok=True)
+        for target, backup in old.items():
+            with suppress(OSError):
+                backup.replace(target)
         for temporary, _, _ in ready:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
@@ -95,6 +114,9 @@ def write_together(
             raise OutputError(f"cannot write {path}: {_reason(error)}") from error
         raise
     finally:
+        for backup in old.values():
+            with suppress(OSError):
+                backup.unlink(missing_ok=True)
         for _, file, _ in ready:
             with suppress(OSError):
                 file.close()
@@ -106,12 +128,18 @@ def read_whole(path: str | os.PathLike[str], failure: type[MirrorError]) -> byte
     Pipes and devices are refused: reading them may never end.
 
     Raises:
-        failure: the file is missing, cannot be read, or is not a regular file.
+        failure: the file is missing, cannot be read, is not a regular file, or is too large.
     """
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):
+        found = os.stat(path)
+        if not stat.S_ISREG(found.st_mode):
             raise failure(f"{path}: is not a regular file")
+        free = free_memory()
+        if free is not None and found.st_size > free / 2:
+            raise failure(f"{path}: its {found.st_size:,} bytes do not fit into memory")
         return Path(path).read_bytes()
+    except MemoryError as error:
+        raise failure(f"{path}: does not fit into memory") from error
     except FileNotFoundError as error:
         raise failure(f"{path}: there is no such file") from error
     except (OSError, ValueError) as error:  # a ValueError of a path with a null character
@@ -120,10 +148,13 @@ def read_whole(path: str | os.PathLike[str], failure: type[MirrorError]) -> byte
 
 def json_text(content: Any) -> str:
     """Strict JSON of plain values, paths and dataclasses; numbers that are not finite are null."""
-    return json.dumps(_plain(content), indent=1, allow_nan=False) + "\n"
+    return json.dumps(plain(content), indent=1, allow_nan=False) + "\n"
 
 
-def _plain(content: Any) -> Any:
+def plain(content: Any) -> Any:
+    """Values that strict JSON has: of numpy's numbers and arrays, paths, dataclasses."""
+    if hasattr(content, "tolist"):  # of numpy or torch
+        content = content.tolist()
     if isinstance(content, float):
         return content if isfinite(content) else None
     if isinstance(content, Path):
@@ -131,15 +162,18 @@ def _plain(content: Any) -> Any:
     if is_dataclass(content) and not isinstance(content, type):
         content = asdict(content)
     if isinstance(content, Mapping):
-        return {str(key): _plain(value) for key, value in content.items()}
+        return {str(key): plain(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_plain(value) for value in content]
+        return [plain(value) for value in content]
     return content
 
 
 @contextmanager
 def output_folder(
-    path: str | os.PathLike[str], names: Iterable[str] = (), lock: str = LOCK
+    path: str | os.PathLike[str],
+    names: Iterable[str] = (),
+    lock: str = LOCK,
+    parts: Sequence[str] = (),
 ) -> Iterator[Path]:
     """A folder in which this process alone writes its results; a context around long work.
 
@@ -153,6 +187,7 @@ def output_folder(
         names: of the files that will be written in it.
         lock: name of the lock; another than the folder's where files of one folder are the results
             of several commands, see `lock_of`.
+        parts: names of folders in it that will hold parts of the results.
 
     Yields:
         The folder.
@@ -165,9 +200,13 @@ def output_folder(
     folder = Path(path)
     for name in names:
         _require_file(folder / name, folder / name)
+    for part in parts:
+        if os.path.lexists(folder / part) and not os.path.isdir(folder / part):
+            raise OutputError(f"cannot create the folder {folder / part}: there is a file")
     made = _make_folder(folder)
     try:
-        remove_abandoned(folder)
+        for part in ("", *parts):
+            _remove_abandoned(folder / part)
         with _sole_use(folder / lock):
             yield folder
     except BaseException:
@@ -177,7 +216,7 @@ def output_folder(
 
 def lock_of(path: Path) -> str:
     """Name of the lock of a file that is written at the end of long work."""
-    return f".{path.name[:100]}{LOCK}"
+    return f".{_short(path.name)}{LOCK}"
 
 
 @contextmanager
@@ -240,7 +279,7 @@ def _require_file(target: Path, named: str | os.PathLike[str]) -> None:
     except FileNotFoundError:
         return
     except (OSError, ValueError) as error:
-        # What is in the way of a folder is told when the folder is made.
+        # What is in the way of a folder is reported when the folder is made.
         if isinstance(error, NotADirectoryError):
             return
         raise OutputError(f"cannot write {named}: {_reason(error)}") from error
@@ -250,8 +289,12 @@ def _require_file(target: Path, named: str | os.PathLike[str]) -> None:
 
 
 def _temporary_beside(target: Path) -> Path:
-    # The target's name is cut so that a long but valid one stays valid.
-    return target.with_name(f".{target.stem[:100]}-{secrets.token_hex(8)}{PARTIAL}")
+    return target.with_name(f".{_short(target.stem)}-{secrets.token_hex(8)}{PARTIAL}")
+
+
+def _short(name: str) -> str:
+    """The beginning of a name: with something added, a long but valid one stays valid."""
+    return os.fsencode(name)[:100].decode(errors="ignore")
 
 
 def _locked_temporary(target: Path) -> tuple[Path, BinaryIO]:
@@ -260,23 +303,22 @@ def _locked_temporary(target: Path) -> tuple[Path, BinaryIO]:
         path = _temporary_beside(target)
         # Created here, not by tempfile, so that it gets the permissions of any other new file.
         file = path.open("xb")
-        if _lock(file) and os.fstat(file.fileno()).st_nlink:
+        if _lock(file) is not False and os.fstat(file.fileno()).st_nlink:
             return path, file
         file.close()  # another process removed it before it was locked
 
 
-def remove_abandoned(folder: Path) -> None:
-    """Remove temporary files that killed processes left in a folder, if it is there."""
+def _remove_abandoned(folder: Path) -> None:
     for path in folder.glob(f".*{PARTIAL}"):
         with suppress(OSError), path.open("r+b") as file:
-            if fcntl is not None and _lock(file):
+            if _lock(file):
                 path.unlink()
 
 
-def _lock(file: BinaryIO) -> bool:
-    """Whether this process holds the file's lock now, or the file system has no locks."""
+def _lock(file: BinaryIO) -> bool | None:
+    """Whether this process holds the file's lock now; None where there are no locks."""
     if fcntl is None:
-        return True
+        return None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -284,6 +326,7 @@ def _lock(file: BinaryIO) -> bool:
     except OSError as error:
         if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
             raise
+        return None
     return True
 
 
@@ -292,7 +335,7 @@ def _held(path: Path) -> BinaryIO | None:
     while True:
         file = path.open("a+b")
         try:
-            if not _lock(file):
+            if _lock(file) is False:
                 file.close()
                 return None
             # Whoever held it before may have removed it in between.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 PROGRAM = "python -m mirror_ppl.fit"
 DOMAIN, POPULATION = "driving", "paper"
 CHECKPOINT = "fit.checkpoint"
+CHECKPOINTS = re.compile(r"fit\.checkpoint(\.refined)?(\.\d+)?")
 COPIES = 4
 """Of log-probabilities of actions, while they are worked out and drawn from."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
@@ -179,7 +181,8 @@ def main(options: Options) -> None:
         # a fit that is killed here cannot be taken for whole without their summary.
         write_together(contents, remove=[folder / name for name in results])
         for file in folder.glob(f"{CHECKPOINT}*"):
-            file.unlink()
+            if CHECKPOINTS.fullmatch(file.name) and file.is_file():
+                file.unlink()
     show_fit(summary, get_domain(demonstrations.domain).reach_unit)
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import faulthandler
 import io
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -17,11 +18,11 @@ import warnings
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache
-from time import monotonic, sleep
 from typing import TYPE_CHECKING
 
 from mirror_ppl.errors import MirrorError
 from mirror_ppl.files import read_whole
+from mirror_ppl.workers import WATCH
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -33,24 +34,28 @@ MOST_COMPRESSED = 1032
 """Bytes that deflate makes of one at most, by its format."""
 SMALL = 2**24
 """Bytes that a file may declare however small it is."""
-SECONDS, BYTES_PER_SECOND = 3.0, 2**24
+SECONDS, BYTES_PER_SECOND = 3.0, 2**26
 """Time of a processor after which reading counts as endless: for any file, and for so many bytes
-more."""
+that it declares more."""
 START, SLOW = 20.0, 20.0
 """Seconds that another process may take to start, and how much slower a busy machine may be."""
 READ_ALL = """
 import io, sys
-sys.path[:] = sys.argv[1:]
+most = int(sys.argv[1])
+sys.path[:] = sys.argv[2:]
 import h5py
-def read(name, part):
-    list(part.attrs.items())
-    if isinstance(part, h5py.Dataset) and part.size is not None and part.size < 10**8:
-        part[()]
+parts = []
 with h5py.File(io.BytesIO(sys.stdin.buffer.read())) as file:
     list(file.attrs.items())
-    file.visititems(read)
+    file.visititems(lambda name, part: parts.append(part))
+    data = [part for part in parts if isinstance(part, h5py.Dataset) and part.size]
+    if sum(part.size * part.dtype.itemsize for part in data) <= most:
+        for part in parts:
+            list(part.attrs.items())
+        for part in data:
+            part[()]
 """
-"""A program that reads all of a netCDF-4 file."""
+"""A program that reads all of a netCDF-4 file, if it declares no more than so many bytes."""
 
 
 def read_netcdf(
@@ -75,8 +80,8 @@ def read_netcdf(
         _import_libraries()
     wanted = tuple(groups)
 
-    def read() -> dict[str, xr.Dataset]:
-        return _read(content, engine, wanted)
+    def read(allow: Callable[[int], object] = lambda declared: None) -> dict[str, xr.Dataset]:
+        return _read(content, engine, wanted, allow)
 
     if engine == "h5netcdf" and not _ends(read, content):
         raise failure(f"{path}: is truncated or damaged (it cannot be read to its end)")
@@ -97,16 +102,20 @@ def _import_libraries() -> None:
     list_engines()
 
 
-def _read(content: bytes, engine: str, groups: tuple[str, ...]) -> dict[str, xr.Dataset]:
+def _read(
+    content: bytes, engine: str, groups: tuple[str, ...], allow: Callable[[int], object]
+) -> dict[str, xr.Dataset]:
+    """The groups; `allow` is called with the bytes that the file declares, before they are read."""
     import xarray as xr
 
     if engine == "h5netcdf":
-        groups = _checked_groups(content, groups)
+        groups, declared = _checked_groups(content, groups)
+        allow(declared)
     else:  # which has no groups
         groups = tuple(group for group in groups if group == "/")
     found = {}
     with warnings.catch_warnings():
-        # What is odd about a file of others, but can be read, is nothing to bother anybody with.
+        # Of oddities in a file that can be read all the same.
         warnings.simplefilter("ignore")
         for group in groups:
             # From memory, because the libraries leave a damaged file open. Without
@@ -121,8 +130,12 @@ def _read(content: bytes, engine: str, groups: tuple[str, ...]) -> dict[str, xr.
     return found
 
 
-def _checked_groups(content: bytes, groups: tuple[str, ...]) -> tuple[str, ...]:
-    """Those of the groups that are there, if the file declares no more than can be in it."""
+def _checked_groups(content: bytes, groups: tuple[str, ...]) -> tuple[tuple[str, ...], int]:
+    """Those of the groups that are there, and the bytes that the file declares.
+
+    Raises:
+        ValueError: it declares more than can be in it.
+    """
     import h5py
 
     declared = 0
@@ -136,64 +149,72 @@ def _checked_groups(content: bytes, groups: tuple[str, ...]) -> tuple[str, ...]:
         # h5netcdf would write to stderr if it failed to read these.
         list(file.attrs.items())
         file.visititems(add)
-        if declared > MOST_COMPRESSED * len(content) + SMALL:
+        if declared > _most(content):
             raise ValueError(f"it declares {declared:,} bytes, but has {len(content):,}")
-        return tuple(group for group in groups if isinstance(file.get(group), h5py.Group))
+        there = tuple(group for group in groups if isinstance(file.get(group), h5py.Group))
+        return there, declared
 
 
-def _ends(read: Callable[[], object], content: bytes) -> bool:
+def _most(content: bytes) -> int:
+    """Bytes that a file may declare."""
+    return MOST_COMPRESSED * len(content) + SMALL
+
+
+def _ends(read: Callable[[Callable[[int], object]], object], content: bytes) -> bool:
     """Whether reading comes to an end, with a result or an exception, in another process."""
-    seconds = SECONDS + len(content) / BYTES_PER_SECOND
-    if hasattr(os, "fork") and threading.active_count() == 1:
-        return _forked(read, seconds)
+    most = START + SLOW * (SECONDS + _most(content) / BYTES_PER_SECOND)
+    others = {thread.name for thread in threading.enumerate()} - {"MainThread", WATCH}
+    if hasattr(os, "fork") and not others:
+        return _forked(read, most)
     # A copy of a process with threads may wait for ever for what another thread holds. A new one
     # takes longer to start.
+    command = [sys.executable, "-c", READ_ALL, str(_most(content)), *sys.path]
     try:
-        command = [sys.executable, "-c", READ_ALL, *sys.path]
         done = subprocess.run(
-            command, input=content, capture_output=True, timeout=START + SLOW * seconds, check=False
+            command, input=content, capture_output=True, timeout=most, check=False
         )
     except subprocess.TimeoutExpired:
         return False
+    except OSError:  # there is no program of Python
+        return True
     return done.returncode >= 0
 
 
-def _forked(read: Callable[[], object], seconds: float) -> bool:
+def _forked(read: Callable[[Callable[[int], object]], object], seconds: float) -> bool:
+    ended, end = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of threads that are not Python's
         child = os.fork()
     if not child:
-        _try(read, seconds)
+        _try(read, end)
+    os.close(end)
     try:
-        deadline, pause = monotonic() + START + SLOW * seconds, 0.001
-        while monotonic() < deadline:
-            done, status = os.waitpid(child, os.WNOHANG)
-            if done:
-                return os.WIFEXITED(status)
-            sleep(pause)
-            pause = min(2 * pause, 0.05)
-    except BaseException:
-        _end(child)
-        raise
-    _end(child)
-    return False
+        # The child says so when it has read; the pipe closes when it ends, however it ends.
+        ready, _, _ = select.select([ended], [], [], seconds)
+        return bool(ready) and os.read(ended, 1) != b""
+    finally:
+        os.close(ended)
+        with suppress(OSError):
+            os.kill(child, signal.SIGKILL)
+        with suppress(OSError):  # where children are reaped by others
+            os.waitpid(child, 0)
 
 
-def _end(child: int) -> None:
-    with suppress(OSError):
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
+def _try(read: Callable[[Callable[[int], object]], object], end: int) -> None:
+    """Read, say so, and end this process."""
 
+    def allow(declared: int) -> None:
+        signal.setitimer(signal.ITIMER_PROF, SECONDS + declared / BYTES_PER_SECOND)
 
-def _try(read: Callable[[], object], seconds: float) -> None:
-    """Read, and end this process."""
     try:
         faulthandler.disable()
         with suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         # Of the processor's time, so that a busy machine makes no difference.
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
-        signal.setitimer(signal.ITIMER_PROF, seconds)
-        read()
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        with suppress(BaseException):
+            read(allow)
+        os.write(end, b"1")
     finally:
         os._exit(0)

@@ -1,4 +1,4 @@
-"""Code of users: files that commands load and run, and faults in them told in one line."""
+"""Code of users: files that commands load and run, and faults in them described in one line."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ def remember_file(path: Path) -> None:
     _FILES.add(path.resolve())
 
 
+def remembered_files() -> tuple[Path, ...]:
+    """Files of users, for other processes to remember."""
+    return tuple(_FILES)
+
+
 def describe(error: BaseException, path: Path | None = None) -> str:
     """An exception in one line, with the last line of the user's own file that it passed.
 
@@ -20,6 +25,8 @@ def describe(error: BaseException, path: Path | None = None) -> str:
         error: the exception.
         path: the file; any that was remembered unless given.
     """
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"SyntaxError: {error.msg} ({Path(error.filename).name}, line {error.lineno})"
     frames = traceback.extract_tb(error.__traceback__)
     own = _own_frames(frames, _FILES if path is None else {path.resolve()})
     text = " ".join(str(error).split())

@@ -7,18 +7,22 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from mirror_ppl.errors import HumanModelError, MirrorError
-from mirror_ppl.user_code import describe, passed_user_code
+from mirror_ppl.errors import HumanModelError, MirrorError, WorkerError
+from mirror_ppl.user_code import describe, passed_user_code, remember_file, remembered_files
 
 Result = TypeVar("Result")
 
 SECONDS_BETWEEN_LOOKS = 1.0
 """How often a worker looks whether the process that started it is still there."""
+WATCH = "mirror_ppl watch"
+"""Name of the thread that looks."""
 _watching = False
 
 
@@ -34,6 +38,7 @@ def run_tasks(tasks: Iterable[Callable[[], Result]], jobs: int) -> Iterator[Resu
 
     Raises:
         HumanModelError: a task failed in code of a user.
+        WorkerError: a process was ended from outside.
     """
     from joblib import Parallel, delayed
 
@@ -41,16 +46,25 @@ def run_tasks(tasks: Iterable[Callable[[], Result]], jobs: int) -> Iterator[Resu
         # Processes that have used much memory are replaced by new ones; nothing is lost.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
         # Work on a cluster is done by processes that nobody here started.
-        calls = (delayed(partial(_guarded, os.getpid(), task))() for task in tasks)
+        files = remembered_files()
+        calls = (delayed(partial(_guarded, os.getpid(), files, task))() for task in tasks)
         results = Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
         try:
             yield from cast(Iterator[Result], results)
+        except BrokenExecutor as error:
+            _end_workers()
+            raise WorkerError(
+                "a worker process was ended from outside, perhaps for lack of memory; use fewer "
+                "--jobs"
+            ) from error
         except BaseException:
             _end_workers()
             raise
 
 
-def _guarded(parent: int, task: Callable[[], Result]) -> Result:
+def _guarded(parent: int, files: Sequence[Path], task: Callable[[], Result]) -> Result:
+    for file in files:
+        remember_file(file)
     # One thread a process: the cores are shared by processes.
     import torch
 
@@ -83,7 +97,7 @@ def _end_with(parent: int) -> None:
             time.sleep(SECONDS_BETWEEN_LOOKS)
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=watch, name=WATCH, daemon=True).start()
 
 
 def _end_workers() -> None:

@@ -467,7 +467,7 @@ def test_people_without_discrete_implants_can_be_fitted(self_model, recordings):
     [
         ("steps", 0, "steps must be at least 1, not 0"),
         ("prune_every", -3, "prune_every must be at least 1, not -3"),
-        ("learning_rate", 0.0, "learning_rate must be positive, not 0.0"),
+        ("learning_rate", 0.0, "learning_rate must be above 0 and at most 1, not 0.0"),
     ],
 )
 def test_impossible_options_are_refused(name, value, message):

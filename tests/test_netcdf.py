@@ -2,6 +2,8 @@
 
 import io
 import os
+import signal
+import threading
 import time
 
 import h5py
@@ -48,12 +50,12 @@ def test_reading_that_does_not_end_or_crashes_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr(netcdf, "SECONDS", 0.3)
     parent, read = os.getpid(), netcdf._read
 
-    def endless(*args):
-        while os.getpid() != parent:
+    def endless(content, engine, groups, allow):
+        assert os.getpid() != parent
+        while True:
             pass
-        pytest.fail("the process itself should not try")
 
-    def crash(*args):
+    def crash(content, engine, groups, allow):
         assert os.getpid() != parent
         os.abort()
 
@@ -102,3 +104,27 @@ def test_names_that_are_no_utf8(tmp_path):
     with pytest.raises(DemonstrationsError) as error:
         load_demonstrations(path)
     assert str(error.value).isprintable()
+
+
+def test_files_are_read_where_there_are_threads(tmp_path):
+    """A copy of such a process might wait for ever for what another thread holds."""
+    path = tmp_path / "a.nc"
+    save_demonstrations(path, simple())
+    found = []
+    work = lambda: found.append(load_demonstrations(path))  # noqa: E731
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(100)
+    assert len(found) == 2 and found[0].equals(found[1])
+
+
+def test_files_are_read_where_children_are_reaped_by_others(tmp_path):
+    path = tmp_path / "a.nc"
+    save_demonstrations(path, simple())
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        load_demonstrations(path)
+    finally:
+        signal.signal(signal.SIGCHLD, before)

@@ -11,8 +11,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from running import command
 
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl import calibrate
+from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.user_code import remember_file
 from mirror_ppl.workers import run_tasks
 
@@ -51,12 +53,15 @@ def test_a_fault_in_a_users_file_is_one_line(tmp_path):
         list(run_tasks([space["fails"]], 1))
 
 
-def marked():
-    """Processes that inherited the mark."""
+def marked(value):
+    """Processes that inherited the mark with this value."""
     found = []
     for process in Path("/proc").iterdir():
         with suppress(OSError):
-            if process.name.isdecimal() and MARK.encode() in (process / "environ").read_bytes():
+            if (
+                process.name.isdecimal()
+                and f"{MARK}={value}\0".encode() in (process / "environ").read_bytes()
+            ):
                 found.append(int(process.name))
     return found
 
@@ -90,10 +95,45 @@ def test_workers_end_soon_after_the_process_that_started_them(tmp_path, number):
         text=True,
     ) as process:
         assert process.stdout.readline() == "at work\n"
-        assert len(marked()) >= 3
+        assert len(marked(tmp_path)) >= 3
         process.send_signal(number)
         assert process.wait(10) == {9: -9, 15: 143, 2: 130}[number]
         deadline = time.monotonic() + 10
-        while marked() and time.monotonic() < deadline:
+        while marked(tmp_path) and time.monotonic() < deadline:
             time.sleep(0.1)
-        assert marked() == []
+        assert marked(tmp_path) == []
+
+
+MODEL = """
+from mirror_ppl.models.toy import ToyHuman
+
+calls = 0
+
+
+class Fails(ToyHuman):
+    def act(self, implants, belief, values):
+        global calls
+        calls += 1
+        if calls > 3:
+            raise RuntimeError("later")
+        return super().act(implants, belief, values)
+"""
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_calibration_names_the_line_of_a_faulty_model(tmp_path, capsys, jobs):
+    (tmp_path / "fails.py").write_text(MODEL)
+    model = ("--human-model", f"{tmp_path / 'fails.py'}:Fails", "--out", tmp_path / "out")
+    small = ("--people", 10, "--rounds", 1, "--draws", 5, "--jobs", jobs)
+    assert command(calibrate, *model, *small) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line == "error: RuntimeError: later (fails.py, line 12)"
+
+
+def test_a_worker_that_is_killed_is_one_line():
+    with pytest.raises(MirrorError, match="a worker process was ended from outside"):
+        list(run_tasks([partial(square, 1), _kill_oneself], 2))
+
+
+def _kill_oneself():
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -20,7 +20,7 @@ from mirror_ppl.errors import DemonstrationsError
 TOLERANCE = 1e-3
 """Differences up to this, in the domain's units, are rounding."""
 ENOUGH_STEPS = 5
-"""Contradicting steps from which on it is told whether the actions look shifted."""
+"""With fewer contradicting steps, nothing is said of shifted actions."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,7 @@ def _wrong(
     domain, mask = get_domain(demonstrations.domain), demonstrations.mask[person]
     actions = demonstrations.actions[person].clamp(min=0)
     if shift:
-        actions, mask = torch.roll(actions, shift, -1), mask & torch.roll(mask, shift, -1)
-        mask[:, 0 if shift > 0 else -1] = False
+        actions, mask = torch.roll(actions, shift, -1), mask & _has_neighbour(mask, shift)
     now = {name: value[:, :-1] for name, value in observation.items()}
     expected = domain.next_observation(now, actions)
     differs = [
@@ -130,6 +129,13 @@ def _wrong(
         for name, value in observation.items()
     ]
     return torch.stack(differs).any(0) & mask
+
+
+def _has_neighbour(mask: Tensor, shift: int) -> Tensor:
+    """Steps ``[B, T]`` with a step of the same round so many steps before."""
+    shifted = torch.roll(mask, shift, -1)
+    shifted[:, 0 if shift > 0 else -1] = False
+    return shifted
 
 
 def _differs(expected: Tensor, found: Tensor) -> Tensor:
@@ -170,7 +176,7 @@ def _shifted(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
         left = fitting = 0
         for person, steps in enumerate(wrong):
             still = _wrong(demonstrations, person, _observation(demonstrations, person), shift)
-            own = steps & torch.roll(demonstrations.mask[person], shift, -1)
+            own = steps & _has_neighbour(demonstrations.mask[person], shift)
             left += int(still.sum())
             fitting += int((own & ~still).sum())
         if fitting > number / 2 and left < number / 2:

@@ -15,7 +15,7 @@ from torch import Tensor
 from mirror_ppl.checks import as_path
 from mirror_ppl.data import schema
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.data.provenance import DESCRIPTION
+from mirror_ppl.data.provenance import DESCRIPTION, RESERVED
 from mirror_ppl.data.schema import TOLD, TRUTH
 from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
@@ -214,7 +214,7 @@ def _provenance(attributes: Mapping[str, object]) -> dict[str, str | int | float
     provenance = {}
     for name, value in attributes.items():
         plain = value.item() if isinstance(value, np.generic) else value
-        if name not in DESCRIPTION and type(plain) in (str, int, float):
+        if name not in (*DESCRIPTION, *RESERVED) and type(plain) in (str, int, float):
             provenance[str(name)] = plain
     return provenance
 

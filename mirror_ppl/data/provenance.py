@@ -11,7 +11,10 @@ import numpy as np
 from mirror_ppl.errors import DemonstrationsError, is_name, shown
 
 DESCRIPTION = ("title", "Conventions", "format", "format_version", "domain", "setting")
-"""Attributes of a file that describe it; all others tell where the recordings come from."""
+"""Attributes of a file that describe it; all others say where the recordings come from."""
+RESERVED = ("NAME", "CLASS", "DIMENSION_LIST", "REFERENCE_LIST", "_NCProperties", "_nc3_strict")
+RESERVED += ("_Netcdf4Dimid", "_Netcdf4Coordinates")
+"""Attributes that netCDF-4 files keep for themselves."""
 
 
 def checked_provenance(provenance: Any) -> dict[str, str | int | float]:
@@ -26,6 +29,8 @@ def checked_provenance(provenance: Any) -> dict[str, str | int | float]:
     for name, value in provenance.items():
         if name in DESCRIPTION:
             raise DemonstrationsError(f"provenance has {name}, which is not a matter of origin")
+        if name in RESERVED:
+            raise DemonstrationsError(f"provenance has {name}, which netCDF keeps for itself")
         if not is_name(name):
             raise DemonstrationsError(f"provenance has {shown(name)}, expected names as text")
         plain = value.item() if isinstance(value, np.generic) else value

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -19,8 +17,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, Protocol, cast
 
-from mirror_ppl.errors import OptionError
+from mirror_ppl.errors import OptionError, WorkerError
 from mirror_ppl.files import write_whole
+from mirror_ppl.user_code import describe
 from mirror_ppl.workers import run_tasks
 
 Rows = list[dict[str, Any]]
@@ -130,18 +129,15 @@ def run_cells(
 
 def _killed(error: Exception) -> bool:
     """Whether a process ended without a word, of this machine or of a cluster."""
-    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+    return isinstance(error, WorkerError) or type(error).__name__ == "KilledWorker"
 
 
 def _cell(place: int, cell: Cell, work: Callable[[Any], Rows]) -> tuple[int, Outcome]:
     began = perf_counter()
     try:
         rows = work(cell)
-    except Exception as error:  # noqa: BLE001 - whatever it is, the other cells go on
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(last.filename).name}, line {last.lineno}"
-        text = f"{type(error).__name__}: {error} ({where})"
-        return place, Outcome(cell, seconds=perf_counter() - began, error=text)
+    except (Exception, SystemExit) as error:  # whatever it is, the other cells go on
+        return place, Outcome(cell, seconds=perf_counter() - began, error=describe(error))
     return place, Outcome(cell, rows, perf_counter() - began)
 
 

@@ -29,6 +29,7 @@ import xarray as xr
 from torch import Tensor
 
 from mirror_ppl import __version__
+from mirror_ppl.checks import whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
 from mirror_ppl.errors import PosteriorError
@@ -79,8 +80,7 @@ class CalibrationOptions:
 
     def __post_init__(self) -> None:
         for name in ("people", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            object.__setattr__(self, name, whole_number(getattr(self, name), name, 1))
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
             raise ValueError(f"rounds must be positive and increase, not {self.rounds}")
 

@@ -11,6 +11,7 @@ import torch
 
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import AssetError
+from mirror_ppl.files import json_text
 from mirror_ppl.inference.amortized import AmortizedGuide, reference_places
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import model_name
@@ -49,7 +50,7 @@ def save_guide(
         "domain_version": human.domain.version,
         "human_model": type(human).__name__,
         "self_model": fingerprint(human.self_model),
-        "card": json.dumps(card, indent=1),
+        "card": json_text(card),
     }
     save_tensors(path, guide.state_dict(), metadata)
 

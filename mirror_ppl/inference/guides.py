@@ -108,7 +108,7 @@ class InferenceOptions:
         share = real_number(self.allow_contradictions, "allow_contradictions", 0, 1)
         object.__setattr__(self, "allow_contradictions", share)
         if self.refine and self.guide not in ("amortized", "exact"):
-            raise ValueError(f"refining starts at what amortized or exact found, not {self.guide}")
+            raise InputError(f"refining starts at what amortized or exact found, not {self.guide}")
 
 
 def infer(

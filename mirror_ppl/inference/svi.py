@@ -23,6 +23,8 @@ from torch import Tensor
 from torch.distributions import biject_to
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
+from mirror_ppl.checks import real_number, whole_number
+from mirror_ppl.errors import InputError
 from mirror_ppl.inference.combinations import discrete_sites
 from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.inference.marginal_elbo import PLATES, marginal_elbo
@@ -69,10 +71,11 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         for name in ("steps", "draws", "checkpoint_every", "prune_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
+            object.__setattr__(self, name, whole_number(getattr(self, name), name, 1))
+        if not 0 < real_number(self.learning_rate, "learning_rate", 0) <= 1:
+            raise InputError(
+                f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
+            )
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from mirror_ppl.checks import as_path
 from mirror_ppl.data import asset_path
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, MirrorError
-from mirror_ppl.files import read_whole, write_whole
+from mirror_ppl.files import json_text, read_whole, write_whole
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
 
@@ -57,7 +57,7 @@ def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) 
         "domain": self_model.domain.name,
         "domain_version": self_model.domain.version,
         "sizes": json.dumps(asdict(self_model.sizes)),
-        "card": json.dumps(card, indent=1),
+        "card": json_text(card),
     }
     save_tensors(path, self_model.state_dict(), metadata)
 

@@ -5,10 +5,11 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from matplotlib import font_manager, rc_context
+from matplotlib import font_manager
 from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
 from matplotlib.text import Text
+from matplotlib.ticker import FixedFormatter, FuncFormatter
 
 from mirror_ppl.files import write_whole
 
@@ -26,14 +27,27 @@ class Picture(Figure):
 
     def draw(self, renderer: Any) -> None:
         """Draw it; see `matplotlib.figure.Figure.draw`."""
+        numbers = self._numbers()
         for text in self.findobj(Text):
             assert isinstance(text, Text)
-            text.set_parse_math(False)
-            text.set_text(displayable(text.get_text(), text.get_fontproperties()))
-        with rc_context({"text.parse_math": False}), warnings.catch_warnings():
+            if text not in numbers:
+                text.set_parse_math(False)
+                text.set_text(displayable(text.get_text(), text.get_fontproperties()))
+        with warnings.catch_warnings():
             # Of labels of ticks, whose texts are made while they are drawn.
             warnings.filterwarnings("ignore", "Glyph .* missing from font")
             super().draw(renderer)
+
+    def _numbers(self) -> set[Text]:
+        """Labels of ticks that are numbers, which matplotlib may write as formulas."""
+        axes = [axis for ax in self.axes for axis in (ax.xaxis, ax.yaxis)]
+        ticks = [
+            tick
+            for axis in axes
+            if not isinstance(axis.get_major_formatter(), FixedFormatter | FuncFormatter)
+            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks())
+        ]
+        return {label for tick in ticks for label in (tick.label1, tick.label2)}
 
     def save(self, path: Path) -> None:
         """Write it in the format of the path's suffix, whole or not at all.
