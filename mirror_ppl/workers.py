@@ -23,15 +23,17 @@ SECONDS_BETWEEN_LOOKS = 1.0
 """How often a worker looks whether the process that started it is still there."""
 WATCH = "mirror_ppl watch"
 """Name of the thread that looks."""
-_watching = False
 
 
-def run_tasks(tasks: Iterable[Callable[[], Result]], jobs: int) -> Iterator[Result]:
+def run_tasks(
+    tasks: Iterable[Callable[[], Result]], jobs: int, here: bool = True
+) -> Iterator[Result]:
     """Do tasks in processes; when this is interrupted or closed, so are they.
 
     Args:
         tasks: calls without arguments, such as a `functools.partial` of a module's function.
         jobs: number of processes; 1 for this one, -1 for one a core.
+        here: whether they are processes of this machine, and not those of joblib's active backend.
 
     Yields:
         Results, in the order in which tasks end.
@@ -45,10 +47,12 @@ def run_tasks(tasks: Iterable[Callable[[], Result]], jobs: int) -> Iterator[Resu
     with warnings.catch_warnings():
         # Processes that have used much memory are replaced by new ones; nothing is lost.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
-        # Work on a cluster is done by processes that nobody here started.
+        own: dict[str, Any] = {}
+        if here and jobs != 1:
+            own = {"backend": "loky", "initializer": _end_with, "initargs": (os.getpid(),)}
         files = remembered_files()
-        calls = (delayed(partial(_guarded, os.getpid(), files, task))() for task in tasks)
-        results = Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
+        calls = (delayed(partial(_guarded, files, task))() for task in tasks)
+        results = Parallel(n_jobs=jobs, return_as="generator_unordered", **own)(calls)
         try:
             yield from cast(Iterator[Result], results)
         except BrokenExecutor as error:
@@ -62,15 +66,13 @@ def run_tasks(tasks: Iterable[Callable[[], Result]], jobs: int) -> Iterator[Resu
             raise
 
 
-def _guarded(parent: int, files: Sequence[Path], task: Callable[[], Result]) -> Result:
+def _guarded(files: Sequence[Path], task: Callable[[], Result]) -> Result:
     for file in files:
         remember_file(file)
     # One thread a process: the cores are shared by processes.
     import torch
 
     torch.set_num_threads(1)
-    if os.getppid() == parent:
-        _end_with(parent)
     try:
         return task()
     except MirrorError:
@@ -84,10 +86,6 @@ def _guarded(parent: int, files: Sequence[Path], task: Callable[[], Result]) -> 
 
 def _end_with(parent: int) -> None:
     """End this process soon after the one that started it, also if that one was killed."""
-    global _watching  # noqa: PLW0603 - one watch a process
-    if _watching:
-        return
-    _watching = True
     with suppress(ValueError):  # not the main thread
         # A terminal interrupts all processes at once; the one that started this one decides.
         signal.signal(signal.SIGINT, signal.SIG_IGN)

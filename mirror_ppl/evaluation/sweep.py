@@ -107,7 +107,8 @@ def run_cells(
             report(len(outcomes), outcome.cell.label + (" failed" if outcome.error else ""))
 
         def results(places: Sequence[int]) -> Iterator[tuple[int, Outcome]]:
-            return run_tasks([partial(_cell, place, cells[place], work) for place in places], jobs)
+            tasks = [partial(_cell, place, cells[place], work) for place in places]
+            return run_tasks(tasks, jobs, here=scheduler is None)
 
         try:
             for place, outcome in results(todo):
