@@ -36,7 +36,7 @@ def require_kind(value: Any, kind: type[Kind], name: str) -> Kind:
 
 
 def require_methods(value: Any, methods: Iterable[str], name: str, what: str) -> None:
-    """Make sure that an object of somebody's own has the methods that it needs.
+    """Make sure that a user's own object has the methods that it needs.
 
     Raises:
         InputError: it lacks one.

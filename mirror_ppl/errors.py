@@ -11,7 +11,7 @@ from reprlib import repr as short_repr
 from typing import Any, Self
 
 MOST_CHARACTERS = 100
-"""Of a name that a person chooses, such as a person's id."""
+"""What is expected of a name that a user chooses, such as a person's id."""
 SHOWN = 40
 """Characters of a longer text that a message shows."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import faulthandler
 import io
+import math
 import os
 import select
 import signal
@@ -37,12 +38,15 @@ SMALL = 2**24
 SECONDS, BYTES_PER_SECOND = 3.0, 2**26
 """Time of a processor after which reading counts as endless: for any file, and for so many bytes
 that it declares more."""
+IMPORTS = 2.0
+"""Time of a processor that a new process needs for its libraries."""
 START, SLOW = 20.0, 20.0
 """Seconds that another process may take to start, and how much slower a busy machine may be."""
 READ_ALL = """
-import io, sys
-most = int(sys.argv[1])
-sys.path[:] = sys.argv[2:]
+import io, resource, sys
+most, seconds = int(sys.argv[1]), int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+sys.path[:] = sys.argv[3:]
 import h5py
 parts = []
 with h5py.File(io.BytesIO(sys.stdin.buffer.read())) as file:
@@ -168,7 +172,8 @@ def _ends(read: Callable[[Callable[[int], object]], object], content: bytes) -> 
         return _forked(read, most)
     # A copy of a process with threads may wait for ever for what another thread holds. A new one
     # takes longer to start.
-    command = [sys.executable, "-c", READ_ALL, str(_most(content)), *sys.path]
+    limit = math.ceil(IMPORTS + SECONDS + _most(content) / BYTES_PER_SECOND)
+    command = [sys.executable, "-c", READ_ALL, str(_most(content)), str(limit), *sys.path]
     try:
         done = subprocess.run(
             command, input=content, capture_output=True, timeout=most, check=False

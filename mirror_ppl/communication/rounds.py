@@ -173,7 +173,7 @@ class RoundSoFar:
         return {name: value[-1] for name, value in self.observation.items()}
 
     def to(self, device: torch.device) -> RoundSoFar:
-        """The same on another device."""
+        """The round on another device."""
         if self.actions.device == device:
             return self
         observation = {name: value.to(device) for name, value in self.observation.items()}
@@ -185,7 +185,7 @@ def _the(name: str) -> str:
 
 
 def _shapes(domain: Domain) -> dict[str, tuple[int, ...]]:
-    """Of one observation of everything, by name."""
+    """Values of one observation of everything, by name."""
     shapes = {m.name: (len(m.items), len(m.features)) for m in domain.modalities}
     return {EGO: (len(domain.ego_features),), **shapes}
 

@@ -219,7 +219,7 @@ class Demonstrations:
 
         Raises:
             UnknownNameError: there is nobody of that id.
-            DemonstrationsError: an index is out of range or no index, somebody is named twice, or
+            DemonstrationsError: an index is out of range or no index, a person is named twice, or
                 the list is empty or no list.
         """
         chosen = []
@@ -265,7 +265,7 @@ class Demonstrations:
         return self._like(variables, self.people)
 
     def to(self, device: torch.device | str) -> Demonstrations:
-        """The same on another device.
+        """These recordings on another device.
 
         Raises:
             UnknownNameError: there is no such device here.
