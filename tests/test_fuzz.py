@@ -20,6 +20,7 @@ from benchmarks._damage_structure import OF_HDF5
 from benchmarks._damage_weights import OF_WEIGHTS
 from benchmarks._judging import fault_of, measured
 from mirror_ppl import __main__
+from mirror_ppl.console import guarded
 from mirror_ppl.errors import AssetError
 from mirror_ppl.inference.export import az, in_units, netcdf_content
 from mirror_ppl.inference.guide_file import load_guide, shipped_guide
@@ -126,7 +127,10 @@ def test_odd_options_are_refused_in_a_line(monkeypatch, capsys, tmp_path):
     @settings(max_examples=100)
     def judged(seed):
         name, arguments = line(np.random.default_rng(seed))
-        status = command(modules[name], *arguments) if name else __main__.main(arguments)
+        if name:
+            status = command(modules[name], *arguments)
+        else:
+            status = guarded(lambda: __main__.main(arguments))
         said = capsys.readouterr().err.splitlines()
         assert status in (0, 2), arguments
         assert (status == 0) == (not said), said
