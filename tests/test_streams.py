@@ -73,11 +73,17 @@ def test_streams_that_are_ascii(tmp_path):
     ("number", "status", "line"),
     [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
 )
-def test_signals_end_work_at_once_and_leave_nothing(tmp_path, number, status, line):
+def test_signals_end_work_at_once_and_leave_nothing(request, tmp_path, number, status, line):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "mirror_ppl.fit", "--guide", "svi", "--steps", "100000"]
+    # A background job ignores interruptions, and so would the processes that it starts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     with subprocess.Popen(
-        [*command, "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         deadline = time.monotonic() + 60
         while not out.exists() and time.monotonic() < deadline:
