@@ -95,7 +95,9 @@ class _Relaxed:
                 implants[site] = pyro.sample(site, dist.Uniform(like.new_zeros(()), 1.0))
             implants |= policy_implants(domain, human.belief_size, like)
             belief = self._believe(self._perceive(implants))
+            belief = belief.flatten(1, 2)  # each moment as a round of its own
             found = human.act(implants, belief, human.action_values(belief))
+            found = found.unflatten(1, self.acted.shape[1:])
             chosen = found.gather(-1, self.acted[..., None]).squeeze(-1)
             total = torch.where(self.rounds.actions >= 0, chosen, 0.0).sum((-1, -2))
             pyro.factor("actions", total[..., None])

@@ -59,9 +59,9 @@ class ByHand(torch.nn.Module):
             stretch = onto.log_abs_det_jacobian(place, value)
             density = torch.distributions.Normal(self.loc[name], width).log_prob(place)
             total = total + fn.log_prob(value).sum() + stretch.sum() - density.sum()
-        logits = implants["consistency"][..., None, None] * table.values
+        logits = implants["consistency"][..., None] * table.values
         logits = logits + residual(implants, table.belief)
-        lapse = implants["lapse"][..., None, None]
+        lapse = implants["lapse"][..., None]
         aware = torch.log1p(-lapse) + torch.log_softmax(logits, -1)
         actions = torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
         likelihood = table.log_likelihoods(actions)  # [P, V]

@@ -23,6 +23,7 @@ from mirror_ppl.domains import Observation, Visibility, get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.course import go_through
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, assumption_sites, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import draw_starts, simulated_drivers
@@ -51,9 +52,9 @@ class Options:
 class EncoderRemembers(HumanModel):
     """Only what is seen or told at a step is visible at it."""
 
-    def look(self, implants, knowledge, observation, told, step):
-        """See `HumanModel.look`."""
-        view, after = super().look(implants, knowledge, observation, told, step)
+    def perceive(self, implants, knowledge, observation, told, step):
+        """See `HumanModel.perceive`."""
+        view, after = super().perceive(implants, knowledge, observation, told, step)
         seen = self.sees(implants, observation, step)
         return replace(
             view, visible={name: mask | told[name] for name, mask in seen.items()}
@@ -141,11 +142,9 @@ def tell(
 def divergence(person: Person, rounds: Told) -> Tensor:
     """Nats an action by which the model of a person misses their true probabilities."""
     human = person.human
-    eye = torch.zeros(len(rounds.actions), dtype=torch.long)
-    view = person.see(eye, rounds.observation, rounds.told)
-    belief = human.believe(view, rounds.observation, rounds.actions)
-    # Every step is a course of its own: `Person.act` gives the last action of each.
-    belief = belief.flatten(0, 1)[None, :, None]
+    implants = {name: value[0] for name, value in person.eyes.items()}
+    steps = go_through(human, implants, rounds.observation, rounds.told, rounds.actions)
+    belief = torch.stack([belief for _, belief in steps], 1).flatten(0, 1)[None]
     predicted = person.act(belief, human.self_model.action_values(belief))[0]
     true = rounds.chances.flatten(0, 1)
     return (true * (true.clamp(min=1e-9).log() - predicted)).sum(-1).mean()

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from mirror_ppl.console import console_for_tables, run
 from mirror_ppl.errors import (
-    HumanModelError,
     OptionError,
     PosteriorError,
     UnknownNameError,
@@ -111,6 +110,7 @@ def main(options: Options) -> None:
     Raises:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
+    from mirror_ppl.communication.objectives import beliefs_have_density, require_density
     from mirror_ppl.evaluation.assistance import COMMUNICATORS, RATES_FROM, PlannerOptions
     from mirror_ppl.evaluation.assistance_cells import Pairing, run_cells
     from mirror_ppl.evaluation.assistance_summary import summarize_assistance
@@ -154,14 +154,12 @@ def main(options: Options) -> None:
         keep_log=options.log is not None,
     )
     pairing.check()
-    if KL in chosen and not pairing.human.stepwise:
+    if KL in chosen and not beliefs_have_density(pairing.human):
         if KL in options.communicator:
-            raise HumanModelError(
-                f"{type(pairing.human).__name__} is not stepwise, so its beliefs have no density, "
-                f"which {KL} compares; see HumanModel.stepwise, or leave {KL} out"
-            )
+            require_density(pairing.human)
         chosen = tuple(name for name in chosen if name != KL)
-        print(f"{KL} is left out: {type(pairing.human).__name__} is not stepwise", file=sys.stderr)
+        name = type(pairing.human).__name__
+        print(f"{KL} is left out: beliefs of {name} have no density", file=sys.stderr)
     if not options.communicator and pairing.domain.as_believed is not pairing.domain:
         chosen = tuple(name for name in chosen if name != LEARNED)
         print(

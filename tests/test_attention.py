@@ -54,7 +54,7 @@ class OneItem(PerItem):
         known[NOTICES[0]] = pyro.sample(NOTICES[0], dist.Beta(1.0, 1.0))
         return known | policy_implants(self.domain, self.self_model.latent, like)
 
-    def attend(self, implants):
+    def round_latents(self, implants):
         first = NOTICED[0]
         return {first: pyro.sample(first, first_success(implants[NOTICES[0]], STEPS))}
 
@@ -166,7 +166,7 @@ def test_attention_of_two_people_is_drawn_with_their_own_probabilities(per_item)
     implants = {site: torch.tensor([[0.9], [0.05]]) for site in NOTICES}
     torch.manual_seed(0)
     with pyro.plate("person", 2, dim=-2), pyro.plate("round", 1000, dim=-1):
-        drawn = per_item.attend(implants)
+        drawn = per_item.round_latents(implants)
     for site in NOTICED:
         assert drawn[site].shape == (2, 1000)
         for person, probability in enumerate((0.9, 0.05)):
@@ -530,13 +530,13 @@ class Wrong(PerItem):
 
     kind = ""
 
-    def attend(self, implants):
+    def round_latents(self, implants):
         if self.kind == "returns":
-            super().attend(implants)
+            super().round_latents(implants)
             return {}
         if self.kind == "param":
             pyro.param("p", torch.tensor(0.5))
-            return super().attend(implants)
+            return super().round_latents(implants)
         if self.kind == "clash":
             return {"lapse": pyro.sample("lapse", dist.Bernoulli(0.5))}
         if self.kind == "support":
@@ -567,7 +567,7 @@ def test_what_cannot_be_attended_to_is_refused(self_model, kind, message):
 class Empty(PerItem):
     """Overrides attend, and nothing differs."""
 
-    def attend(self, implants):
+    def round_latents(self, implants):
         return {}
 
     def sees(self, implants, observation, step):
@@ -577,7 +577,7 @@ class Empty(PerItem):
 def test_attention_to_nothing_is_none(self_model, recordings):
     human = Empty(self_model)
     check_contract(human)
-    assert not human.attends
+    assert not human.has_round_latents
     one = recordings.select_people([0]).select_rounds([0])
     assert build_view_table(human, one).attention is None
 
@@ -585,7 +585,7 @@ def test_attention_to_nothing_is_none(self_model, recordings):
 class ReadsSight(OneRadius):
     """Is away only if they see two cells, which cannot be summed out."""
 
-    def attend(self, implants):
+    def round_latents(self, implants):
         chance = 0.1 + 0.8 * (implants["sight_radius"] == 2)
         return {"away": pyro.sample("away", dist.Bernoulli(chance))}
 

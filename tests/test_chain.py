@@ -88,7 +88,9 @@ def by_combination(human, rounds, draws):
         lengths = [int((stage == number).sum()) for number in range(3)]
         facts = {
             name: fact.view(1, 1)
-            for name, fact in human.facts({name: value[0] for name, value in seen.items()}).items()
+            for name, fact in human.covariates(
+                {name: value[0] for name, value in seen.items()}
+            ).items()
         }
         joint, along = [], []
         for guess, *found in product((0, 1), *(range(length + 1) for length in lengths)):
@@ -266,8 +268,8 @@ class Hangs(Searcher):
 
     spans = Searcher.spans
 
-    def attend(self, implants):
-        sites = super().attend(implants)
+    def round_latents(self, implants):
+        sites = super().round_latents(implants)
         chances = torch.linspace(0.1, 0.9, 61)[sites["found_0"].long()]
         mood = pyro.sample("mood", dist.Bernoulli(chances))
         return {**sites, "mood": mood}

@@ -67,17 +67,17 @@ def test_it_is_the_package_s_own_model_of_bomb_defusal(searcher):
     assert type(load_human_model("mirror", searcher.self_model)) is Searcher
     assert type(load_human_model(None, SelfModel(get_domain("driving")))) is HumanModel
     check_contract(searcher)
-    assert searcher.stepwise and searcher.attends
+    assert searcher.stepwise and searcher.has_round_latents
 
 
 def test_what_is_looked_for_is_known_of_the_stages_that_were_reached(searcher):
     observation, states = course([WAIT, 1, 2, WAIT], rounds=5)
-    facts = searcher.facts(observation)
+    facts = searcher.covariates(observation)
     for stage in range(3):
         assert torch.equal(facts[f"sought_{stage}"], states[0].live[:, stage])
     # Of later stages it is taken to be as at the last one.
     early = {name: value[:, :3] for name, value in observation.items()}
-    facts = searcher.facts(early)
+    facts = searcher.covariates(early)
     assert torch.equal(facts["sought_1"], states[0].live[:, 1])
     assert torch.equal(facts["sought_2"], states[0].live[:, 1])
 
@@ -244,14 +244,14 @@ def test_what_was_done_tells_when_it_was_found(searcher):
     observation, _ = course([WAIT] * 4 + [2] + [WAIT] * 3)
     own = {name: value[0] for name, value in observation.items()}
     actions = torch.tensor([WAIT] * 4 + [2] + [WAIT] * 3)
-    found = searcher.explanations(own, actions)
+    found = searcher.log_proposal(own, actions)
     # Pressed at the fifth step: found just then, rather than before or after.
     assert int(found["found_0"].argmax()) == 4
     assert set(found) == {"found_0", "found_1"}
     later = found["found_1"]
     assert later[3:].tolist() == [0.0] * 58 and (later[:2] < 0).all()
     proposal = Proposal(searcher, *(2 * [{n: v[None] for n, v in implants(searcher).items()}]), 64)
-    facts = {name: fact.view(1, 1) for name, fact in searcher.facts(observation).items()}
+    facts = {name: fact.view(1, 1) for name, fact in searcher.covariates(observation).items()}
     chosen = proposal.values(None, 0, facts, found)
     weights = torch.bincount(chosen.values["found_0"], minlength=61)
     assert int(weights.argmax()) == 4

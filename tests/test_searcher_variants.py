@@ -40,7 +40,7 @@ def test_the_sites_of_each(name, sites, attends, robot):
     human = variant(name, robot)
     check_contract(human)
     assert set(sample_sites(human, 1, 1)) == sites
-    assert human.attends == attends and human.stepwise
+    assert human.has_round_latents == attends and human.stepwise
 
 
 def test_perception_alone_is_mirror_with_the_robot_s_rules_and_no_residual(robot):

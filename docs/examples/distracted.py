@@ -19,13 +19,13 @@ from mirror_ppl.models import HumanModel, Implants
 
 
 class DistractedPerson(HumanModel):
-    """The package's human model, with attention that differs from round to round."""
+    """The package's human model, with a latent that differs from round to round."""
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person; ``distracted`` is how often they are."""
         return super().prior() | {"distracted": pyro.sample("distracted", dist.Beta(1.0, 4.0))}
 
-    def attend(self, implants: Implants) -> dict[str, Tensor]:
+    def round_latents(self, implants: Implants) -> dict[str, Tensor]:
         """Sample in which rounds they are, ``[..., P, B]``."""
         return {"away": pyro.sample("away", dist.Bernoulli(implants["distracted"]))}
 

@@ -19,14 +19,40 @@ from mirror_ppl.models import HumanModel, Implants
 
 
 class LatePerson(HumanModel):
-    """The package's human model, with one sample site more: ``late``."""
+    """The package's human model, with one sample site more, and a memory of one step.
+
+    A belief is the robot's, and behind it that of the step before: ``[..., 2 Z]``.
+    """
+
+    @property
+    def belief_size(self) -> int:
+        """Two beliefs of the robot's size."""
+        return 2 * self.self_model.latent
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample the implants of every person; ``late`` is how often they react late."""
+        one = next(self.self_model.parameters()).new_ones(())  # on its device
+        late = pyro.sample("late", dist.Beta(one, 4 * one))  # mean 0.2
+        return super().prior() | {"late": late}
+
+    def believe(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
+    ) -> Tensor:
+        """The belief after one step, and the one before it."""
+        before, _ = belief.chunk(2, -1)
+        now = super().believe(before, evidence, action, still).mean  # of a Gaussian
+        first = action == len(self.domain.actions)  # nothing was done before, nothing believed
+        return torch.cat([now, torch.where(first[..., None], now, before)], -1)
+
+    def action_values(self, belief: Tensor) -> Tensor:
+        """Action values ``[..., 2 A]`` at both beliefs."""
+        now, before = belief.chunk(2, -1)
+        return torch.cat([super().action_values(now), super().action_values(before)], -1)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of actions ``[..., T, A]``; some follow the belief before."""
-        one = belief.new_ones(())  # on the belief's device
-        late = pyro.sample("late", dist.Beta(one, 4 * one))  # [..., P, 1]; mean 0.2
-        late = late[..., None, None]  # [..., P, 1, 1, 1], beside [..., P, V, T, A]
-        now = super().act(implants, belief, values)
-        # The first action has no belief before it.
-        before = torch.cat([now[..., :1, :], now[..., :-1, :]], -2)
+        """Log-probabilities of actions ``[..., P, B, A]``; some follow the belief before."""
+        beliefs, both = belief.chunk(2, -1), values.chunk(2, -1)
+        now = super().act(implants, beliefs[0], both[0])
+        before = super().act(implants, beliefs[1], both[1])
+        late = implants["late"][..., None]  # [..., P, 1, 1]
         return torch.logaddexp(torch.log1p(-late) + now, torch.log(late) + before)

@@ -24,7 +24,6 @@ from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, Implants
-from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.view import View
 
@@ -46,8 +45,6 @@ class NetworkPerson(HumanModel):
     Raises:
         HumanModelError: the networks are of several people, or of another domain.
     """
-
-    stepwise = True
 
     def __init__(
         self,
@@ -88,7 +85,7 @@ class NetworkPerson(HumanModel):
         del draws
         return self.domain if self.world is None else self.world
 
-    def look(
+    def perceive(
         self,
         implants: Implants,
         knowledge: Any,
@@ -112,29 +109,16 @@ class NetworkPerson(HumanModel):
         inputs[..., -(self._none + 1) :] = 0.0
         return self.networks.gates(inputs.flatten(0, -2)[None]).view(*inputs.shape[:-1], -1)
 
-    def advance(
+    def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
-    ) -> Gaussian:
-        """One step of the GRU; its state has no spread."""
+    ) -> Tensor:
+        """The state of the GRU after one step, ``[..., H]``."""
         del still
         shape = belief.shape
         gates = evidence + self.networks.weights["input"][0, -(self._none + 1) :][action]
         gates = gates.expand(*shape[:-1], -1).flatten(0, -2)[None]
         after = self.networks.update(belief.reshape(1, -1, shape[-1]), gates)
-        mean = after.view(shape)
-        return Gaussian(mean, torch.zeros_like(mean))
-
-    def believe(self, view: View, observation: Observation, actions: Tensor) -> Tensor:
-        """States of the GRU ``[..., T, H]`` along views of rounds."""
-        evidence = self.evidence(view, observation)
-        previous = torch.nn.functional.pad(actions[..., :-1], [1, 0], value=self._none)
-        previous = previous.expand(evidence.shape[:-1])
-        belief = evidence.new_zeros(*evidence.shape[:-2], self.belief_size)
-        states = []
-        for now, done in zip(evidence.unbind(-2), previous.unbind(-1), strict=True):
-            belief = self.advance(belief, now, done).mean
-            states.append(belief)
-        return torch.stack(states, -2)
+        return after.view(shape)
 
     def action_values(self, belief: Tensor) -> Tensor:
         """What the network says of actions, ``[..., A]``."""
@@ -142,7 +126,7 @@ class NetworkPerson(HumanModel):
         return found.view(*belief.shape[:-1], -1)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of actions ``[..., T, A]``."""
+        """Log-probabilities of actions ``[..., P, B, A]``."""
         del implants, belief
         return values.log_softmax(-1)
 

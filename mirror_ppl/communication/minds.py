@@ -7,12 +7,12 @@ that such an eye may have seen. U stands for distinct eyes, n for beliefs that a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import pyro
 import torch
@@ -27,6 +27,7 @@ from mirror_ppl.domains.base import Observation, Visibility, map_state
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.prior import checked_draws
 from mirror_ppl.models.attention import AttentionValues, Proposal
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
@@ -90,11 +91,13 @@ class Person:
         there are or of some that stand for them (:mod:`mirror_ppl.models.attention`). Nothing
         changes if no attention differs from round to round.
         """
-        if not self.human.attends:
+        if not self.human.has_round_latents:
             return self
         so_far = {name: value[: past.time] for name, value in past.observation.items()}
-        facts = {name: fact.view(1, 1) for name, fact in self.human.facts(past.observation).items()}
-        explanations = self.human.explanations(so_far, past.actions)
+        facts = {
+            name: fact.view(1, 1) for name, fact in self.human.covariates(past.observation).items()
+        }
+        explanations = self.human.log_proposal(so_far, past.actions)
         values = self._attention_of_any_round
         if facts or explanations:
             values = self._attention.values(None, 0, facts, explanations)
@@ -128,26 +131,19 @@ class Person:
     def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
         """Log-probability ``[S, G]`` of what was done so far under values of attention ``[G]``."""
         number = len(next(iter(attention.values())))
-        if not past.time:
-            return torch.zeros(self.number, number, device=self.device)
-        eyes = {name: value.repeat_interleave(number) for name, value in self.eyes.items()}
-        eyes |= {name: value.repeat(self.eye_count) for name, value in attention.items()}
-        count = self.eye_count * number
-        observation, told, _ = _history(past, count)
-        view = self.human.perceive(eyes, observation, told)
-        view = view.map(lambda part: part.expand(count, *part.shape[1:]))
-        # Most values differ in what comes later: there are few things that were seen so far.
-        first, seen = distinct_rows(view.numbers())
-        observation, _, actions = _history(past, len(first))
-        belief = self.human.believe(view.map(lambda part: part[first]), observation, actions)
-        values = self.human.action_values(belief)
-        with self._conditioned():
-            found = self.human.act(self.implants, belief[None], values[None])
-        found = found.expand(self.number, *found.shape[1:])[:, 0]
-        done = past.actions.expand(*found.shape[:-1])[..., None]
-        found = found.gather(-1, done).sum((-1, -2))  # [S, distinct]
-        which = self.eye[:, None] * number + torch.arange(number, device=self.device)
-        return found.gather(-1, seen[which])
+        total = torch.zeros(self.number, number, device=self.device)
+        everybody = copy(self)
+        everybody.eyes = {
+            **{name: value.repeat_interleave(number) for name, value in self.eyes.items()},
+            **{name: value.repeat(self.eye_count) for name, value in attention.items()},
+        }
+        everybody.eye_count = self.eye_count * number
+        eye = self.eye[:, None] * number + torch.arange(number, device=self.device)  # [S, G]
+        for time, (beliefs, own) in enumerate(through(everybody, past)):
+            mean = beliefs.mean[None]
+            found = self.act(mean, self.human.action_values(mean))[..., past.actions[time]]
+            total = total + found.gather(-1, own[eye])
+        return total
 
     def _conditioned(self) -> ExitStack:
         stack = ExitStack()
@@ -160,10 +156,10 @@ class Person:
     def see(self, eye: Tensor, observation: Observation, told: Visibility) -> View:
         """What eyes ``[n]`` see of rounds ``[n, T, ...]``."""
         implants = {name: value[eye] for name, value in self.eyes.items()}
-        view = self.human.perceive(implants, observation, told)
+        view = perceived(self.human, implants, observation, told)
         return view.map(lambda part: part.expand(len(eye), *part.shape[1:]))
 
-    def look(
+    def perceive(
         self,
         eye: Tensor,
         knowledge: Any,
@@ -171,21 +167,21 @@ class Person:
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """One step of eyes ``[n]`` with the domain's knowledge ``[n]``; see `HumanModel.look`."""
+        """One step of eyes ``[n]`` with knowledge ``[n]``; see `HumanModel.perceive`."""
         implants = {name: value[eye] for name, value in self.eyes.items()}
-        view, knowledge = self.human.look(implants, knowledge, observation, told, step)
+        view, knowledge = self.human.perceive(implants, knowledge, observation, told, step)
         return view.map(lambda part: part.expand(len(eye), *part.shape[1:])), knowledge
 
     def act(self, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of the last action ``[S, M, A]`` of M beliefs of each draw.
+        """Log-probabilities ``[S, M, A]`` of actions at M beliefs of each draw.
 
         Args:
-            belief: ``[S, M, T, Z]``.
-            values: the self-model's action values there, ``[S, M, T, A]``.
+            belief: ``[S, M, Z]``, or ``[1, M, Z]`` where draws share them.
+            values: the self-model's action values there, ``[S, M, A]``.
         """
-        with self._conditioned():
+        with self._conditioned(), pyro.plate("round", belief.shape[1], dim=-1):
             result = self.human.act(self.implants, belief[:, None], values[:, None])
-        return result[:, 0, :, -1]
+        return result.expand(self.number, *result.shape[1:])[:, 0]
 
 
 @dataclass(frozen=True)
@@ -209,21 +205,87 @@ class Looks:
     told: Visibility
 
 
-class Beliefs(Protocol):
-    """Beliefs of one step.
+@dataclass(frozen=True)
+class Beliefs:
+    """What may be believed at one step, each belief once.
 
     Attributes:
-        courses: beliefs up to this step ``[n, T, Z]``; of stepwise models only the last, T = 1.
+        person: whose they are.
+        mean: the beliefs ``[n, Z]``.
+        scale: of their densities ``[n, Z]``; ``None`` before the first step, or if they have none.
+        knowledge: the domain's, ``[n]``.
+        step: the number of the next step.
     """
 
-    @property
-    def courses(self) -> Tensor:
-        """See above."""
-        ...
+    person: Person
+    mean: Tensor
+    scale: Tensor | None
+    knowledge: Any
+    step: int
+
+    @classmethod
+    def at_first(cls, person: Person) -> tuple[Beliefs, Tensor]:
+        """Before the first step: one belief, and that it is everybody's, ``[U]``."""
+        human = person.human
+        zero = next(human.parameters()).new_zeros(1, human.belief_size)
+        nothing = human.domain.nothing_known(1, device=zero.device)
+        own = torch.zeros(person.eye_count, dtype=torch.long, device=zero.device)
+        return cls(person, zero, None, nothing, 0), own
 
     def after(self, looks: Looks) -> tuple[Beliefs, Tensor]:
-        """Beliefs of the next step, and which of them each look leads to ``[g]``."""
-        ...
+        """Beliefs of the next step, and which of them each look leads to ``[g]``.
+
+        Looks that show the same after the same lead to one belief.
+        """
+        human = self.person.human
+        seen = {name: value[looks.row] for name, value in looks.observation.items()}
+        before = _rows(self.knowledge, looks.parent)
+        view, knowledge = self.person.perceive(looks.eye, before, seen, looks.told, self.step)
+        told_by, which = distinct_rows(torch.stack([looks.row, view.numbers()], -1))
+        rows = looks.row[told_by]
+        evidence = human.evidence(
+            view.map(lambda part: part[told_by]),
+            {name: value[rows] for name, value in looks.observation.items()},
+        )
+        known = _whole_numbers(knowledge)
+        first, index = distinct_rows(
+            torch.cat([torch.stack([looks.parent, looks.action, which], -1), *known], -1)
+        )
+        state = human.believe(
+            self.mean[looks.parent[first]],
+            evidence[which[first]],
+            looks.action[first],
+            None if view.still is None else view.still[first],
+        )
+        mean, scale = state if isinstance(state, Gaussian) else (state, None)
+        knowledge = _rows(knowledge, first)
+        if view.still is not None:
+            # Beliefs that stay as they are, are the same ones however long ago they were formed.
+            same, which = distinct_rows(
+                torch.cat([as_whole_numbers(mean), *_whole_numbers(knowledge)], -1)
+            )
+            mean, scale = mean[same], None if scale is None else scale[same]
+            knowledge, index = _rows(knowledge, same), which[index]
+        return Beliefs(self.person, mean, scale, knowledge, self.step + 1), index
+
+
+def through(person: Person, past: RoundSoFar) -> Iterator[tuple[Beliefs, Tensor]]:
+    """Beliefs at each step of a round so far, and which of them each eye has ``[U]``."""
+    beliefs, own = Beliefs.at_first(person)
+    eyes = torch.arange(person.eye_count, device=own.device)
+    none = len(person.human.domain.actions)
+    for time in range(past.time):
+        action = past.actions[time - 1] if time else none
+        looks = Looks(
+            parent=own,
+            eye=eyes,
+            action=torch.full_like(eyes, int(action)),
+            row=torch.zeros_like(eyes),
+            observation={name: value[time, None] for name, value in past.observation.items()},
+            told={name: mask[time].expand(len(eyes), -1) for name, mask in past.told.items()},
+        )
+        beliefs, own = beliefs.after(looks)
+        yield beliefs, own
 
 
 @dataclass(frozen=True)
@@ -246,8 +308,8 @@ class Standing:
     def of(cls, person: Person, past: RoundSoFar) -> Standing:
         """The person at this point of a round."""
         person = person.in_round(past)
-        kind = StepwiseBeliefs if person.human.stepwise else CourseBeliefs
-        return cls(person, past, *kind.before(person, past))
+        *_, (before, own) = Beliefs.at_first(person), *through(person, past)
+        return cls(person, past, before, own)
 
     @property
     def last_action(self) -> int:
@@ -275,11 +337,8 @@ class Standing:
         """Which of the allowed items ``[N]`` tell anything now, in at least one posterior draw.
 
         What everybody sees or knows already leads to the same beliefs if it is told besides, so no
-        message with it is worth its cost. Items tell something each by itself or not at all. Of
-        models that are not stepwise nothing is known: what is told now may count later.
+        message with it is worth its cost. Items tell something each by itself or not at all.
         """
-        if not self.person.human.stepwise:
-            return allowed
         places = allowed.nonzero().squeeze(-1)
         messages = allowed.new_zeros(len(places) + 1, len(allowed))
         messages[torch.arange(1, len(messages)), places] = True
@@ -301,146 +360,6 @@ class Standing:
         same = (index[:, None] == index).all(-1)
         dearer = alone[places][:, None] >= third[places] - 1e-6  # of rounding
         return (same & dearer).any(1)
-
-
-@dataclass(frozen=True)
-class StepwiseBeliefs:
-    """Beliefs of human models in which each step follows from the one before.
-
-    Attributes:
-        person: whose they are.
-        state: ``q(zH_t | ...)``, parameters ``[n, Z]``; beliefs are the means.
-        knowledge: the domain's, ``[n]``.
-        step: the number of the next step.
-    """
-
-    person: Person
-    state: Gaussian
-    knowledge: Any
-    step: int
-
-    @property
-    def courses(self) -> Tensor:
-        """The last belief, ``[n, 1, Z]``."""
-        return self.state.mean[:, None]
-
-    @classmethod
-    def before(cls, person: Person, past: RoundSoFar) -> tuple[StepwiseBeliefs, Tensor]:
-        """Beliefs before the present step; eyes that saw the same so far share one."""
-        human, eyes = person.human, torch.arange(person.eye_count, device=person.eye.device)
-        knowledge = human.domain.nothing_known(1, device=eyes.device)
-        if past.time == 0:
-            zero = next(human.parameters()).new_zeros(1, human.belief_size)
-            beliefs = cls(person, Gaussian(zero, torch.ones_like(zero)), knowledge, 0)
-            return beliefs, torch.zeros_like(eyes)
-        views = []
-        for time in range(past.time):
-            now = {name: value[time : time + 1] for name, value in past.observation.items()}
-            told = {name: mask[time : time + 1] for name, mask in past.told.items()}
-            view, knowledge = person.look(eyes, knowledge, now, told, time)
-            views.append(view)
-        view = View.stack(views)
-        known = torch.cat(_whole_numbers(knowledge), -1)
-        first, which = distinct_rows(torch.cat([view.numbers(), known], -1))
-        observation, _, actions = _history(past, len(first))
-        mean = human.believe(view.map(lambda part: part[first]), observation, actions)[:, -1]
-        state = Gaussian(mean, torch.ones_like(mean))
-        return cls(person, state, _rows(knowledge, first), past.time), which
-
-    def after(self, looks: Looks) -> tuple[StepwiseBeliefs, Tensor]:
-        """See :class:`Beliefs`; looks that tell the same after the same lead to one belief."""
-        human = self.person.human
-        seen = {name: value[looks.row] for name, value in looks.observation.items()}
-        before = _rows(self.knowledge, looks.parent)
-        view, knowledge = self.person.look(looks.eye, before, seen, looks.told, self.step)
-        told_by, which = distinct_rows(torch.stack([looks.row, view.numbers()], -1))
-        rows = looks.row[told_by]
-        evidence = human.evidence(
-            view.map(lambda part: part[told_by]),
-            {name: value[rows] for name, value in looks.observation.items()},
-        )
-        known = _whole_numbers(knowledge)
-        first, index = distinct_rows(
-            torch.cat([torch.stack([looks.parent, looks.action, which], -1), *known], -1)
-        )
-        state = human.advance(
-            self.state.mean[looks.parent[first]],
-            evidence[which[first]],
-            looks.action[first],
-            None if view.still is None else view.still[first],
-        )
-        knowledge = _rows(knowledge, first)
-        if view.still is not None:
-            # Beliefs that stay as they are, are the same ones however long ago they were formed.
-            alike, which = distinct_rows(
-                torch.cat([as_whole_numbers(state.mean), *_whole_numbers(knowledge)], -1)
-            )
-            state = Gaussian(state.mean[alike], state.scale[alike])
-            knowledge, index = _rows(knowledge, alike), which[index]
-        return StepwiseBeliefs(self.person, state, knowledge, self.step + 1), index
-
-
-@dataclass(frozen=True)
-class CourseBeliefs:
-    """Beliefs of any human model: every round is gone through again from its beginning.
-
-    Attributes:
-        person: whose they are.
-        observation: rounds up to this step ``[n, T, ...]``; T may be 0.
-        told: ``[n, T, K]``.
-        actions: before each of these steps but the first, ``[n, T - 1]``.
-        courses: ``[n, T, Z]``.
-    """
-
-    person: Person
-    observation: Observation
-    told: Visibility
-    actions: Tensor
-    courses: Tensor
-
-    @classmethod
-    def before(cls, person: Person, past: RoundSoFar) -> tuple[CourseBeliefs, Tensor]:
-        """Beliefs before the present step, of each eye its own."""
-        observation, told, actions = _history(past, person.eye_count)
-        nothing = next(person.human.parameters()).new_zeros(person.eye_count, 0, 0)
-        beliefs = cls(person, observation, told, actions[:, : max(past.time - 1, 0)], nothing)
-        return beliefs, torch.arange(person.eye_count, device=person.eye.device)
-
-    def after(self, looks: Looks) -> tuple[CourseBeliefs, Tensor]:
-        """See :class:`Beliefs`; each look leads to a belief of its own."""
-
-        def longer(before: Tensor, last: Tensor) -> Tensor:
-            return torch.cat([before[looks.parent], last[:, None]], 1)
-
-        observation = {
-            name: longer(self.observation[name], value[looks.row])
-            for name, value in looks.observation.items()
-        }
-        told = {name: longer(self.told[name], mask) for name, mask in looks.told.items()}
-        actions = self.actions
-        if observation["ego"].shape[1] > 1:
-            actions = longer(actions, looks.action)
-        else:
-            actions = actions[looks.parent]
-        # What is done at the last step does not matter to the belief there.
-        done = torch.nn.functional.pad(actions, [0, 1])
-        view = self.person.see(looks.eye, observation, told)
-        courses = self.person.human.believe(view, observation, done)
-        index = torch.arange(len(looks.eye), device=looks.eye.device)
-        return CourseBeliefs(self.person, observation, told, actions, courses), index
-
-
-def _history(past: RoundSoFar, number: int) -> tuple[Observation, Visibility, Tensor]:
-    """The steps before the present one, ``[number, t, ...]``."""
-
-    def repeated(value: Tensor) -> Tensor:
-        return value[: past.time].expand(number, *value[: past.time].shape)
-
-    return (
-        {name: repeated(value) for name, value in past.observation.items()},
-        {name: repeated(mask) for name, mask in past.told.items()},
-        repeated(past.actions),
-    )
 
 
 def _whole_numbers(knowledge: Any) -> list[Tensor]:

@@ -20,6 +20,10 @@ from mirror_ppl.communication.minds import Looks, Standing
 from mirror_ppl.communication.worlds import Futures, World, robot_belief
 from mirror_ppl.distinct import uniform_of
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.combinations import discrete_sites
+from mirror_ppl.models.attention import attention_sites
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.networks import Gaussian
 
 
 @dataclass(frozen=True)
@@ -201,15 +205,15 @@ class _Tree:
         )
         self.beliefs, index = self.beliefs.after(looks)
         self.belief = index[look]
-        courses = self.beliefs.courses
-        values = self.person.human.action_values(courses)
+        beliefs = self.beliefs.mean
+        values = self.person.human.action_values(beliefs)
         # Courses of a draw share its policy implants: one row a draw, padded to the longest.
         counts = torch.bincount(self.draw, minlength=self.person.number)
         begin = counts.cumsum(0) - counts
         place = torch.arange(len(self.draw), device=key.device) - begin[self.draw]
         padded = torch.zeros(len(counts), int(counts.max()), dtype=torch.long, device=key.device)
         padded[self.draw, place] = self.belief
-        log_chances = self.person.act(courses[padded], values[padded])[self.draw, place]
+        log_chances = self.person.act(beliefs[padded], values[padded])[self.draw, place]
         return self.weight[:, None] * log_chances.exp()
 
     def branch(
@@ -270,14 +274,10 @@ class Divergence:
         """See :class:`Objective`; steps left and seed do not matter.
 
         Raises:
-            HumanModelError: the human model is not stepwise, so its belief has no density.
+            HumanModelError: the beliefs of the human model have no density like the robot's.
         """
         person = standing.person
-        if not person.human.stepwise:
-            raise HumanModelError(
-                f"{type(person.human).__name__} is not stepwise, and its beliefs have no density "
-                "to compare; see HumanModel.stepwise"
-            )
+        require_density(person.human)
         channels = Channels(person.human.domain)
         robot = robot_belief(person.human.self_model, standing.past)
 
@@ -285,15 +285,50 @@ class Divergence:
         def value(candidates: Tensor) -> Valued:
             message = candidates[:, 0]
             beliefs, index = standing.told(message)
-            apart = self._apart(robot, beliefs.state)[index]  # pyright: ignore
+            assert beliefs.scale is not None
+            apart = self._apart(robot, Gaussian(beliefs.mean, beliefs.scale))[index]
             utility = -self.weight * apart[:, person.eye]
             return Valued(utility - channels.cost(message)[:, None], None)
 
         return value
 
-    def _apart(self, robot, person) -> Tensor:
+    def _apart(self, robot: Gaussian, person: Gaussian) -> Tensor:
         squared = (robot.mean - person.mean).pow(2)
         if self.measure == "squared":
             return squared.sum(-1)
         ratio = (robot.scale / person.scale).pow(2)
         return 0.5 * (ratio + squared / person.scale.pow(2) - 1 - ratio.log()).sum(-1)
+
+
+@torch.no_grad()
+def beliefs_have_density(human: HumanModel) -> bool:
+    """Whether beliefs of a human model have densities to compare with the robot's."""
+    domain = human.domain
+    device = next(human.parameters()).device
+    observation = domain.observe(domain.initial(1, torch.Generator(device).manual_seed(0)))
+    nothing = {
+        m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=device)
+        for m in domain.modalities
+    }
+    sites = discrete_sites(human) | attention_sites(human)
+    implants = {name: support[:1] for name, support in sites.items()}
+    view, _ = human.perceive(
+        implants, domain.nothing_known(1, device=device), observation, nothing, 0
+    )
+    evidence = human.evidence(view, observation)
+    none = torch.full((1,), len(domain.actions), device=device)
+    state = human.believe(evidence.new_zeros(1, human.belief_size), evidence, none)
+    return isinstance(state, Gaussian) and human.belief_size == human.self_model.latent
+
+
+def require_density(human: HumanModel) -> None:
+    """Refuse human models whose beliefs have no density to compare with the robot's.
+
+    Raises:
+        HumanModelError: this is one.
+    """
+    if not beliefs_have_density(human):
+        raise HumanModelError(
+            f"beliefs of {type(human).__name__} have no density like the robot's, which mirror-kl "
+            "compares: its believe returns no Gaussian, or one of another size"
+        )

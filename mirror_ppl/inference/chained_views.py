@@ -70,7 +70,7 @@ def chained_views(  # noqa: PLR0913 - a round, and whose it is
     supports = attention_sites(human)
     spans = human.spans(so_far)
     check_spans(spans, {site: len(support) for site, support in supports.items()}, steps)
-    facts = {name: fact.view(1, 1) for name, fact in human.facts(so_far).items()}
+    facts = {name: fact.view(1, 1) for name, fact in human.covariates(so_far).items()}
     course = _Course(human, combinations, observation, told, actions[0])
     states = course.beginning(number)
     levels, rows = [], []
@@ -211,7 +211,7 @@ class _Course:
                 {name: value[:, step] for name, value in part.items()}
                 for part in (self.observation, self.told)
             )
-            view, knowledge = self.human.look({**sites, **values}, knowledge, now, told, step)
+            view, knowledge = self.human.perceive({**sites, **values}, knowledge, now, told, step)
             view = view.map(lambda part: part.expand(number, *part.shape[1:]))
             knowledge = map_state(lambda part: part.expand(number, *part.shape[1:]), knowledge)
             belief = self._after(belief, view, step)
@@ -245,8 +245,8 @@ class _Course:
             before = torch.cat(self._beliefs)
             self._beliefs = [before]
             action = torch.full_like(some, self._done[step])
-            state = self.human.advance(before[belief[some]], evidence, action)
-            self._beliefs.append(state.mean)
+            after = self.human.belief_after(before[belief[some]], evidence, action)
+            self._beliefs.append(after)
         return torch.tensor(found, device=belief.device)[which]
 
     def moments(self, numbers: Tensor) -> tuple[Tensor, Tensor]:

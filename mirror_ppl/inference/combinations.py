@@ -61,8 +61,8 @@ def require_own_attention(human: HumanModel, sites: Mapping[str, Tensor]) -> Non
     for name, one in found[0].items():
         if not all(torch.equal(one, other.get(name, one[:0])) for other in found):
             raise HumanModelError(
-                f'"{name}" of attend depends on a discrete site that perceive() reads; let it '
-                "depend on others only"
+                f'"{name}" of round_latents depends on a discrete site that perceive() reads; let '
+                "it depend on others only"
             )
 
 
@@ -77,18 +77,16 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
     domain = human.domain
     device = next(human.parameters()).device
     state = domain.initial(1, torch.Generator(device).manual_seed(0))
-    steps = domain.horizon
-    observation = {
-        name: value[:, None].expand(1, steps, *value.shape[1:])
-        for name, value in domain.observe(state).items()
-    }
+    observation = domain.observe(state)
     told = {
-        m.name: torch.zeros(1, steps, len(m.items), dtype=torch.bool, device=device)
+        m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=device)
         for m in domain.modalities
     }
-    attended = attention_sites(human)
-    implants = Readable({name: support[:1] for name, support in (supports | attended).items()})
-    human.perceive(implants, observation, told)
+    latents = attention_sites(human)
+    implants = Readable({name: support[:1] for name, support in (supports | latents).items()})
+    knowledge: Any = domain.nothing_known(1, device=device)
+    for step in range(domain.horizon):
+        _, knowledge = human.perceive(implants, knowledge, observation, told, step)
     supports = {name: support for name, support in supports.items() if name in implants.read}
     number = prod(len(support) for support in supports.values())
     if number > MAX_COMBINATIONS:

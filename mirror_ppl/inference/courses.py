@@ -34,15 +34,8 @@ def beliefs_and_values(
     first, node = distinct_rows(_beginnings(numbers).flatten()[:, None])
     node = node.view(views, steps)
     of, step = first // steps, first % steps
-    if human.stepwise:
-        alike = distinct_rows(torch.stack([step, numbers[of, step]], -1))
-        belief = _step_by_step(human, view, node, of, step, alike, observation, actions)
-    else:
-        parts = []
-        for some in torch.arange(views, device=numbers.device).split(CHUNK):
-            part = view.map(lambda value: value[some])  # noqa: B023 - used at once
-            parts.append(human.believe(part, observation, actions))
-        belief = torch.cat(parts)[of, step]
+    alike = distinct_rows(torch.stack([step, numbers[of, step]], -1))
+    belief = _step_by_step(human, view, node, of, step, alike, observation, actions)
     values = [human.action_values(part) for part in belief.split(CHUNK)]
     return belief, torch.cat(values), node
 
@@ -76,7 +69,7 @@ def _step_by_step(
             parent = belief[node[of[some], max(time - 1, 0)]]
             action = before[time].expand(len(some))
             still = None if view.still is None else view.still[of[some], step[some]]
-            belief[some] = human.advance(parent, evidence[some], action, still).mean
+            belief[some] = human.belief_after(parent, evidence[some], action, still)
     return belief
 
 

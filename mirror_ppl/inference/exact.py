@@ -112,7 +112,7 @@ def expected_counts(
     combinations: Tensor,
     log_prior: Tensor | None,
 ) -> Tensor:
-    """How often each action is expected to have been taken at each moment, ``[N, T', A]``.
+    """How often each action is expected to have been taken at each moment, ``[N, A]``.
 
     It is not known what somebody saw and attended to. By Fisher's identity this is the gradient of
     the log-likelihood by the log-probabilities of actions.
@@ -130,7 +130,7 @@ def expected_counts(
     with conditioned(draws, number, 1), torch.enable_grad():
         implants = human.prior()
         chances = human.act(implants, table.belief, table.values)
-        chances = chances.expand(number, *chances.shape[-4:]).detach().requires_grad_()
+        chances = chances.expand(number, *chances.shape[-3:]).detach().requires_grad_()
         likelihoods = human.of_actions(implants, table, chances)
         joint = combination_scores(table, likelihoods, combinations)[:, 0]
         if log_prior is None:

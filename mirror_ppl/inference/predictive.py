@@ -40,7 +40,6 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
         return torch.cat(parts)
     person = torch.arange(table.people, device=table.index.device)[:, None]
     everybody = person[..., None]
-    belief, values = table.belief.flatten(1, 2), table.values.flatten(1, 2)
     results = []
     for draw in range(number):
         own = {name: value[draw] for name, value in draws.items()}
@@ -56,9 +55,11 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
                 results.append(_attentive(human, implants, table, table.attention, sight))
                 continue
             moments = table.moments[person, sight].clamp(min=0)  # [P, B, T]
-            results.append(
-                human.act(implants, belief[everybody, moments], values[everybody, moments])
+            belief, values = (
+                part[everybody, moments].flatten(1, 2) for part in (table.belief, table.values)
             )
+            found = human.act(implants, belief, values)
+            results.append(found.expand(*values.shape[:2], -1).unflatten(1, moments.shape[1:]))
     return torch.stack(results)
 
 
@@ -73,7 +74,7 @@ def _attentive(
     person = torch.arange(table.people, device=sight.device)[:, None]
     views = attention.sights[person, sight]  # [P, B, G']
     moments = table.moments[person[..., None], views].clamp(min=0)  # [P, B, G', T]
-    each = human.act(implants, table.belief, table.values).flatten(-3, -2)
+    each = human.act(implants, table.belief, table.values)
     found = each.expand(table.people, *each.shape[-2:])[person[..., None, None], moments]
     done = table.recorded[:, :, None, :, None].expand(*moments.shape, 1)
     along = found.gather(-1, done).squeeze(-1).cumsum(-1)
@@ -93,12 +94,12 @@ def _chained(
     number = len(next(iter(draws.values())))
     with conditioned(draws, number, table.people):
         implants = human.prior()
-        each = human.act(implants, table.belief, table.values).squeeze(-2)  # [S, P, N, A]
+        each = human.act(implants, table.belief, table.values)  # [S, P, N, A]
         each = each.expand(number, table.people, *each.shape[-2:])
         chances = chain.log_chances(human, implants, table.rounds)
         chances = chances.expand(number, table.people, table.rounds, *chances.shape[-2:])
         sight = table.sight_of(implants).expand(number, table.people, table.rounds)
-    acted = table.acted.squeeze(-1).expand(number, *table.acted.shape[:2])[..., None]
+    acted = table.acted.expand(number, *table.acted.shape)[..., None]
     chosen = each.gather(-1, acted).squeeze(-1)  # [S, P, N]
     *_, steps = table.recorded.shape
     actions = each.shape[-1]

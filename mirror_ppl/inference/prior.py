@@ -48,10 +48,7 @@ def sample_sites(
         if draws is not None:
             stack.enter_context(pyro.plate("draw", draws, dim=-3))
         stack.enter_context(pyro.plate("person", people, dim=-2))
-        implants = human.prior()
-        # One made-up belief is enough for the sites that act() may add.
-        belief = next(human.parameters()).new_zeros(people, 1, 1, human.belief_size)
-        human.act(implants, belief, human.action_values(belief))
+        human.prior()
     nodes = trace.trace.nodes
     latent = latent_sites(trace.trace)
     return {name: nodes[name] for name in nodes if name in latent or name in given}

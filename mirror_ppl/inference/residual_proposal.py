@@ -43,8 +43,8 @@ class ResidualProposal:
 
     Attributes:
         human: the model of people; it samples ``residual_in`` and ``residual_out``.
-        belief: of the moments that count ``[1, N, 1, Z]``.
-        values: action values there ``[1, N, 1, A]``.
+        belief: of the moments that count ``[1, N, Z]``.
+        values: action values there ``[1, N, A]``.
         counts: how often each action is expected to have been taken there ``[N, A]``.
     """
 
@@ -60,10 +60,9 @@ class ResidualProposal:
         Args:
             human: the model of people.
             table: views of the person's rounds.
-            counts: how often each action is expected at each moment, ``[N, T', A]``.
+            counts: how often each action is expected at each moment, ``[N, A]``.
         """
-        counts = counts.flatten(0, 1)
-        belief, values = (part[0].flatten(0, 1) for part in (table.belief, table.values))
+        belief, values = table.belief[0], table.values[0]
         often = counts.sum(-1)
         ordered, places = often.sort(descending=True)
         most = int((ordered.cumsum(0) < COUNTED * ordered.sum()).sum()) + 1
@@ -71,7 +70,7 @@ class ResidualProposal:
         # Each of the others counts as the one in which somebody believes much the same.
         nearest = torch.cdist(belief, belief[some]).argmin(-1)
         counts = counts.new_zeros(len(some), counts.shape[-1]).index_add(0, nearest, counts)
-        return cls(human, belief[some][None, :, None], values[some][None, :, None], counts)
+        return cls(human, belief[some][None], values[some][None], counts)
 
     def gaussian(self, draws: Mapping[str, Tensor]) -> MultivariateNormal:
         """``q(w | rest)`` of draws ``[S, 1, 1, ...]`` of everything else, of ``[S, W]``."""
@@ -80,8 +79,8 @@ class ResidualProposal:
         with conditioned(rest, number, 1), poutine.trace() as trace:
             implants = self.human.prior()
             without = self.human.act(implants, self.belief, self.values)
-        without = without.expand(number, *without.shape[1:])[:, 0, :, 0]  # [S, N, A]
-        features = implant_priors.residual_features(implants, self.belief)[:, 0, :, 0]  # [S, N, R]
+        without = without.expand(number, *without.shape[1:])[:, 0]  # [S, N, A]
+        features = implant_priors.residual_features(implants, self.belief)[:, 0]  # [S, N, R]
         scale = trace.trace.nodes[SITE]["fn"].base_dist.scale.flatten()[0]
         return _laplace(without, features, self.counts, scale)
 

@@ -23,9 +23,9 @@ class RoundViews:
 
     Attributes:
         moments: ``[V, T]``.
-        belief: ``[N, T', Z]``.
-        values: ``[N, T', A]``.
-        acted: ``[N, T']``.
+        belief: ``[N, Z]``.
+        values: ``[N, A]``.
+        acted: ``[N]``.
         sights: the view under each value of attention, ``[U, G]``; ``None`` if a sight is a view.
         rounds: of each sight ``[U]``, if there is more than one round.
         chain: attention that is summed out exactly, of one person; views are of its spans.
@@ -50,18 +50,7 @@ class RoundViews:
         more = steps - self.moments.shape[1]
         if not more:
             return self
-        moments, length = self.moments, self.belief.shape[1]
-        if length > 1:  # whole rounds, which get longer
-            real = moments != NO_VIEW
-            moments = torch.where(real, moments // length * steps + moments % length, NO_VIEW)
-        grown = more if length > 1 else 0
-        return replace(
-            self,
-            moments=pad(moments, [0, more], value=NO_VIEW),
-            belief=pad(self.belief, [0, 0, 0, grown]),
-            values=pad(self.values, [0, 0, 0, grown]),
-            acted=pad(self.acted, [0, grown]),
-        )
+        return replace(self, moments=pad(self.moments, [0, more], value=NO_VIEW))
 
     def kept(self, sights: Tensor) -> RoundViews:
         """Only some sights, and the views and moments that they have."""
@@ -75,10 +64,9 @@ class RoundViews:
             return replace(alone.kept(views), sights=place, rounds=rounds)
         moments = self.moments[sights]
         real = moments != NO_VIEW
-        length = self.belief.shape[1]
-        used, place = torch.unique(moments[real] // length, return_inverse=True)
+        used, place = torch.unique(moments[real], return_inverse=True)
         moments = moments.clone()
-        moments[real] = place * length + moments[real] % length
+        moments[real] = place
         if not len(used):  # of padding alone; act() is asked about something all the same
             used = used.new_zeros(1)
         return RoundViews(moments, self.belief[used], self.values[used], self.acted[used])
@@ -99,11 +87,6 @@ def round_views(
     some = view.map(lambda part: part[first])
     belief, values, node = beliefs_and_values(human, some, numbers[first], observation, actions)
     acted = actions.expand(node.shape)
-    if human.stepwise:
-        at = acted.new_zeros(len(belief)).scatter(0, node.flatten(), acted.flatten())
-        part = RoundViews(node, belief[:, None], values[:, None], at[:, None])
-    else:
-        moments = torch.arange(node.numel(), device=node.device).view(node.shape)
-        part = RoundViews(moments, belief[node], values[node], acted)
-    moments = torch.where(real, part.moments, NO_VIEW)
-    return replace(part, moments=moments), inverse
+    at = acted.new_zeros(len(belief)).scatter(0, node.flatten(), acted.flatten())
+    moments = torch.where(real, node, NO_VIEW)
+    return RoundViews(moments, belief, values, at), inverse

@@ -27,7 +27,7 @@ Round = tuple[Observation, Visibility, Tensor, Tensor]
 
 def looks_twice(human: HumanModel) -> bool:
     """Whether what stands for all that people may attend to hangs on who they are."""
-    return human.attends and not human.chained
+    return human.has_round_latents and not human.chained
 
 
 def rough(options: ImportanceOptions) -> ImportanceOptions:

@@ -34,6 +34,7 @@ from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.round_views import RoundViews, round_views
 from mirror_ppl.models.attention import KEPT, VALUES, AttentionValues, Proposal
 from mirror_ppl.models.chain import Chain
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, log_likelihoods
 
@@ -53,7 +54,7 @@ class Screening:
         seed: seed of those draws.
         resolution: moments of a round count as one when the log-probabilities of what was done
             there, each under ``alike`` of those ways, fall on the same points of a grid of this
-            width. Whole views do, step by step, if the model is not ``stepwise``. 0 for never.
+            width. 0 for never.
         alike: see there.
     """
 
@@ -120,9 +121,9 @@ class Sightings:
         self._recorded: list[tuple[Tensor, Tensor]] = []
         self._attended: list[AttentionValues] = []
         self._proposal: Proposal | None = None
-        if human.attends:
+        if human.has_round_latents:
             require_own_attention(human, supports)
-        if human.attends and not human.chained:
+        if human.has_round_latents and not human.chained:
             known = {} if likely is not None else self.draw_ways()
             anybody = known or draw_prior(human, 1, PROPOSING_WAYS, 0)
             self._proposal = Proposal(human, anybody, likely, values)
@@ -152,14 +153,14 @@ class Sightings:
             attended = self._proposal.values(
                 self._weights(),
                 seed,
-                {name: fact.view(1, 1) for name, fact in self.human.facts(so_far).items()},
-                self.human.explanations(so_far, actions[0, real]),
+                {name: fact.view(1, 1) for name, fact in self.human.covariates(so_far).items()},
+                self.human.log_proposal(so_far, actions[0, real]),
             )
             each = len(attended)
             candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
             candidates |= {name: value.repeat(number) for name, value in attended.values.items()}
             number = number * each
-        view = self.human.perceive(candidates, observation, told)
+        view = perceived(self.human, candidates, observation, told)
         part, which = round_views(self.human, view, observation, actions, real, number)
         if self.screening is not None and self.screening.resolution > 0:
             part, place = self._merged(part, self.screening)
@@ -194,9 +195,7 @@ class Sightings:
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
         found = chained_views(self.human, candidates, len(alive), observation, told, actions, real)
         values = torch.cat([self.human.action_values(some) for some in found.belief.split(CHUNK)])
-        part = RoundViews(
-            found.moments, found.belief[:, None], values[:, None], found.acted[:, None]
-        )
+        part = RoundViews(found.moments, found.belief, values, found.acted)
         chain = found.chain
         if self.screening is not None:
             if self.screening.resolution > 0:
@@ -310,23 +309,18 @@ class Sightings:
         """The views of a round with moments that count as one made one; which each view is then."""
         ways = {name: way[: screening.alike] for name, way in self.draw_ways().items()}
         real = torch.zeros_like(part.acted, dtype=torch.bool)
-        real.view(-1)[part.moments[part.moments != NO_VIEW]] = True
+        real[part.moments[part.moments != NO_VIEW]] = True
         keys = []
         for some in torch.arange(len(part.acted), device=part.acted.device).split(CHUNK):
             found = self._act(ways, part.belief[None, some], part.values[None, some])[:, 0]
             acted = part.acted[some].expand(found.shape[:-1])
             chosen = found.gather(-1, acted[..., None]).squeeze(-1)
-            keys.append(torch.round(chosen / screening.resolution).long().movedim(0, -1))
+            keys.append(torch.round(chosen / screening.resolution).long().T)
         # What was done tells moments apart, too: theirs is one entry of ``acted``.
-        key = torch.cat([torch.cat(keys), part.acted[..., None]], -1) * real[..., None]
-        first, cluster = distinct_rows(key.flatten(1))
-        length = part.acted.shape[1]
+        key = torch.cat([torch.cat(keys), part.acted[:, None]], -1) * real[:, None]
+        first, cluster = distinct_rows(key)
         moments = part.moments
-        moments = torch.where(
-            moments == NO_VIEW,
-            NO_VIEW,
-            cluster[moments.clamp(min=0) // length] * length + moments.clamp(min=0) % length,
-        )
+        moments = torch.where(moments == NO_VIEW, NO_VIEW, cluster[moments.clamp(min=0)])
         distinct, place = distinct_rows(moments)
         kept = RoundViews(
             moments[distinct], part.belief[first], part.values[first], part.acted[first]
@@ -355,11 +349,11 @@ class Sightings:
         return self.ways
 
     def _act(self, ways: Mapping[str, Tensor], belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities ``[ways, 1, N, T', A]``."""
+        """Log-probabilities ``[ways, 1, N, A]``."""
         with self._deciding(ways) as number:
             found = self.human.act(self.human.prior(), belief, values)
         # Of a model whose actions depend on no implant they are the same in every way.
-        return found.expand(number, *found.shape[-4:])
+        return found.expand(number, *found.shape[-3:])
 
     @contextmanager
     def _deciding(self, ways: Mapping[str, Tensor]) -> Iterator[int]:

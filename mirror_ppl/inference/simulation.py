@@ -12,8 +12,8 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Observation, Visibility, map_state, total_reward
 from mirror_ppl.inference.experience import roll_out
+from mirror_ppl.models.course import messages_at
 from mirror_ppl.models.human import HumanModel, Implants
-from mirror_ppl.models.sites import latent_values
 
 
 @torch.no_grad()
@@ -53,32 +53,23 @@ def play_rounds(
         m.name: torch.zeros(people, rounds, steps, len(m.items), dtype=torch.bool, device=device)
         for m in domain.modalities
     }
-    sites, attends = dict(implants), human.attends
     lengths = torch.zeros(people, rounds, dtype=torch.long, device=device)
     under_way = lengths == 0
-    follow = (_Stepwise if human.stepwise else _Courses)(human, told, actions)
+    beliefs = _Beliefs(human, told, actions)
     # What the program itself draws comes from the generator, too, whatever else is drawn from it.
     own = torch.Generator(device)
     own.set_state(generator.get_state())
     seed = int(torch.randint(2**31, (), generator=own, device=device))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        with poutine.condition(data=dict(implants)), pyro.plate("person", people, dim=-2):
+            drawn = human.prior()
     for step in range(steps):
         under_way &= ~domain.over(state)
         lengths += under_way
-        with (
-            torch.random.fork_rng(devices=[]),
-            poutine.condition(data=sites),
-            pyro.plate("person", people, dim=-2),
-        ):
-            torch.manual_seed(seed)
-            with poutine.trace() as trace:
-                drawn = human.prior()
-            # What was drawn at the first step stays, of a person for all rounds.
-            sites |= latent_values(trace.trace)
-            if attends:
-                drawn = drawn | _attention(human, drawn, observed, seed + 1)
-            with poutine.trace() as trace:
-                log_probability = follow.act(drawn, observed, step)
-        sites |= latent_values(trace.trace)
+        with torch.random.fork_rng(devices=[]), pyro.plate("person", people, dim=-2):
+            latents = _round_latents(human, drawn, observed, seed + 1)
+            log_probability = beliefs.act(drawn, latents, observed[-1], step)
         probability = log_probability.exp().flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)
         actions[..., step] = chosen.view(people, rounds)
@@ -104,21 +95,23 @@ def play_rounds(
     )
 
 
-def _attention(
+def _round_latents(
     human: HumanModel, implants: dict[str, Tensor], observed: list[Observation], seed: int
 ) -> dict[str, Tensor]:
-    """What people attend to in a round so far, ``[P, B]``; the same while they attend to the same.
+    """What differs from round to round ``[P, B]``, by the covariates of the rounds so far.
 
-    Runs inside the person plate.
+    Runs inside the person plate. One seed, so that what covariates leave alone stays the same.
     """
+    if not human.has_round_latents:
+        return {}
     so_far = {name: torch.stack([one[name] for one in observed], 2) for name in observed[0]}
     torch.manual_seed(seed)
     with pyro.plate("round", observed[0]["ego"].shape[1], dim=-1):
-        return human.attend(implants | human.facts(so_far))
+        return human.round_latents(implants | human.covariates(so_far))
 
 
-class _Stepwise:
-    """People of whom each step follows from the one before."""
+class _Beliefs:
+    """What people know and believe, step after step."""
 
     def __init__(self, human: HumanModel, told: Visibility, actions: Tensor) -> None:
         self.human, self.told, self.actions = human, told, actions
@@ -126,33 +119,14 @@ class _Stepwise:
         self.knowledge = human.domain.nothing_known(people, rounds, device=actions.device)
         like = next(human.parameters())
         self.belief = like.new_zeros(people, rounds, human.belief_size)
-        self.last = torch.full_like(actions[..., 0], len(human.domain.actions))
+        self.none = torch.full_like(actions[..., 0], len(human.domain.actions))
 
-    def act(self, implants: Implants, observed: list[Observation], step: int) -> Tensor:
-        """Log-probabilities ``[P, B, A]`` of actions at a step."""
-        human, now = self.human, observed[-1]
-        told = {name: mask[..., step, :] for name, mask in self.told.items()}
-        last = self.actions[..., step - 1] if step else self.last
-        view, self.knowledge = human.look(implants, self.knowledge, now, told, step)
+    def act(self, implants: Implants, latents: Implants, now: Observation, step: int) -> Tensor:
+        """Log-probabilities ``[P, B, A]`` of actions at a step; runs inside the person plate."""
+        human, told = self.human, messages_at(self.told, step)
+        last = self.actions[..., step - 1] if step else self.none
+        sites = {**implants, **latents}
+        view, self.knowledge = human.perceive(sites, self.knowledge, now, told, step)
         evidence = human.evidence(view, now)
-        self.belief = human.advance(self.belief, evidence, last, view.still).mean
-        belief = self.belief[..., None, :]
-        return human.act(implants, belief, human.action_values(belief))[..., 0, :]
-
-
-class _Courses:
-    """People of whom rounds have to be gone through from the beginning at each step."""
-
-    def __init__(self, human: HumanModel, told: Visibility, actions: Tensor) -> None:
-        self.human, self.told, self.actions = human, told, actions
-
-    def act(self, implants: Implants, observed: list[Observation], step: int) -> Tensor:
-        """Log-probabilities ``[P, B, A]`` of actions at a step."""
-        human = self.human
-        # What comes later does not matter to this step: the last observation stands in for it.
-        shown = observed + observed[-1:] * (self.actions.shape[-1] - 1 - step)
-        observation = {name: torch.stack([one[name] for one in shown], 2) for name in shown[0]}
-        view = human.perceive(implants, observation, self.told)
-        belief = human.believe(view, observation, self.actions)
-        values = human.action_values(belief)
-        return human.act(implants, belief, values)[..., step, :]
+        self.belief = human.belief_after(self.belief, evidence, last, view.still)
+        return human.act(implants, self.belief, human.action_values(self.belief))

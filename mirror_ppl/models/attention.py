@@ -49,7 +49,7 @@ class AttentionValues:
         log_weights: ``-log pi``, ``[G]``.
         kept: which of them are looked at ``[G']``.
         log_kept: log-probability with which each of these was kept ``[G']``.
-        facts: of the round, see `HumanModel.facts`.
+        facts: of the round, see `HumanModel.covariates`.
     """
 
     values: dict[str, Tensor]
@@ -70,8 +70,8 @@ class AttentionValues:
 
 
 def attention_sites(human: HumanModel) -> dict[str, Tensor]:
-    """Supports ``[n]`` of the sites of a human model's ``attend``, by name."""
-    if not human.attends:
+    """Supports ``[n]`` of the sites of a human model's ``round_latents``, by name."""
+    if not human.has_round_latents:
         return {}
     with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
         nodes = attention_nodes(human, human.prior())
@@ -83,7 +83,7 @@ def attention_sites(human: HumanModel) -> dict[str, Tensor]:
 def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[str, Any]:
     """Nodes of the sites of attention in one round; runs inside the person plate."""
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-        human.attend(implants)
+        human.round_latents(implants)
     return latent_sites(trace.trace)
 
 
@@ -99,7 +99,7 @@ def site_probabilities(
         human: the model of people.
         ways: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
         weights: of each of them ``[W]``; alike unless given.
-        facts: of the round, see `HumanModel.facts`.
+        facts: of the round, see `HumanModel.covariates`.
     """
     number = len(next(iter(ways.values())))
     with (
@@ -186,7 +186,7 @@ class Proposal:
     """Proposes values of attention for round after round of a person.
 
     Args:
-        human: the model of people; it attends.
+        human: the model of people; it has round latents.
         anybody: draws ``[W, 1, 1, ...]`` of implants from the prior.
         likely: draws of what this person may be like; unknown unless given.
         number: of values G.
@@ -219,8 +219,8 @@ class Proposal:
             weights: of the draws from the prior, as the rounds so far have it, ``[W]``; looked at
                 unless it is known what the person may be like.
             seed: of the draws.
-            facts: of the round, see `HumanModel.facts`.
-            explanations: of what was done, see `HumanModel.explanations`.
+            facts: of the round, see `HumanModel.covariates`.
+            explanations: of what was done, see `HumanModel.log_proposal`.
         """
         facts = dict(facts or {})
         prior = self._known("anybody", self.anybody, facts)

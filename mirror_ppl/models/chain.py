@@ -1,7 +1,7 @@
 """Attention that is read at one stretch of a round after another, summed out exactly.
 
-Where each site of ``attend`` counts at certain steps only (its :class:`Span`), what a person may
-have attended to need not be gone through combination by combination. What is left of the values
+Where each site of ``round_latents`` counts at certain steps only (its :class:`Span`), what a person
+may have attended to need not be gone through combination by combination. What is left of the values
 read so far is the belief and the knowledge that they led to; many lead to the same. So the sum runs
 from the end of the round to its beginning, over *states* in which a span may begin::
 
@@ -36,7 +36,7 @@ NEVER = -1e30
 
 @dataclass(frozen=True)
 class Span:
-    """The steps of a round at which a site of ``attend`` is read.
+    """The steps of a round at which a site of ``round_latents`` is read.
 
     Attributes:
         first: the first of them.
@@ -55,7 +55,7 @@ def check_spans(spans: Mapping[str, Span], sizes: Mapping[str, int], steps: int)
 
     Args:
         spans: by site.
-        sizes: number of values of each site of ``attend``.
+        sizes: number of values of each site of ``round_latents``.
         steps: of the round.
 
     Raises:
@@ -110,9 +110,9 @@ class Chain:
     A combination of a person's implants has one *sight* of a round: a state of the first level.
 
     Attributes:
-        supports: of the sites of ``attend``, ``[n]``, in the order of their spans.
+        supports: of the sites of ``round_latents``, ``[n]``, in the order of their spans.
         levels: of each site.
-        facts: of the rounds ``[P, B]``, see `HumanModel.facts`.
+        facts: of the rounds ``[P, B]``, see `HumanModel.covariates`.
     """
 
     supports: Mapping[str, Tensor]

@@ -4,7 +4,7 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
 
     psi_p      ~ prior                                     inside pyro.plate("person", P)
     m_b        ~ what differs from round to round          inside pyro.plate("round", B); or nothing
-    n_t        = natural visibility of each item           perceptual implants and attention m_b
+    n_t        = natural visibility of each item           perceptual implants and m_b
     k_t        = what follows from everything seen and told up to t
     v_t        = n_t or told_t or k_t                      what was communicated is overlaid
     u_t        = what psi_p takes for granted about the rest
@@ -12,9 +12,9 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
     a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
     z_t, x_t, r_t ~ the self-model's transition, observation and reward likelihoods
 
-To change the model, derive from :class:`HumanModel` and override one of ``prior``, ``attend``,
-``sees``, ``perceive``, ``believe`` and ``act``, in Pyro's syntax; fitting, predicting and
-simulating call those methods.
+To change the model, derive from :class:`HumanModel` and override one of ``prior``,
+``round_latents``, ``sees``, ``perceive``, ``evidence``, ``believe`` and ``act``, in Pyro's syntax.
+The last five are about one step of a round; fitting, predicting, simulating and planning call them.
 
 Departures from the supplement: thresholds are inferred by the bin between distances that can occur;
 a person may take things for granted (``assumes_clear``, ``assumes_closing``); actions may be
@@ -59,22 +59,11 @@ class HumanModel(nn.Module):
     views. Weights and the like follow as event dimensions.
 
     Attributes:
-        stepwise: whether a step of a round can be worked out from the belief before it and that
-            step alone, so that planning need not go through the whole round again. A class that
-            overrides ``perceive``, ``believe`` or ``act`` counts as one that cannot, unless it says
-            ``stepwise = True``.
         of_the_world: sites whose prior :meth:`learn_world` changes. They are about the world, and a
             population of people says nothing of them.
     """
 
-    stepwise = True
     of_the_world: tuple[str, ...] = ()
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        changed = {"perceive", "believe", "act"} & set(vars(cls))
-        if changed and "stepwise" not in vars(cls):
-            cls.stepwise = False
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__()
@@ -114,7 +103,7 @@ class HumanModel(nn.Module):
             self.domain, like
         ) | implant_priors.policy_implants(self.domain, self.self_model.latent, like)
 
-    def attend(self, implants: Implants) -> dict[str, Tensor]:
+    def round_latents(self, implants: Implants) -> dict[str, Tensor]:
         """Sample what differs from round to round in what somebody sees: their attention ``m_b``.
 
         Runs inside ``pyro.plate("person", P, dim=-2)`` and ``pyro.plate("round", B, dim=-1)``. Its
@@ -122,17 +111,17 @@ class HumanModel(nn.Module):
         :meth:`prior`; nothing differs unless this is overridden.
 
         Args:
-            implants: as :meth:`prior` returned them, ``[..., P, 1]``, with what :meth:`facts` said
+            implants: as :meth:`prior` returned them, ``[..., P, 1]``, with the :meth:`covariates`
                 of the rounds, ``[..., P, B]``, where they are known.
         """
         del implants
         return {}
 
-    def facts(self, observation: Observation) -> dict[str, Tensor]:
+    def covariates(self, observation: Observation) -> dict[str, Tensor]:
         """What of a round decides, besides themselves, what somebody attends to, ``[...]``.
 
-        :meth:`attend` reads it by these names, which are no sites. Nothing does unless this is
-        overridden.
+        :meth:`round_latents` reads it by these names, which are no sites. Nothing does unless this
+        is overridden.
 
         Args:
             observation: everything there was to observe, ``[..., T, K, F]``, as far as the round
@@ -142,15 +131,14 @@ class HumanModel(nn.Module):
         return {}
 
     def spans(self, observation: Observation) -> dict[str, Span]:
-        """At which steps of a round each site of :meth:`attend` is read, in this order.
+        """At which steps of a round each site of :meth:`round_latents` is read, in this order.
 
         Where this is known, attention is summed out exactly (:mod:`mirror_ppl.models.chain`). Sites
         are read throughout the round, or at a span of it that ends before the next one begins;
-        those read throughout come first. Their distributions do not hang on each other's values,
-        and the model is ``stepwise``. Nothing is known unless this is overridden, nor where a class
-        that derives from the one that does overrides ``attend``, ``sees``, ``look`` or ``perceive``
-        and not this: then values are drawn that stand for all there could be
-        (:mod:`mirror_ppl.models.attention`).
+        those read throughout come first. Their distributions do not depend on each other's values.
+        Nothing is known unless this is overridden, nor where a class that derives from the one that
+        does overrides ``round_latents``, ``sees`` or ``perceive`` and not this: then values are
+        drawn that stand for all there could be (:mod:`mirror_ppl.models.attention`).
 
         Args:
             observation: of one round, as far as it went, ``[t, K, F]``; t is 0 of padding.
@@ -161,15 +149,15 @@ class HumanModel(nn.Module):
     @property
     def chained(self) -> bool:
         """Whether attention is summed out exactly, see :meth:`spans`."""
-        if not self.attends or not self.stepwise:
+        if not self.has_round_latents:
             return False
         order = type(self).__mro__
         known = next(place for place, one in enumerate(order) if "spans" in vars(one))
-        changed = {"attend", "sees", "look", "perceive"}
+        changed = {"round_latents", "sees", "perceive"}
         since = any(changed & set(vars(one)) for one in order[:known])
         return order[known] is not HumanModel and not since
 
-    def explanations(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
+    def log_proposal(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
         """How well values of attention explain what was done, as logarithms ``[n]`` by site.
 
         Attention is proposed by that; whatever it says, what is inferred is right in the limit.
@@ -200,9 +188,9 @@ class HumanModel(nn.Module):
         return self.domain
 
     @cached_property
-    def attends(self) -> bool:
+    def has_round_latents(self) -> bool:
         """Whether something differs from round to round."""
-        if type(self).attend is HumanModel.attend:
+        if type(self).round_latents is HumanModel.round_latents:
             return False
         with (
             torch.random.fork_rng(devices=[]),
@@ -210,7 +198,7 @@ class HumanModel(nn.Module):
             pyro.plate("person", 1, dim=-2),
             pyro.plate("round", 1, dim=-1),
         ):
-            return bool(self.attend(self.prior()))
+            return bool(self.round_latents(self.prior()))
 
     def log_attention(
         self,
@@ -228,9 +216,9 @@ class HumanModel(nn.Module):
 
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
-            values: of the sites of :meth:`attend`, ``[P, B, G]``.
+            values: of the sites of :meth:`round_latents`, ``[P, B, G]``.
             log_weights: for how many each of them stands, ``[P, B, G]``.
-            facts: of the rounds ``[P, B]``, see :meth:`facts`.
+            facts: of the rounds ``[P, B]``, see :meth:`covariates`.
         """
         found = self.log_attention_sites(implants, values, facts)
         return torch.stack(torch.broadcast_tensors(*found.values())).sum(0) + log_weights
@@ -241,14 +229,14 @@ class HumanModel(nn.Module):
         values: Mapping[str, Tensor],
         facts: Mapping[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Log-probability of values of each site of :meth:`attend`, ``[..., P, B, G]``, by name.
+        """Log-probability of values of each round latent, ``[..., P, B, G]``, by name.
 
         Runs inside the person plate.
 
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
             values: of the sites, ``[P, B, G]``.
-            facts: of the rounds ``[P, B]``, see :meth:`facts`.
+            facts: of the rounds ``[P, B]``, see :meth:`covariates`.
         """
         # Far to the left of whatever dimensions draws and enumeration take.
         given = {
@@ -262,7 +250,7 @@ class HumanModel(nn.Module):
             poutine.condition(data=given),
             pyro.plate("round", rounds, dim=-1),
         ):
-            self.attend({**implants, **(facts or {})})
+            self.round_latents({**implants, **(facts or {})})
         found = {}
         for name in given:
             node = trace.trace.nodes[name]
@@ -276,7 +264,7 @@ class HumanModel(nn.Module):
         """What a person sees by themselves at one step, masks ``[..., K]``: ``n_t``.
 
         Args:
-            implants: the discrete sites of :meth:`prior` and :meth:`attend`, ``[...]``.
+            implants: the discrete sites of :meth:`prior` and :meth:`round_latents`, ``[...]``.
             observation: everything that could be seen at this step, ``[..., K, F]``.
             step: the number of the step in its round, from 0.
         """
@@ -287,7 +275,7 @@ class HumanModel(nn.Module):
         own = reach.expand(*batch, -1).gather(-1, direction.expand(*batch, -1))
         return by_eye(self.domain, distance <= own)
 
-    def look(
+    def perceive(
         self,
         implants: Implants,
         knowledge: Any,
@@ -295,10 +283,10 @@ class HumanModel(nn.Module):
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """One step of :meth:`perceive`.
+        """What a person sees, is told, remembers and takes for granted at one step.
 
         Args:
-            implants: the discrete sites of :meth:`prior` and :meth:`attend`, ``[...]``.
+            implants: the discrete sites of :meth:`prior` and :meth:`round_latents`, ``[...]``.
             knowledge: the domain's, of the step before.
             observation: everything that could be seen at this step, ``[..., K, F]``.
             told: what is communicated at this step, ``[..., K]``.
@@ -325,40 +313,8 @@ class HumanModel(nn.Module):
                 taken[name] = taken[name] | (mask & makes & ~visible[name])
         return View(visible, taken, imagined), knowledge
 
-    def perceive(self, implants: Implants, observation: Observation, told: Visibility) -> View:
-        """What a person sees, is told, remembers and takes for granted, masks ``[..., T, K]``.
-
-        Args:
-            implants: the discrete sites of :meth:`prior` and :meth:`attend`, ``[...]``.
-            observation: everything that could be seen, ``[..., T, K, F]``.
-            told: what is communicated, ``[..., T, K]``.
-        """
-        knowledge = self.domain.nothing_known(1, device=observation["ego"].device)
-        views = []
-        for step in range(observation["ego"].shape[-2]):
-            now = {
-                name: value[..., step, :] if name == "ego" else value[..., step, :, :]
-                for name, value in observation.items()
-            }
-            heard = {name: mask[..., step, :] for name, mask in told.items()}
-            view, knowledge = self.look(implants, knowledge, now, heard, step)
-            views.append(view)
-        return View.stack(views)
-
-    def believe(self, view: View, observation: Observation, actions: Tensor) -> Tensor:
-        """Beliefs ``zH`` ``[..., T, Z]`` of views of rounds: the means of the robot's own encoder.
-
-        Args:
-            view: masks ``[..., T, K]``.
-            observation: everything that could be seen, ``[..., T, K, F]``.
-            actions: what was done, ``[..., T]``; the last one is not used.
-        """
-        evidence = self.evidence(view, observation)
-        evidence = evidence + self.self_model.encoder.previous_actions(actions[..., :-1])
-        return self.self_model.believe(evidence, view.still)
-
     def evidence(self, view: View, observation: Observation) -> Tensor:
-        """What views ``[..., K]`` of observations tell the encoder at each step, ``[..., H]``."""
+        """What a view ``[..., K]`` of an observation tells the encoder, ``[..., H]``."""
         encoder, domain = self.self_model.encoder, self.domain
         embedded = encoder.embed(domain.symbols(observation))
         if not view.taken:
@@ -366,10 +322,13 @@ class HumanModel(nn.Module):
         imagined = encoder.embed(domain.symbols(view.imagined))
         return encoder.combine(embedded, view.visible, imagined, view.taken)
 
-    def advance(
+    def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
-    ) -> Gaussian:
-        """One step of :meth:`believe`: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.
+    ) -> Gaussian | Tensor:
+        """The belief after one step: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.
+
+        The mean of what is returned is the belief; a model whose beliefs have no density returns
+        the belief itself, ``[..., Z]`` with Z the model's :attr:`belief_size`.
 
         Args:
             belief: of the step before ``[..., Z]``; zero before the first.
@@ -383,20 +342,27 @@ class HumanModel(nn.Module):
             return state
         return state._replace(mean=torch.where(still[..., None], belief, state.mean))
 
-    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of actions ``[..., T, A]``.
+    def belief_after(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
+    ) -> Tensor:
+        """The belief ``[..., Z]`` itself; arguments as of :meth:`believe`."""
+        found = self.believe(belief, evidence, action, still)
+        return found.mean if isinstance(found, Gaussian) else found
 
-        Runs inside the person plate, so new sample sites have one value a person, ``[..., P, 1]``.
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """Log-probabilities of actions at one step, ``[..., P, B, A]``.
+
+        Runs inside the person plate and a plate of rounds; where several rounds come to the same
+        belief, B counts distinct ones.
 
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
-            belief: ``[..., P, V, T, Z]``, of each view of each person's rounds, in time order; of
-                models that are ``stepwise``, of single moments, T = 1.
-            values: the self-model's action values at the belief, ``[..., P, V, T, A]``.
+            belief: ``[..., P, B, Z]``.
+            values: the self-model's action values at the belief, ``[..., P, B, A]``.
         """
-        logits = implants["consistency"][..., None, None] * values
+        logits = implants["consistency"][..., None] * values
         logits = logits + implant_priors.residual(implants, belief)
-        lapse = implants["lapse"][..., None, None]
+        lapse = implants["lapse"][..., None]
         aware = torch.log1p(-lapse) + log_softmax_of_few(logits)
         return torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
 
@@ -412,7 +378,7 @@ class HumanModel(nn.Module):
         return self.of_actions(implants, table, self.act(implants, table.belief, table.values))
 
     def of_actions(self, implants: Implants, table: ViewTable, log_probabilities: Tensor) -> Tensor:
-        """The same, given log-probabilities ``[..., P, N, T', A]`` of actions at each moment."""
+        """The same, given log-probabilities ``[..., P, N, A]`` of actions at each moment."""
         attention = table.attention
         if attention is None:
             return table.log_likelihoods(log_probabilities)

@@ -179,7 +179,7 @@ def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
 
 
 def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
-    """``delta(zH_t)`` ``[..., T, A]`` of beliefs ``[..., T, Z]``: one hidden layer; 0 without."""
+    """``delta(zH_t)`` ``[..., P, B, A]`` of beliefs ``[..., P, B, Z]``: one hidden layer; or 0."""
     if "residual_in" not in implants:
         return belief.new_zeros(())
     hidden = torch.tanh(_layer(implants["residual_in"], belief))
@@ -187,27 +187,24 @@ def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
 
 
 def residual_features(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
-    """What the rows of ``residual_out`` weigh in the residual, ``[..., T, R + 1]``."""
+    """What the rows of ``residual_out`` weigh in the residual, ``[..., P, B, R + 1]``."""
     hidden = torch.tanh(_layer(implants["residual_in"], belief))
     return torch.nn.functional.pad(hidden, [0, 1], value=1.0)
 
 
 def _layer(weights: Tensor, inputs: Tensor) -> Tensor:
-    """Per-person linear layer: weights ``[..., I + 1, O]`` on inputs ``[..., T, I]``."""
-    if weights.dim() <= 2 or weights.shape[-3] != 1 or inputs.dim() <= 3:
+    """Per-person linear layer: weights ``[..., P, 1, I + 1, O]`` on inputs ``[..., P, B, I]``."""
+    if weights.dim() > 2 and weights.shape[-3] == 1:
+        # The rounds of a person share the weights: one product for all of them.
+        weights = weights.squeeze(-3)
+        if weights.dim() == inputs.dim() + 1:
+            return _of_all_draws(weights, inputs)
         return inputs @ weights[..., :-1, :] + weights[..., -1:, :]
-    # Views of a person share the weights: one product for all of them, not one for each.
-    weights = weights.squeeze(-3)
-    views = inputs.flatten(-3, -2)
-    if weights.dim() == views.dim() + 1:
-        product = _of_all_draws(weights, views)
-    else:
-        product = views @ weights[..., :-1, :] + weights[..., -1:, :]
-    return product.unflatten(-2, inputs.shape[-3:-1])
+    return (inputs[..., None, :] @ weights[..., :-1, :]).squeeze(-2) + weights[..., -1, :]
 
 
 def _of_all_draws(weights: Tensor, inputs: Tensor) -> Tensor:
-    """S draws of weights ``[S, ..., I + 1, O]`` on the same inputs ``[..., V, I]``: one product."""
+    """S draws of weights ``[S, ..., I + 1, O]`` on the same inputs ``[..., B, I]``: one product."""
     draws, outputs = weights.shape[0], weights.shape[-1]
     joined = weights.movedim(0, -2).flatten(-2)  # [..., I + 1, S O]
     product = inputs @ joined[..., :-1, :] + joined[..., -1:, :]

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import pyro
 import torch
@@ -134,14 +135,13 @@ def check_contract(human: HumanModel) -> None:
     device = next(human.parameters()).device
     generator = torch.Generator(device).manual_seed(0)
     people, steps, actions = 2, 3, len(domain.actions)
-    states = [domain.initial(people, generator)]
-    done = torch.zeros(people, steps, dtype=torch.long, device=device)
-    for step in range(steps - 1):
-        states.append(domain.transition(states[-1], done[:, step]))
-    observed = [domain.observe(state) for state in states]
-    observation = {name: torch.stack([part[name] for part in observed], 1) for name in observed[0]}
+    state, observed = domain.initial(people, generator), []
+    none, done = (torch.full((people,), action, device=device) for action in (actions, 0))
+    for _ in range(steps):
+        observed.append(domain.observe(state))
+        state = domain.transition(state, done)
     told = {
-        m.name: torch.zeros(people, steps, len(m.items), dtype=torch.bool, device=device)
+        m.name: torch.zeros(people, len(m.items), dtype=torch.bool, device=device)
         for m in domain.modalities
     }
     method = "prior"
@@ -158,33 +158,36 @@ def check_contract(human: HumanModel) -> None:
                 raise HumanModelError(
                     f"prior returned {type(implants).__name__}, expected a dict of sites by name"
                 )
-            method = "attend"
-            attention = _attention(human, implants, people)
-            for name in set(attention) & set(latent_sites(trace.trace)):
-                raise HumanModelError(f'"{name}" is a site of prior() and of attend()')
+            method = "round_latents"
+            latents = _round_latents(human, implants, people)
+            for name in set(latents) & set(latent_sites(trace.trace)):
+                raise HumanModelError(f'"{name}" is a site of prior() and of round_latents()')
             sampled = latent_values(trace.trace)
             discrete = {
                 name: sampled[name].flatten()[:people].expand(people)
                 for name in sampled
                 if name in discrete_names(trace.trace)
             }
-            method = "perceive"
-            view = human.perceive(Readable(discrete | attention), observation, told)
-            method = "believe"
-            belief = human.believe(view, observation, done)[:, None]
-            method = "act"
-            values = human.action_values(belief)
-            log_probabilities = human.act(implants, belief, values)
-            expected = (people, 1, steps, actions)
-            if tuple(log_probabilities.shape[-4:]) != expected:
-                raise HumanModelError(
-                    f"act returned shape {tuple(log_probabilities.shape)}, expected "
-                    f"{expected} for (people, views, steps, actions)"
+            belief = next(human.parameters()).new_zeros(people, human.belief_size)
+            knowledge: Any = domain.nothing_known(people, device=device)
+            for step, now in enumerate(observed):
+                method = "perceive"
+                readable = Readable(discrete | latents)
+                view, knowledge = human.perceive(readable, knowledge, now, told, step)
+                method = "evidence"
+                evidence = human.evidence(view, now)
+                method = "believe"
+                belief = human.belief_after(
+                    belief, evidence, none if step == 0 else done, view.still
                 )
-            total = log_probabilities.exp().sum(-1)
-            if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
-                raise HumanModelError("act has to return log-probabilities: they do not sum to 1")
-        _check_names(domain, [*latent_sites(trace.trace), *attention])
+                if tuple(belief.shape) != (people, human.belief_size):
+                    raise HumanModelError(
+                        f"believe returned shape {tuple(belief.shape)}, expected "
+                        f"({people}, {human.belief_size}) for {people} beliefs"
+                    )
+                method = "act"
+                _check_act(human, implants, belief)
+        _check_names(domain, [*latent_sites(trace.trace), *latents])
         method = "spans"
         if human.chained:
             check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
@@ -197,27 +200,47 @@ def check_contract(human: HumanModel) -> None:
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
 
 
-def _attention(human: HumanModel, implants: Implants, people: int) -> dict[str, Tensor]:
+def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
+    """Runs inside the person plate, of people with a round each; of beliefs ``[P, Z]``."""
+    belief = belief[:, None]
+    with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
+        found = human.act(implants, belief, human.action_values(belief))
+    for name in latent_sites(trace.trace):
+        raise HumanModelError(f'act samples "{name}" at every step; sample it in prior')
+    expected = (len(belief), 1, len(human.domain.actions))
+    if tuple(found.shape[-3:]) != expected:
+        raise HumanModelError(
+            f"act returned shape {tuple(found.shape)}, expected {expected} for (people, rounds, "
+            "actions)"
+        )
+    total = found.exp().sum(-1)
+    if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
+        raise HumanModelError("act has to return log-probabilities: they do not sum to 1")
+
+
+def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[str, Tensor]:
     """What differs from round to round, in one round of each ``[people]``."""
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-        returned = human.attend(implants)
+        returned = human.round_latents(implants)
     sites = latent_sites(trace.trace)
     if not isinstance(returned, Mapping) or set(returned) != set(sites):
-        raise HumanModelError("attend has to return a dict of the sites that it samples, by name")
+        raise HumanModelError(
+            "round_latents has to return a dict of the sites that it samples, by name"
+        )
     for name, site in trace.trace.nodes.items():
         if site["type"] == "param":
             raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
     for name, site in sites.items():
         if not site["fn"].support.is_discrete:
-            raise HumanModelError(f'"{name}" of attend is not discrete')
+            raise HumanModelError(f'"{name}" of round_latents is not discrete')
         shape, event = tuple(site["fn"].batch_shape), tuple(site["fn"].event_shape)
         if event or torch.broadcast_shapes(shape, (people, 1)) != (people, 1):
             raise HumanModelError(
-                f'"{name}" of attend has shape {shape} and event shape {event}, expected '
+                f'"{name}" of round_latents has shape {shape} and event shape {event}, expected '
                 f"({people}, 1) and () for {people} people with one round"
             )
         if not site["fn"].has_enumerate_support:
-            raise HumanModelError(f'"{name}" of attend has no finite support')
+            raise HumanModelError(f'"{name}" of round_latents has no finite support')
     return {name: site["value"].flatten()[:people].expand(people) for name, site in sites.items()}
 
 

@@ -71,7 +71,6 @@ class Searcher(HumanModel):
             which the robot would.
     """
 
-    stepwise = True
     kinds = tuple(kind.lower().replace(" ", "_") for kind in KINDS)
     of_the_world = tuple(RULE + kind.lower().replace(" ", "_") for kind in KINDS)
     rule_logits: Tensor
@@ -136,7 +135,7 @@ class Searcher(HumanModel):
             for kind, logits in zip(self.kinds, self.rule_logits, strict=True)
         }
 
-    def attend(self, implants: Implants) -> dict[str, Tensor]:
+    def round_latents(self, implants: Implants) -> dict[str, Tensor]:
         """Sample the guess, and when they find what they look for at each stage."""
         one = next(iter(implants.values()))
         items = next(m.items for m in self.domain.modalities if m.name == "visual")
@@ -152,7 +151,7 @@ class Searcher(HumanModel):
             sites[name] = pyro.sample(name, found)
         return sites
 
-    def facts(self, observation: Observation) -> dict[str, Tensor]:
+    def covariates(self, observation: Observation) -> dict[str, Tensor]:
         """What was looked for at each stage; at those not reached, what was looked for last."""
         stage = observation["ego"][..., 0].long()
         if not stage.shape[-1]:  # of nobody's round nothing was looked for
@@ -181,7 +180,7 @@ class Searcher(HumanModel):
             spans[f"{FOUND}{number}"] = Span(first, last, last - first + 1)
         return spans
 
-    def explanations(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
+    def log_proposal(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
         """What was pressed for was found just before; what was waited for was not."""
         steps = torch.arange(self.domain.horizon + 1, device=actions.device)
         stage, since = (part[: len(actions)] for part in observation["ego"].long().unbind(-1))
@@ -216,14 +215,14 @@ class Searcher(HumanModel):
             "verbal": reads.expand(torch.broadcast_shapes(reads.shape, verbal.shape)),
         }
 
-    def look(self, implants, knowledge, observation, told, step):
+    def perceive(self, implants, knowledge, observation, told, step):
         """As everywhere; and who does not know the type takes it for what they guess.
 
         Bombs do nothing by themselves: at a step without news the belief stays as it is, however
         long they search.
         """
         before = knowledge
-        view, knowledge = super().look(implants, knowledge, observation, told, step)
+        view, knowledge = super().perceive(implants, knowledge, observation, told, step)
         guess = implants[GUESS].to(observation["verbal"])[..., None, None]
         known = view.visible["verbal"]
         shape = torch.broadcast_shapes(known.shape, guess.shape[:-1])
@@ -240,8 +239,8 @@ class Searcher(HumanModel):
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Choose as the robot would, with buttons exchanged by the rules they know."""
         presses = values[..., 1:]
-        second = self.believed_kind(belief)[..., None]  # [..., T, 1]
-        own = [self._exchanged(presses, implants[RULE + kind][..., None]) for kind in self.kinds]
+        second = self.believed_kind(belief)[..., None]  # [..., P, B, 1]
+        own = [self._exchanged(presses, implants[RULE + kind]) for kind in self.kinds]
         exchanged = (1 - second) * own[0] + second * own[1]
         wait = values[..., :1].expand(*exchanged.shape[:-1], 1)
         return super().act(implants, belief, torch.cat([wait, exchanged], -1))
@@ -254,8 +253,8 @@ class Searcher(HumanModel):
         return (self.self_model.decoders["verbal"](belief).mean[..., 0, 0] > EVEN_ODDS).to(belief)
 
     def _exchanged(self, presses: Tensor, rule: Tensor) -> Tensor:
-        """Values ``[..., P, V, T, 4]`` of buttons under a rule ``[..., P, 1, 1]``."""
-        exchange = self.exchanges[rule.long()]  # [..., P, 1, 1, 4, 4]
+        """Values ``[..., P, B, 4]`` of buttons under a rule ``[..., P, 1]``."""
+        exchange = self.exchanges[rule.long()]  # [..., P, 1, 4, 4]
         return (exchange @ presses[..., None]).squeeze(-1)
 
     @torch.no_grad()

@@ -16,8 +16,6 @@ from mirror_ppl.models.view import View
 class PerceptualSearcher(Searcher):
     """Searches and guesses, but decides as the robot does: by its rules, without a residual."""
 
-    stepwise = True
-
     def prior(self) -> dict[str, Tensor]:
         """Sample how quick they are, whether they read the type, and how strictly they choose."""
         like = next(self.self_model.parameters())
@@ -31,10 +29,9 @@ class PerceptualSearcher(Searcher):
 class KnowingSearcher(Searcher):
     """Knows the rules, and sees all that there is at once: nothing is left to be searched."""
 
-    stepwise = True
-    attend = HumanModel.attend
-    facts = HumanModel.facts
-    explanations = HumanModel.explanations
+    round_latents = HumanModel.round_latents
+    covariates = HumanModel.covariates
+    log_proposal = HumanModel.log_proposal
 
     def prior(self) -> dict[str, Tensor]:
         """Sample their rules, and how they decide."""
@@ -48,9 +45,9 @@ class KnowingSearcher(Searcher):
         del implants, step
         return _everything(observation)
 
-    def look(self, implants, knowledge, observation, told, step) -> tuple[View, object]:
+    def perceive(self, implants, knowledge, observation, told, step) -> tuple[View, object]:
         """As everywhere; there is nothing to guess."""
-        return HumanModel.look(self, implants, knowledge, observation, told, step)
+        return HumanModel.perceive(self, implants, knowledge, observation, told, step)
 
 
 class KnowingRobot(NoImplants):

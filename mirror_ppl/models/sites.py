@@ -41,8 +41,8 @@ class Readable(Mapping[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         if name not in self.known:
             raise HumanModelError(
-                f'perceive() reads "{name}", which is not a discrete site of prior() or attend(); '
-                f"it can read: {', '.join(self.known) or 'none'}"
+                f'perceive() reads "{name}", which is not a discrete site of prior() or '
+                f"round_latents(); it can read: {', '.join(self.known) or 'none'}"
             )
         self.read.add(name)
         return self.known[name]

@@ -72,7 +72,7 @@ def _check_looks(
 
             sites = {name: repeated(value) for name, value in usual.items()}
             known = map_state(repeated, knowledge)
-            view, _ = human.look({**sites, site: some}, known, now, told, step)
+            view, _ = human.perceive({**sites, site: some}, known, now, told, step)
             numbers = view.map(repeated).numbers()
             if bool((numbers != numbers[:1]).any()):
                 what = (
@@ -84,7 +84,7 @@ def _check_looks(
                     f'the span of "{site}" is steps {span.first} to {span.last}, but at step '
                     f"{step} {what}"
                 )
-        _, knowledge = human.look(usual, knowledge, now, told, step)
+        _, knowledge = human.perceive(usual, knowledge, now, told, step)
 
 
 def _check_independence(human: HumanModel, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -92,9 +92,9 @@ def _check_independence(human: HumanModel, so_far: Mapping[str, Tensor]) -> dict
     with torch.random.fork_rng(devices=[]), poutine.block(), pyro.plate("person", 1, dim=-2):
         torch.manual_seed(0)
         implants = human.prior()
-        facts = {name: fact.view(1, 1) for name, fact in human.facts({**so_far}).items()}
+        facts = {name: fact.view(1, 1) for name, fact in human.covariates({**so_far}).items()}
         with poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-            human.attend({**implants, **facts})
+            human.round_latents({**implants, **facts})
         supports = {
             name: node["fn"].enumerate_support(expand=False).flatten()
             for name, node in latent_sites(trace.trace).items()
@@ -110,7 +110,7 @@ def _check_independence(human: HumanModel, so_far: Mapping[str, Tensor]) -> dict
                 found.append(human.log_attention_sites(implants, values, facts)[site])
             if not torch.equal(*torch.broadcast_tensors(*found)):
                 raise HumanModelError(
-                    f'"{site}" of attend hangs on another of its sites, so that spans cannot be '
-                    "summed out one after another"
+                    f'"{site}" of round_latents depends on another of its sites, so that spans '
+                    "cannot be summed out one after another"
                 )
     return supports

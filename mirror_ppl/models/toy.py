@@ -13,6 +13,7 @@ has the evidence of a beta-binomial.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -44,25 +45,37 @@ class ToyHuman(HumanModel):
             implants[site] = pyro.sample(site, rate)
         return implants
 
-    def perceive(self, implants: Implants, observation: Observation, told: Visibility) -> View:
+    def perceive(
+        self,
+        implants: Implants,
+        knowledge: Any,
+        observation: Observation,
+        told: Visibility,
+        step: int,
+    ) -> tuple[View, Any]:
         """What is within reach; nothing is remembered."""
+        del told, step
         _, distance = self.domain.distance(observation)
         bins = torch.tensor(self.domain.reach_bins, device=distance.device)
-        return View({"visual": distance <= bins[implants["reach"]][..., None, None]})
+        return View({"visual": distance <= bins[implants["reach"]][..., None]}), knowledge
 
-    def believe(self, view: View, observation: Observation, actions: Tensor) -> Tensor:
-        """Whether anything is in sight, in the first dimension ``[..., T, Z]``."""
-        seen = view.visible["visual"].any(-1)
+    def evidence(self, view: View, observation: Observation) -> Tensor:
+        """Whether anything is in sight, ``[..., 1]``."""
+        del observation
         like = next(self.self_model.parameters())
-        belief = like.new_zeros(*seen.shape, self.self_model.latent)
-        belief[..., 0] = seen.to(like)
-        return belief
+        return view.visible["visual"].any(-1, keepdim=True).to(like)
+
+    def believe(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
+    ) -> Tensor:
+        """The same, in the first dimension ``[..., Z]``."""
+        del action, still
+        return torch.nn.functional.pad(evidence, [0, belief.shape[-1] - 1])
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities ``[..., T, 2]``."""
-        seen = belief[..., 0] > 0
-        one, other = (implants[site][..., None] for site in RATES)
-        rate = torch.where(seen, one, other)
+        """Log-probabilities ``[..., P, B, 2]``."""
+        del values
+        rate = torch.where(belief[..., 0] > 0, implants["in_sight"], implants["otherwise"])
         return torch.stack([torch.log1p(-rate), torch.log(rate)], -1)
 
 

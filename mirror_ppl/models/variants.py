@@ -63,7 +63,7 @@ class PerItem(HumanModel):
             | implant_priors.policy_implants(domain, self.self_model.latent, like)
         )
 
-    def attend(self, implants: Implants) -> dict[str, Tensor]:
+    def round_latents(self, implants: Implants) -> dict[str, Tensor]:
         """Sample when each item is noticed."""
         return implant_priors.notice_times(self.domain, implants)
 

@@ -44,14 +44,14 @@ def log_likelihoods(
     """Log-likelihood ``[..., V]`` of the recorded actions along views.
 
     Args:
-        log_probabilities: of actions at beliefs, ``[..., N, T', A]``.
-        acted: what was done there, ``[..., N, T']``.
-        moments: of each step of each view, which of the N T' beliefs it is, ``[..., V, T]``;
+        log_probabilities: of actions at beliefs, ``[..., N, A]``.
+        acted: what was done there, ``[..., N]``.
+        moments: of each step of each view, which of the N beliefs it is, ``[..., V, T]``;
             ``NO_VIEW`` in padding.
         repeats: how often each of them occurs ``[..., V, T]``; once unless given.
     """
     acted = acted.expand(log_probabilities.shape[:-1])
-    chosen = log_probabilities.gather(-1, acted[..., None]).squeeze(-1).flatten(-2)
+    chosen = log_probabilities.gather(-1, acted[..., None]).squeeze(-1)
     steps = moments.clamp(min=0).flatten(-2)
     found = chosen.gather(-1, steps.expand(*chosen.shape[:-1], steps.shape[-1]))
     found = found.unflatten(-1, moments.shape[-2:])
@@ -68,7 +68,7 @@ class Attention:
     these values. Those views together are a *sight* of the round; there are U.
 
     Attributes:
-        values: of the sites of ``attend``, ``[P, B, G]``.
+        values: of the sites of ``round_latents``, ``[P, B, G]``.
         log_weights: for how many of all that there could be each of them stands, ``[P, B, G]``;
             minus infinity in padding.
         kept: those that could explain what was done, ``[P, B, G']``, an index into the G.
@@ -77,7 +77,7 @@ class Attention:
         sights: the view of each sight under each value kept, ``[P, U, G']``, an index into the V
             views.
         rounds: the round that each sight is of, ``[P, U]``.
-        facts: of the rounds ``[P, B]``, see `HumanModel.facts`.
+        facts: of the rounds ``[P, B]``, see `HumanModel.covariates`.
     """
 
     values: Mapping[str, Tensor]
@@ -117,8 +117,7 @@ class Attention:
 class ViewTable:
     """Distinct views of the rounds of P people, V a person (padded), with the beliefs they lead to.
 
-    Views share the moments that they have in common. A model that is ``stepwise`` acts on each of
-    them by itself: there are N moments, and T' is 1. For other models N is V and T' is T.
+    Views share the N moments that they have in common.
 
     Attributes:
         sites: names of the discrete sites that views depend on.
@@ -126,11 +125,11 @@ class ViewTable:
         index: sight of each person, round and combination of those sites' values, ``[P, B, M]``,
             an index into the person's U sights or ``NO_VIEW``. Where attention does not differ
             from round to round a sight is a view, and U is V.
-        moments: of each step of a view, which of the N T' beliefs it is, ``[P, V, T]``; ``NO_VIEW``
-            in padding.
-        belief: ``[P, N, T', Z]``.
-        values: the self-model's action values ``[P, N, T', A]``.
-        acted: what was done there, ``[P, N, T']``.
+        moments: of each step of a view, which of the N beliefs it is, ``[P, V, T]``; ``NO_VIEW`` in
+            padding.
+        belief: ``[P, N, Z]``.
+        values: the self-model's action values ``[P, N, A]``.
+        acted: what was done there, ``[P, N]``.
         recorded: actions ``[P, B, T]``, 0 in padding.
         steps: which steps are real ``[P, B, T]``.
         view_counts: number of real views of each person ``[P]``.
@@ -237,7 +236,7 @@ class ViewTable:
         """Log-likelihood ``[..., P, U]`` of the recorded actions under each sight.
 
         Args:
-            log_probabilities: of actions ``[..., P, N, T', A]``.
+            log_probabilities: of actions ``[..., P, N, A]``.
             log_chances: of attention where there is such, see :meth:`Attention.log_chances` and
                 :meth:`Chain.log_chances`.
         """
