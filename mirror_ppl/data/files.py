@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.data.provenance import DESCRIPTION, RESERVED
 from mirror_ppl.data.schema import TOLD, TRUTH
 from mirror_ppl.domains import Domain, get_domain, require_known
-from mirror_ppl.errors import DemonstrationsError, UnknownNameError
+from mirror_ppl.errors import DemonstrationsError, UnknownNameError, shown
 from mirror_ppl.files import write_whole
 from mirror_ppl.netcdf import read_netcdf
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 FORMAT = "mirror_ppl demonstrations"
 FORMAT_VERSION = "1"
+MANY, LONG = 12, 40
+"""Names, and characters of a name, that a message shows."""
 
 _LONG_NAMES = {
     "round_count": ("number of rounds; those from it on are padding", "rounds"),
@@ -182,11 +184,18 @@ def _in_order(dataset: xr.Dataset, labels: Mapping[str, tuple[str, ...]]) -> xr.
         if dimension in dataset.coords:
             given = _texts(dataset[dimension])
             if sorted(given) != sorted(expected):
+                odd = [name for name in given if name not in expected] or given
                 raise DemonstrationsError(
-                    f"{dimension} has {', '.join(given)}, expected {', '.join(expected)}"
+                    f"{dimension} has {_listed(odd)}, expected {_listed(expected)}"
                 )
             dataset = dataset.isel({dimension: [given.index(name) for name in expected]})
     return dataset
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names in a message, on one line; of many only the first."""
+    some = [name if name.isprintable() and len(name) <= LONG else shown(name) for name in names]
+    return ", ".join(some[:MANY] + [f"... ({len(some)} in all)"] * (len(some) > MANY))
 
 
 def _texts(array: xr.DataArray) -> list[str]:
@@ -206,7 +215,9 @@ def _tensor(array: xr.DataArray, dimensions: tuple[str, ...]) -> Tensor:
     values = array.transpose(*dimensions).values
     if values.dtype.kind not in "biuf":
         raise DemonstrationsError(f"{array.name} has the dtype {values.dtype}, expected numbers")
-    return torch.from_numpy(values.astype(np.float64 if values.dtype.kind == "f" else np.int64))
+    with np.errstate(invalid="ignore"):  # of values that are no number, and stay none
+        values = values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
+    return torch.from_numpy(values)
 
 
 def _provenance(attributes: Mapping[str, object]) -> dict[str, str | int | float]:
