@@ -26,6 +26,7 @@ from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility, map_state
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.prior import checked_draws
+from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.attention import AttentionValues, Proposal
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.human import HumanModel
@@ -103,7 +104,8 @@ class Person:
             values = self._attention.values(None, 0, facts, explanations)
         log_chances = self._log_chances(values.values, past)
         with self._conditioned():
-            log_chances = log_chances + self.human.log_attention(
+            log_chances = log_chances + log_weighted_latents(
+                self.human,
                 self.implants,
                 {name: value[None, None] for name, value in values.values.items()},
                 values.log_weights[None, None],
@@ -141,7 +143,12 @@ class Person:
         eye = self.eye[:, None] * number + torch.arange(number, device=self.device)  # [S, G]
         for time, (beliefs, own) in enumerate(through(everybody, past)):
             mean = beliefs.mean[None]
-            found = self.act(mean, self.human.action_values(mean))[..., past.actions[time]]
+            acted = past.actions[time].expand(1, mean.shape[1])
+            with self._conditioned():
+                _, found = choices(
+                    self.human, self.implants, mean, self.human.action_values(mean), acted
+                )
+            found = found.expand(self.number, *found.shape[-2:])[:, 0]
             total = total + found.gather(-1, own[eye])
         return total
 

@@ -18,8 +18,9 @@ from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.models.attention import attention_sites
-from mirror_ppl.models.chain import Chain, Level, check_spans
+from mirror_ppl.models.chain import Chain, Level
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.spans import check_spans
 from mirror_ppl.models.view import View
 from mirror_ppl.models.view_table import NO_VIEW
 

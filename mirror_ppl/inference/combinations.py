@@ -9,17 +9,21 @@ from typing import Any
 import pyro
 import torch
 from pyro import poutine
-from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.likelihood.densities import (
+    BATCH,
+    check_plates,
+    is_observed,
+    log_prob,
+    prior_nodes,
+)
 from mirror_ppl.models.attention import attention_nodes, attention_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 
 MAX_COMBINATIONS = 100_000
-BATCH = 3
-"""Dimensions of draws, people and their rounds."""
 
 
 def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
@@ -116,6 +120,8 @@ def log_priors(
 ) -> Tensor:
     """Log prior probability ``[S, P, M]`` of each combination.
 
+    With all that ``prior`` observes or adds by a factor, as far as it depends on these sites.
+
     Args:
         human: the model of people.
         grid: values ``[M]`` of the discrete sites; others are not looked at.
@@ -127,37 +133,35 @@ def log_priors(
     """
     values = {site: value[:, None, None, None] for site, value in grid.items()}
     number = len(next(iter(draws.values()))) if draws else 1
-    with (
-        torch.random.fork_rng(devices=[]),
-        poutine.block(),
-        poutine.trace() as trace,
-        poutine.condition(data={**draws, **values}),
-        pyro.plate("draw", number, dim=-3),
-        pyro.plate("person", people, dim=-2),
-    ):
-        human.prior()
-    for name, node in trace.trace.nodes.items():
-        if node["type"] != "sample" or name in grid or site_is_subsample(node):
+    nodes = prior_nodes(human, {**draws, **values}, number, people)
+    total = next(human.parameters()).new_zeros(1, 1, 1, 1)
+    for name, node in nodes.items():
+        if name in grid:
+            own = _log_prior(node, grid[name])
+        elif len(node["fn"].batch_shape) <= BATCH:
             continue
-        if len(node["fn"].batch_shape) > BATCH:
+        elif not is_observed(node):
             raise HumanModelError(
                 f'the prior of "{name}" depends on a discrete site that perceive() reads; let that '
                 f'site depend on "{name}" instead'
             )
-    total = next(human.parameters()).new_zeros(1, 1, 1, 1)
-    for site, value in grid.items():
-        total = total + _log_prior(trace.trace.nodes[site]["fn"], value)
+        else:
+            own = log_prob(node)
+        check_plates(name, own, people)
+        total = total + own
     size = max([len(value) for value in grid.values()], default=1)
     return total.expand(size, number, people, 1).squeeze(-1).permute(1, 2, 0)
 
 
-def _log_prior(fn: Any, value: Tensor) -> Tensor:
+def _log_prior(node: Any, value: Tensor) -> Tensor:
     """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 where all is alike."""
-    if len(fn.batch_shape) > BATCH:  # depends on other discrete sites
-        return fn.log_prob(value[:, None, None, None])
+    fn = node["fn"]
+    plain = node["mask"] is None and isinstance(node["scale"], (int, float))
+    if len(fn.batch_shape) > BATCH or not plain:  # depends on other discrete sites, perhaps
+        return log_prob(node)
     # The prior of most sites has nothing to do with others, so that it is one table.
     values, index = value.unique(return_inverse=True)
     table = fn.log_prob(values[:, None, None, None])
     if (table == table[:, :1]).all():
         table = table[:, :1]
-    return table[index]
+    return node["scale"] * table[index]

@@ -17,6 +17,8 @@ from torch import Tensor
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.combinations import discrete_sites, grid_of, log_priors
 from mirror_ppl.inference.views import combination_scores
+from mirror_ppl.likelihood.densities import choices
+from mirror_ppl.likelihood.table_program import log_likelihoods, of_moments
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
@@ -82,7 +84,7 @@ def log_joints(
     for begin in range(0, number, size):
         some = {name: value[begin : begin + size] for name, value in draws.items()}
         with conditioned(some, min(size, number - begin), table.people):
-            likelihoods = human.log_likelihoods(human.prior(), table)
+            likelihoods = log_likelihoods(human, human.prior(), table)
         scores = combination_scores(table, likelihoods, combinations)
         if log_prior is None:
             parts.append(log_priors(human, grid, some, table.people) + scores)
@@ -115,7 +117,7 @@ def expected_counts(
     """How often each action is expected to have been taken at each moment, ``[N, A]``.
 
     It is not known what somebody saw and attended to. By Fisher's identity this is the gradient of
-    the log-likelihood by the log-probabilities of actions.
+    the log-likelihood by that of the moments.
 
     Args:
         human: the model of people.
@@ -129,16 +131,19 @@ def expected_counts(
     grid = {name: one[combinations] for name, one in combination_values(human, table).items()}
     with conditioned(draws, number, 1), torch.enable_grad():
         implants = human.prior()
-        chances = human.act(implants, table.belief, table.values)
-        chances = chances.expand(number, *chances.shape[-3:]).detach().requires_grad_()
-        likelihoods = human.of_actions(implants, table, chances)
+        with torch.no_grad():
+            _, moments = choices(human, implants, table.belief, table.values, table.acted)
+        moments = moments.expand(number, *moments.shape[-2:]).clone().requires_grad_()
+        likelihoods = of_moments(human, implants, table, moments)
         joint = combination_scores(table, likelihoods, combinations)[:, 0]
         if log_prior is None:
             log_prior = log_priors(human, grid, draws, 1)[:, 0]
         total = (joint + log_prior).logsumexp(-1)
-        (counts,) = torch.autograd.grad(total.sum(), chances)
+        (counts,) = torch.autograd.grad(total.sum(), moments)
     weights = log_weights.softmax(0).to(counts)
-    return (weights @ counts.flatten(1)).view(counts.shape[2:])
+    often = weights @ counts[:, 0]  # [N]
+    actions = often.new_zeros(len(often), len(human.domain.actions))
+    return actions.scatter(-1, table.acted[0][:, None], often[:, None])
 
 
 @torch.no_grad()

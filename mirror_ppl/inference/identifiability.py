@@ -35,6 +35,7 @@ from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import combination_number
 
@@ -267,7 +268,7 @@ def _information(
         pyro.plate("draw", len(pairs), dim=-3),
         pyro.plate("person", 1, dim=-2),
     ):
-        likelihood = human.log_likelihoods(human.prior(), table)
+        likelihood = log_likelihoods(human, human.prior(), table)
     likelihood = likelihood.expand(len(pairs), 1, -1)[:, 0]  # [S, U]
     joint = likelihood[:, table.index[0][:, candidates]] + pairs[:, None]  # [S, R, C]
     after = torch.softmax(torch.logsumexp(joint, 0), -1)  # [R, C]

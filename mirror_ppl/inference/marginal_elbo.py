@@ -16,6 +16,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.inference.exact import combination_values
+from mirror_ppl.likelihood.table_program import TableProgram
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
@@ -37,7 +38,7 @@ def marginal_elbo(
 
     def loss(table: ViewTable) -> Tensor:
         guided = poutine.trace(guide).get_trace(table)
-        replayed = poutine.replay(human.model, trace=guided)
+        replayed = poutine.replay(TableProgram(human), trace=guided)
         combinations = {
             site: value[table.possible_numbers][..., None]  # [C, P, 1]
             for site, value in values.items()

@@ -10,6 +10,7 @@ from pyro.infer.autoguide import init_to_median
 from mirror_ppl.inference.exact import draw_combinations, log_joints, require_acting_on_beliefs
 from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.svi import PLATES, Report, silent
+from mirror_ppl.likelihood.table_program import TableProgram
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
@@ -44,7 +45,10 @@ def sample_nuts(
     with torch.random.fork_rng(devices=[]), pyro.validation_enabled(False):
         torch.manual_seed(seed)
         kernel = NUTS(
-            human.model, max_plate_nesting=PLATES, init_strategy=init_to_median, max_tree_depth=6
+            TableProgram(human),
+            max_plate_nesting=PLATES,
+            init_strategy=init_to_median,
+            max_tree_depth=6,
         )
         chain = MCMC(kernel, number, WARMUP, hook_fn=count, disable_progbar=True)
         chain.run(table)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mirror_ppl.inference.exact import conditioned
 from mirror_ppl.inference.marginal_elbo import PLATES
+from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.chain import NEVER, NO_VALUE, Chain
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable
@@ -74,12 +75,12 @@ def _attentive(
     person = torch.arange(table.people, device=sight.device)[:, None]
     views = attention.sights[person, sight]  # [P, B, G']
     moments = table.moments[person[..., None], views].clamp(min=0)  # [P, B, G', T]
-    each = human.act(implants, table.belief, table.values)
+    each, done = choices(human, implants, table.belief, table.values, table.acted)
     found = each.expand(table.people, *each.shape[-2:])[person[..., None, None], moments]
-    done = table.recorded[:, :, None, :, None].expand(*moments.shape, 1)
-    along = found.gather(-1, done).squeeze(-1).cumsum(-1)
-    weights = human.log_attention(
-        implants, attention.values, attention.log_weights, attention.facts
+    done = done.expand(table.people, -1)[person[..., None, None], moments]
+    along = done.cumsum(-1)
+    weights = log_weighted_latents(
+        human, implants, attention.values, attention.log_weights, attention.facts
     )
     # What was done before a step tells what they attend to at it.
     before = torch.nn.functional.pad(along[..., :-1], [1, 0])
@@ -94,13 +95,12 @@ def _chained(
     number = len(next(iter(draws.values())))
     with conditioned(draws, number, table.people):
         implants = human.prior()
-        each = human.act(implants, table.belief, table.values)  # [S, P, N, A]
-        each = each.expand(number, table.people, *each.shape[-2:])
+        each, chosen = choices(human, implants, table.belief, table.values, table.acted)
+        each = each.expand(number, table.people, *each.shape[-2:])  # [S, P, N, A]
+        chosen = chosen.expand(number, *table.acted.shape)
         chances = chain.log_chances(human, implants, table.rounds)
         chances = chances.expand(number, table.people, table.rounds, *chances.shape[-2:])
         sight = table.sight_of(implants).expand(number, table.people, table.rounds)
-    acted = table.acted.expand(number, *table.acted.shape)[..., None]
-    chosen = each.gather(-1, acted).squeeze(-1)  # [S, P, N]
     *_, steps = table.recorded.shape
     actions = each.shape[-1]
     shape = (number, table.people, table.rounds, steps, actions)
@@ -135,7 +135,7 @@ def _along(
 
     Args:
         moments: of E courses ``[E, T]``.
-        chosen: log-probabilities of what was done at each moment ``[S, N]``.
+        chosen: log-likelihood of what was recorded at each moment ``[S, N]``.
         each: of every action ``[S, N, A]``.
         log_chance: of each course before the span ``[S, E]``.
 

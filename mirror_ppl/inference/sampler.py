@@ -4,7 +4,8 @@ With draws ``psi_s ~ q`` of a person::
 
     w_s = p(psi_s) sum_m p(m | psi_s) p(actions | m, psi_s) / q(psi_s)
 
-where ``m`` runs over all combinations of the discrete sites that perception reads. ``q`` is the
+where ``m`` runs over all combinations of the discrete sites that perception reads, and densities
+are those of the program with all that it observes, scales or adds by factors. ``q`` is the
 mixture of all that was proposed (Veach and Guibas, *Optimally combining sampling techniques for
 Monte Carlo rendering*, 1995), so that weights are bounded. Pareto k tells whether there are enough
 draws (Vehtari, Simpson, Gelman, Yao and Gabry, *Pareto smoothed importance sampling*, 2015).
@@ -22,6 +23,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal, biject_to
 
 from mirror_ppl.inference.alike import Alike, fixed_prior
+from mirror_ppl.inference.combinations import discrete_sites
 from mirror_ppl.inference.exact import (
     combination_values,
     expected_counts,
@@ -31,6 +33,7 @@ from mirror_ppl.inference.exact import (
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
 from mirror_ppl.inference.views import restricted
+from mirror_ppl.likelihood.densities import log_correction
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view_table import ViewTable
 
@@ -190,6 +193,8 @@ class Sampler:
         self._policies: list[Draws] = []
         self._joints: list[Tensor] = []
         self._log_prior = torch.zeros(2, 0, device=table.index.device)  # of scalars, of discrete
+        self._corrections: list[Tensor] = []
+        self._perceived = {site: discrete_sites(human)[site] for site in table.sites}
         self._residual: ResidualProposal | None = None
         self._log_residual = torch.zeros(2, 0, device=table.index.device)
 
@@ -292,6 +297,7 @@ class Sampler:
     ) -> None:
         self._policies.append(policy)
         self._joints.append(joint)
+        self._corrections.append(log_correction(self.human, self._perceived, policy, 1)[:, 0])
         self.place = torch.cat([self.place, place])
         groups = []
         for names in (self.sites, self.supports):
@@ -326,6 +332,7 @@ class Sampler:
             parts.append(density + discrete + math.log(stage.number / len(joint)))
         mixture = torch.logsumexp(torch.stack(parts), 0)
         target = joint.logsumexp(-1) + of_scalars + of_discrete + prior
+        target = target + torch.cat(self._corrections)
         log_weights, pareto_k = _smoothed(target - mixture)
         return Weighted(policy, self.alike, joint, log_weights, pareto_k)
 

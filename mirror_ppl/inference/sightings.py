@@ -32,11 +32,12 @@ from mirror_ppl.inference.combinations import (
 from mirror_ppl.inference.courses import CHUNK
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.round_views import RoundViews, round_views
+from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.attention import KEPT, VALUES, AttentionValues, Proposal
 from mirror_ppl.models.chain import Chain
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, log_likelihoods
+from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, along_views
 
 PROPOSING_WAYS = 64
 """Draws from the prior by which attention is proposed where nothing is screened."""
@@ -312,10 +313,8 @@ class Sightings:
         real[part.moments[part.moments != NO_VIEW]] = True
         keys = []
         for some in torch.arange(len(part.acted), device=part.acted.device).split(CHUNK):
-            found = self._act(ways, part.belief[None, some], part.values[None, some])[:, 0]
-            acted = part.acted[some].expand(found.shape[:-1])
-            chosen = found.gather(-1, acted[..., None]).squeeze(-1)
-            keys.append(torch.round(chosen / screening.resolution).long().T)
+            found = self._of_moments(ways, part, some)
+            keys.append(torch.round(found / screening.resolution).long().T)
         # What was done tells moments apart, too: theirs is one entry of ``acted``.
         key = torch.cat([torch.cat(keys), part.acted[:, None]], -1) * real[:, None]
         first, cluster = distinct_rows(key)
@@ -328,17 +327,16 @@ class Sightings:
         return kept, place
 
     def _log_likelihoods(self, part: RoundViews) -> Tensor:
-        """Of a round's actions under each way and view, ``[ways, V]``."""
-        found = self._act(self.draw_ways(), part.belief[None], part.values[None])[:, 0]
-        return log_likelihoods(found, part.acted, part.moments)
+        """Of what was recorded of a round under each way and view, ``[ways, V]``."""
+        return along_views(self._of_moments(self.draw_ways(), part), part.moments)
 
     def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
         """Log joint ``[ways, U, G]`` of actions and attention, of likelihoods ``[ways, U, G]``."""
         values = {name: value[None, None] for name, value in attended.values.items()}
         with self._deciding(self.draw_ways()):
             implants = self.human.prior()
-            chances = self.human.log_attention(
-                implants, values, attended.log_weights[None, None], attended.facts
+            chances = log_weighted_latents(
+                self.human, implants, values, attended.log_weights[None, None], attended.facts
             )
         return likelihoods + chances[:, 0]
 
@@ -348,12 +346,15 @@ class Sightings:
             self.ways = draw_prior(self.human, 1, self.screening.ways, self.screening.seed)
         return self.ways
 
-    def _act(self, ways: Mapping[str, Tensor], belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities ``[ways, 1, N, A]``."""
+    def _of_moments(
+        self, ways: Mapping[str, Tensor], part: RoundViews, some: Tensor | slice = slice(None)
+    ) -> Tensor:
+        """Log-likelihood ``[ways, N]`` of what was recorded at some moments of a round."""
+        moments = (one[None, some] for one in (part.belief, part.values, part.acted))
         with self._deciding(ways) as number:
-            found = self.human.act(self.human.prior(), belief, values)
+            _, found = choices(self.human, self.human.prior(), *moments)
         # Of a model whose actions depend on no implant they are the same in every way.
-        return found.expand(number, *found.shape[-3:])
+        return found.expand(number, *found.shape[-2:])[:, 0]
 
     @contextmanager
     def _deciding(self, ways: Mapping[str, Tensor]) -> Iterator[int]:

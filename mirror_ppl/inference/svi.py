@@ -30,6 +30,7 @@ from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_j
 from mirror_ppl.inference.marginal_elbo import PLATES, marginal_elbo
 from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.views import combination_scores, restricted
+from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import discrete_names, latent_sites
 from mirror_ppl.models.view_table import NO_VIEW, ViewTable
@@ -132,7 +133,7 @@ class PriorScaledNormal(AutoNormal):
 
 def continuous_guide(human: HumanModel, table: ViewTable) -> PriorScaledNormal:
     """A mean-field guide over the continuous sites of a human model, one factor a person."""
-    model = poutine.block(human.model, hide=list(_enumerated(human, table)))
+    model = poutine.block(TableProgram(human), hide=list(_enumerated(human, table)))
     guide = PriorScaledNormal(model, init_loc_fn=init_to_median)
     guide(table)
     return guide
@@ -216,7 +217,7 @@ def negative_elbo(
     if set(discrete_sites(human)) == set(table.sites) == _enumerated(human, table):
         return marginal_elbo(human, table, guide)
     return TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)(
-        config_enumerate(human.model, "parallel"), guide
+        config_enumerate(TableProgram(human), "parallel"), guide
     )
 
 
@@ -233,7 +234,7 @@ def _prune(human: HumanModel, table: ViewTable, guide: AutoGuide, margin: float)
             poutine.condition(data=guide(table)),
             pyro.plate("person", table.people, dim=-PLATES),
         ):
-            likelihoods = human.log_likelihoods(human.prior(), table)
+            likelihoods = log_likelihoods(human, human.prior(), table)
         score = combination_scores(table, likelihoods)
         best = score if best is None else torch.maximum(best, score)
     assert best is not None
@@ -288,7 +289,7 @@ def draw_implants(
 
 def _enumerated(human: HumanModel, table: ViewTable) -> set[str]:
     """Every discrete site of the whole program, those that ``act`` samples included."""
-    return discrete_names(poutine.trace(human.model).get_trace(table))
+    return discrete_names(poutine.trace(TableProgram(human)).get_trace(table))
 
 
 def _draw_by_table(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
@@ -300,7 +301,7 @@ def _draw_by_table(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Dra
 def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
     continuous = guide(table)
     sampled = infer_discrete(
-        poutine.condition(config_enumerate(human.model, "parallel"), data=continuous),
+        poutine.condition(config_enumerate(TableProgram(human), "parallel"), data=continuous),
         first_available_dim=-1 - PLATES,
     )
     trace = poutine.trace(sampled).get_trace(table)

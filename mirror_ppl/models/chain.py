@@ -17,68 +17,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mirror_ppl.errors import HumanModelError
-
-if TYPE_CHECKING:
-    from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.likelihood.densities import log_latents
+from mirror_ppl.models.human import HumanModel, Implants
 
 NO_VALUE = -1
 """Index of a value in padding."""
 NEVER = -1e30
 """Logarithm of as good as no probability; finite, so that gradients are numbers."""
-
-
-@dataclass(frozen=True)
-class Span:
-    """The steps of a round at which a site of ``round_latents`` is read.
-
-    Attributes:
-        first: the first of them.
-        last: the step after the last.
-        values: how many values of the site's support differ in what is seen there, from the first
-            on; all that follow see what the last of these does.
-    """
-
-    first: int
-    last: int
-    values: int
-
-
-def check_spans(spans: Mapping[str, Span], sizes: Mapping[str, int], steps: int) -> None:
-    """Make sure that spans are as `HumanModel.spans` says.
-
-    Args:
-        spans: by site.
-        sizes: number of values of each site of ``round_latents``.
-        steps: of the round.
-
-    Raises:
-        HumanModelError: they are not.
-    """
-    if set(spans) != set(sizes):
-        raise HumanModelError(
-            f"spans has to be of the sites of attend, {', '.join(sizes)}; not of "
-            f"{', '.join(spans) or 'none'}"
-        )
-    begin = 0
-    for site, span in spans.items():
-        throughout = (span.first, span.last) == (0, steps)
-        if not begin <= span.first <= span.last <= steps or (throughout and begin > 0):
-            raise HumanModelError(
-                f'the span of "{site}", steps {span.first} to {span.last} of {steps}, begins '
-                "before the one before it is over"
-            )
-        if not 1 <= span.values <= sizes[site]:
-            raise HumanModelError(
-                f'"{site}" has {sizes[site]} values, not the {span.values} of its span'
-            )
-        begin = 0 if throughout else span.last
 
 
 @dataclass(frozen=True)
@@ -143,7 +93,7 @@ class Chain:
             )
             for name, support in self.supports.items()
         }
-        found = human.log_attention_sites(implants, values, self.facts)
+        found = log_latents(human, implants, values, self.facts)
         parts = []
         for name, support in self.supports.items():
             own = pad(found[name][..., : len(support)], [0, most - len(support)], value=NEVER)

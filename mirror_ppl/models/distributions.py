@@ -1,4 +1,4 @@
-"""A Gaussian Markov chain as one Pyro distribution.
+"""Distributions of the models: a Gaussian Markov chain, and choices among few values.
 
 Latent trajectories are one sample site, ``z`` ``[T + 1, Z]``. Drawing from the chain walks through
 time; its log density, given the whole trajectory, needs no walk and is computed for all steps at
@@ -10,13 +10,39 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from pyro.distributions import TorchDistribution
+from pyro.distributions import Categorical, TorchDistribution
 from torch import Tensor
-from torch.distributions import Normal, constraints
+from torch.distributions import Distribution, Normal, constraints
 
 from mirror_ppl.models.networks import Gaussian
 
 Step = Callable[[Tensor, Tensor], Gaussian]
+
+
+class NormalizedCategorical(Categorical):
+    """A categorical distribution of log-probabilities that are normalized already.
+
+    Args:
+        log_probabilities: of each value, ``[..., n]``.
+    """
+
+    def __init__(self, log_probabilities: Tensor) -> None:
+        self.logits = log_probabilities  # pyright: ignore[reportAttributeAccessIssue] - lazy
+        self._param = log_probabilities
+        self._num_events = log_probabilities.shape[-1]
+        # That of Categorical would normalize them once more.
+        Distribution.__init__(self, log_probabilities.shape[:-1], validate_args=False)
+
+    def expand(self, batch_shape: torch.Size, _instance: object = None) -> NormalizedCategorical:
+        """The same choice in every place of a batch."""
+        del _instance
+        return NormalizedCategorical(self.logits.expand(*batch_shape, -1))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-probability ``[...]`` of values."""
+        shape = torch.broadcast_shapes(value.shape, self.logits.shape[:-1])
+        place = value.long().expand(shape)[..., None]
+        return self.logits.expand(*shape, -1).gather(-1, place).squeeze(-1)
 
 
 class GaussianChain(TorchDistribution):

@@ -36,17 +36,15 @@ from mirror_ppl.checks import require_methods
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
-from mirror_ppl.models.chain import Span
+from mirror_ppl.models.distributions import NormalizedCategorical
 from mirror_ppl.models.networks import Gaussian, log_softmax_of_few
-from mirror_ppl.models.self_model import Rounds, SelfModel
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
-from mirror_ppl.models.view_table import RecordedActions, ViewTable
 
 Implants = Mapping[str, Tensor]
-SPARE = 6
-"""Dimensions that draws and enumeration may take to the left of people and rounds."""
-SPARED = 3
-"""Dimensions of people, rounds and values of their attention."""
+ACTION = "action"
+"""Site of the action of a step."""
 
 
 class HumanModel(nn.Module):
@@ -133,7 +131,7 @@ class HumanModel(nn.Module):
     def spans(self, observation: Observation) -> dict[str, Span]:
         """At which steps of a round each site of :meth:`round_latents` is read, in this order.
 
-        Where this is known, attention is summed out exactly (:mod:`mirror_ppl.models.chain`). Sites
+        Where this is known, they are summed out exactly (:mod:`mirror_ppl.likelihood.chain`). Sites
         are read throughout the round, or at a span of it that ends before the next one begins;
         those read throughout come first. Their distributions do not depend on each other's values.
         Nothing is known unless this is overridden, nor where a class that derives from the one that
@@ -199,66 +197,6 @@ class HumanModel(nn.Module):
             pyro.plate("round", 1, dim=-1),
         ):
             return bool(self.round_latents(self.prior()))
-
-    def log_attention(
-        self,
-        implants: Implants,
-        values: Mapping[str, Tensor],
-        log_weights: Tensor,
-        facts: Mapping[str, Tensor] | None = None,
-    ) -> Tensor:
-        """``log p(m_b | psi_p)`` of G values that stand for all in a round, ``[..., P, B, G]``.
-
-        Runs inside the person plate. Each is multiplied by that for how many it stands, so that
-        sums over the G values estimate sums over all of them without bias. They are therefore
-        not divided by their own sum, which is 1 on average only: values are proposed by what was
-        done, so that where few of them are probable of a person the actions would seem probable.
-
-        Args:
-            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
-            values: of the sites of :meth:`round_latents`, ``[P, B, G]``.
-            log_weights: for how many each of them stands, ``[P, B, G]``.
-            facts: of the rounds ``[P, B]``, see :meth:`covariates`.
-        """
-        found = self.log_attention_sites(implants, values, facts)
-        return torch.stack(torch.broadcast_tensors(*found.values())).sum(0) + log_weights
-
-    def log_attention_sites(
-        self,
-        implants: Implants,
-        values: Mapping[str, Tensor],
-        facts: Mapping[str, Tensor] | None = None,
-    ) -> dict[str, Tensor]:
-        """Log-probability of values of each round latent, ``[..., P, B, G]``, by name.
-
-        Runs inside the person plate.
-
-        Args:
-            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
-            values: of the sites, ``[P, B, G]``.
-            facts: of the rounds ``[P, B]``, see :meth:`covariates`.
-        """
-        # Far to the left of whatever dimensions draws and enumeration take.
-        given = {
-            name: value.movedim(-1, 0).reshape(value.shape[-1], *(1,) * SPARE, *value.shape[:-1])
-            for name, value in values.items()
-        }
-        rounds = next(iter(values.values())).shape[1]
-        with (
-            poutine.block(),
-            poutine.trace() as trace,
-            poutine.condition(data=given),
-            pyro.plate("round", rounds, dim=-1),
-        ):
-            self.round_latents({**implants, **(facts or {})})
-        found = {}
-        for name in given:
-            node = trace.trace.nodes[name]
-            own = torch.as_tensor(node["fn"].log_prob(node["value"])).movedim(0, -1)
-            while own.dim() > SPARED and own.shape[0] == 1:
-                own = own.squeeze(0)
-            found[name] = own
-        return found
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """What a person sees by themselves at one step, masks ``[..., K]``: ``n_t``.
@@ -366,41 +304,9 @@ class HumanModel(nn.Module):
         aware = torch.log1p(-lapse) + log_softmax_of_few(logits)
         return torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
 
-    def log_likelihoods(self, implants: Implants, table: ViewTable) -> Tensor:
-        """Of the recorded actions under each sight of a round, ``[..., P, U]``.
-
-        Runs inside the person plate. What people attended to is summed out.
-
-        Args:
-            implants: as :meth:`prior` returned them, ``[..., P, 1]``.
-            table: the rounds of P people and the distinct views of them.
-        """
-        return self.of_actions(implants, table, self.act(implants, table.belief, table.values))
-
-    def of_actions(self, implants: Implants, table: ViewTable, log_probabilities: Tensor) -> Tensor:
-        """The same, given log-probabilities ``[..., P, N, A]`` of actions at each moment."""
-        attention = table.attention
-        if attention is None:
-            return table.log_likelihoods(log_probabilities)
-        chances = attention.log_chances(self, implants, table.rounds)
-        return table.log_likelihoods(log_probabilities, chances)
-
-    def model(self, table: ViewTable, world: Rounds | None = None) -> None:
-        """The program, conditioned on the recorded actions of a table of views.
-
-        Args:
-            table: the rounds of P people and the distinct views of them.
-            world: the same rounds, flattened, to condition the self-model's states, observations
-                and rewards too. They do not depend on implants once the actions are known, so
-                fitting implants leaves them out; see :meth:`SelfModel.elbo` for their bound.
-        """
-        with pyro.plate("person", table.people, dim=-2):
-            implants = self.prior()
-            scores = table.scores(self.log_likelihoods(implants, table))
-            pyro.sample(
-                "actions",
-                RecordedActions(scores, table.place_of(implants), table.recorded.shape[1:]),
-                obs=table.recorded[:, None],
-            )
-        if world is not None:
-            self.self_model.model(world)
+    def choose(
+        self, implants: Implants, belief: Tensor, values: Tensor, action: Tensor | None = None
+    ) -> Tensor:
+        """Sample the action ``[..., P, B]`` of one step, or observe the recorded one."""
+        chances = self.act(implants, belief, values)
+        return pyro.sample(ACTION, NormalizedCategorical(chances), obs=action)

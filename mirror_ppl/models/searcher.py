@@ -34,9 +34,9 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility, total_rewar
 from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
 from mirror_ppl.domains.bomb_panel import BUTTONS, KINDS, STAGES
 from mirror_ppl.models import implants as implant_priors
-from mirror_ppl.models.chain import Span
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
 
 QUICKNESS, EVENNESS = "quickness", "evenness"

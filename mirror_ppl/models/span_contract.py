@@ -11,9 +11,10 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, map_state
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.models.chain import Span, check_spans
+from mirror_ppl.likelihood.densities import log_latents
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.models.spans import Span, check_spans
 
 STEPS = 12
 
@@ -107,7 +108,7 @@ def _check_independence(human: HumanModel, so_far: Mapping[str, Tensor]) -> dict
                     for name, support in supports.items()
                 }
                 values[site] = own.expand(1, 1, -1)
-                found.append(human.log_attention_sites(implants, values, facts)[site])
+                found.append(log_latents(human, implants, values, facts)[site])
             if not torch.equal(*torch.broadcast_tensors(*found)):
                 raise HumanModelError(
                     f'"{site}" of round_latents depends on another of its sites, so that spans '

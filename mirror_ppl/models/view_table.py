@@ -10,18 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
+from mirror_ppl.likelihood.densities import log_weighted_latents
 from mirror_ppl.models.chain import Chain
-
-if TYPE_CHECKING:
-    from mirror_ppl.models.human import HumanModel, Implants
-
+from mirror_ppl.models.human import HumanModel, Implants
 
 NO_VIEW = -1
 """Index of a combination of implants that was given up."""
@@ -38,22 +35,17 @@ def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
     return number
 
 
-def log_likelihoods(
-    log_probabilities: Tensor, acted: Tensor, moments: Tensor, repeats: Tensor | None = None
-) -> Tensor:
-    """Log-likelihood ``[..., V]`` of the recorded actions along views.
+def along_views(found: Tensor, moments: Tensor, repeats: Tensor | None = None) -> Tensor:
+    """Log-likelihood ``[..., V]`` of what was recorded along views.
 
     Args:
-        log_probabilities: of actions at beliefs, ``[..., N, A]``.
-        acted: what was done there, ``[..., N]``.
-        moments: of each step of each view, which of the N beliefs it is, ``[..., V, T]``;
-            ``NO_VIEW`` in padding.
+        found: of each moment, ``[..., N]``.
+        moments: of each step of each view, which of the N it is, ``[..., V, T]``; ``NO_VIEW`` in
+            padding.
         repeats: how often each of them occurs ``[..., V, T]``; once unless given.
     """
-    acted = acted.expand(log_probabilities.shape[:-1])
-    chosen = log_probabilities.gather(-1, acted[..., None]).squeeze(-1)
     steps = moments.clamp(min=0).flatten(-2)
-    found = chosen.gather(-1, steps.expand(*chosen.shape[:-1], steps.shape[-1]))
+    found = found.gather(-1, steps.expand(*found.shape[:-1], steps.shape[-1]))
     found = found.unflatten(-1, moments.shape[-2:])
     if repeats is not None:
         found = found * repeats
@@ -89,9 +81,9 @@ class Attention:
     facts: Mapping[str, Tensor] = field(default_factory=dict)
 
     def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
-        """See `HumanModel.log_attention`, ``[..., P, B, G]``; runs inside the person plate."""
+        """See `log_weighted_latents`, ``[..., P, B, G]``; runs inside the person plate."""
         del rounds
-        return human.log_attention(implants, self.values, self.log_weights, self.facts)
+        return log_weighted_latents(human, implants, self.values, self.log_weights, self.facts)
 
     def marginal(self, likelihoods: Tensor, log_weights: Tensor) -> Tensor:
         """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.
@@ -230,20 +222,9 @@ class ViewTable:
         """Number of the combination that implants ``[...]`` are, row-major over ``sizes``."""
         return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
 
-    def log_likelihoods(
-        self, log_probabilities: Tensor, log_chances: Tensor | None = None
-    ) -> Tensor:
-        """Log-likelihood ``[..., P, U]`` of the recorded actions under each sight.
-
-        Args:
-            log_probabilities: of actions ``[..., P, N, A]``.
-            log_chances: of attention where there is such, see :meth:`Attention.log_chances` and
-                :meth:`Chain.log_chances`.
-        """
-        found = log_likelihoods(log_probabilities, self.acted, *self.runs)
-        if self.attention is None or log_chances is None:
-            return found
-        return self.attention.marginal(found, log_chances)
+    def along_views(self, moments: Tensor) -> Tensor:
+        """Log-likelihood ``[..., P, V]`` of what was recorded, of moments ``[..., P, N]``."""
+        return along_views(moments, *self.runs)
 
 
 class RecordedActions(TorchDistribution):

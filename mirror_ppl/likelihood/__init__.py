@@ -1,0 +1,1 @@
+"""The compilation of a human program and recorded rounds: what they say, computed at once."""
