@@ -12,8 +12,7 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Observation, Visibility, map_state, total_reward
 from mirror_ppl.inference.experience import roll_out
-from mirror_ppl.models.course import messages_at
-from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.models.human import HumanModel, Implants, messages_at
 
 
 @torch.no_grad()

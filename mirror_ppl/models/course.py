@@ -9,21 +9,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import HumanModel, at_step, messages_at
 from mirror_ppl.models.view import View
-
-
-def at_step(rounds: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
-    """Observations ``[..., T, K, F]``, with ``"ego"`` ``[..., T, E]``, at one step."""
-    return {
-        name: value[..., step, :] if name == "ego" else value[..., step, :, :]
-        for name, value in rounds.items()
-    }
-
-
-def messages_at(told: Visibility, step: int) -> Visibility:
-    """Masks ``[..., T, K]`` at one step."""
-    return {name: mask[..., step, :] for name, mask in told.items()}
 
 
 def perceived(

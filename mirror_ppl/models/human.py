@@ -37,6 +37,7 @@ from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.distributions import NormalizedCategorical
+from mirror_ppl.models.handlers import AtStep, MaskObserved
 from mirror_ppl.models.networks import Gaussian, log_softmax_of_few
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
@@ -310,3 +311,76 @@ class HumanModel(nn.Module):
         """Sample the action ``[..., P, B]`` of one step, or observe the recorded one."""
         chances = self.act(implants, belief, values)
         return pyro.sample(ACTION, NormalizedCategorical(chances), obs=action)
+
+    def model(self, rounds: Demonstrations) -> None:
+        """The program: what P people see, believe and do in their rounds, step after step.
+
+        Every engine computes what this says; :mod:`mirror_ppl.likelihood` does it at once for all
+        that a person may have seen. Sites of steps are ``message_<modality>_<t>``, ``belief_<t>``
+        and ``action_<t>``, besides what :meth:`act` adds. Padding does not count.
+
+        Args:
+            rounds: recorded, with actions to condition on.
+        """
+        domain, device = self.domain, rounds.actions.device
+        observation, actions = rounds.observation(), rounds.actions.clamp(min=0)
+        people, number, steps = rounds.shape
+        with pyro.plate("person", people, dim=-2):
+            implants = self.prior()
+            with pyro.plate("round", number, dim=-1):
+                with MaskObserved(rounds.mask.any(-1)):
+                    latents = self.round_latents({**implants, **recorded_covariates(self, rounds)})
+                knowledge = domain.nothing_known(1, device=device)
+                belief = next(self.parameters()).new_zeros(people, number, self.belief_size)
+                action = torch.full((people, number), len(domain.actions), device=device)
+                for step in range(steps):
+                    with AtStep(step), MaskObserved(rounds.mask[..., step]):
+                        now = at_step(observation, step)
+                        told = {
+                            name: pyro.deterministic(f"message_{name}", mask, event_dim=1)
+                            for name, mask in messages_at(rounds.told, step).items()
+                        }
+                        view, knowledge = self.perceive(
+                            {**implants, **latents}, knowledge, now, told, step
+                        )
+                        evidence = self.evidence(view, now)
+                        belief = pyro.deterministic(
+                            "belief",
+                            self.belief_after(belief, evidence, action, view.still),
+                            event_dim=1,
+                        )
+                        values = self.action_values(belief)
+                        action = self.choose(implants, belief, values, actions[..., step])
+
+
+def recorded_covariates(human: HumanModel, rounds: Demonstrations) -> dict[str, Tensor]:
+    """The covariates ``[P, B]`` of recorded rounds, of each as far as it went."""
+    if type(human).covariates is HumanModel.covariates:
+        return {}
+    observation = rounds.observation()
+    each = [
+        human.covariates(
+            {
+                name: value[person, number, : int(rounds.lengths[person, number])]
+                for name, value in observation.items()
+            }
+        )
+        for person in range(rounds.shape[0])
+        for number in range(rounds.shape[1])
+    ]
+    return {
+        name: torch.stack([one[name] for one in each]).view(rounds.shape[:2]) for name in each[0]
+    }
+
+
+def at_step(rounds: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
+    """Observations ``[..., T, K, F]``, with ``"ego"`` ``[..., T, E]``, at one step."""
+    return {
+        name: value[..., step, :] if name == "ego" else value[..., step, :, :]
+        for name, value in rounds.items()
+    }
+
+
+def messages_at(told: Mapping[str, Tensor], step: int) -> Visibility:
+    """Masks ``[..., T, K]`` at one step."""
+    return {name: mask[..., step, :] for name, mask in told.items()}

@@ -1,0 +1,41 @@
+"""Effect handlers of the human program: names of steps, and padding."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pyro.poutine.mask_messenger import MaskMessenger
+from pyro.poutine.messenger import Messenger
+from pyro.poutine.util import site_is_subsample
+from torch import Tensor
+
+
+class AtStep(Messenger):
+    """Sites get the number of the step appended: ``action`` becomes ``action_3``."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _pyro_sample(self, msg: Any) -> None:
+        # Once: `pyro.do` sends a copy of what it replaces through all handlers again.
+        if not msg["infer"].get("has_step"):
+            msg["infer"] = {**msg["infer"], "has_step": True}
+            msg["name"] = f"{msg['name']}_{self.step}"
+
+
+class MaskObserved(MaskMessenger):
+    """Observed sites and factors do not count where a mask is false.
+
+    Sampled ones do: summed or integrated out, each of them comes to 1.
+
+    Args:
+        mask: which of them count, boolean ``[P, B]``.
+    """
+
+    def __init__(self, mask: Tensor) -> None:
+        super().__init__(mask)  # pyright: ignore[reportArgumentType] - boolean
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if msg["is_observed"] and not site_is_subsample(msg):
+            super()._pyro_sample(msg)
