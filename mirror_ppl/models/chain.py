@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.densities import log_latents
 from mirror_ppl.models.human import HumanModel, Implants
 
@@ -95,6 +96,15 @@ class Chain:
         }
         found = log_latents(human, implants, values, self.facts)
         parts = []
+        added = found.pop(next(iter(self.supports)))
+        for name in set(found) - set(self.supports):
+            if found[name].shape[-1] > 1:
+                raise HumanModelError(
+                    f'"{name}" of round_latents depends on sites that are summed out span after '
+                    "span; without spans it can be inferred"
+                )
+            added = added + found[name]
+        found[next(iter(self.supports))] = added
         for name, support in self.supports.items():
             own = pad(found[name][..., : len(support)], [0, most - len(support)], value=NEVER)
             later = own.flip(-1).logcumsumexp(-1).flip(-1)

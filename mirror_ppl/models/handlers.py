@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from pyro.poutine.mask_messenger import MaskMessenger
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
@@ -24,7 +23,7 @@ class AtStep(Messenger):
             msg["name"] = f"{msg['name']}_{self.step}"
 
 
-class MaskObserved(MaskMessenger):
+class MaskObserved(Messenger):
     """Observed sites and factors do not count where a mask is false.
 
     Sampled ones do: summed or integrated out, each of them comes to 1.
@@ -34,8 +33,9 @@ class MaskObserved(MaskMessenger):
     """
 
     def __init__(self, mask: Tensor) -> None:
-        super().__init__(mask)  # pyright: ignore[reportArgumentType] - boolean
+        super().__init__()
+        self.mask = mask
 
     def _pyro_sample(self, msg: Any) -> None:
         if msg["is_observed"] and not site_is_subsample(msg):
-            super()._pyro_sample(msg)
+            msg["mask"] = self.mask if msg["mask"] is None else msg["mask"] & self.mask

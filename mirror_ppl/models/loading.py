@@ -13,6 +13,7 @@ from typing import Any
 import pyro
 import torch
 from pyro import poutine
+from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from mirror_ppl.checks import require_kind
@@ -222,6 +223,12 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
     """What differs from round to round, in one round of each ``[people]``."""
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
         returned = human.round_latents(implants)
+    for name, site in trace.trace.nodes.items():
+        if not returned and site["type"] == "sample" and not site_is_subsample(site):
+            raise HumanModelError(
+                f'round_latents has "{name}", but no site that differs from round to round: put it '
+                "into prior"
+            )
     sites = latent_sites(trace.trace)
     if not isinstance(returned, Mapping) or set(returned) != set(sites):
         raise HumanModelError(
