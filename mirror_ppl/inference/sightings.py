@@ -32,7 +32,11 @@ from mirror_ppl.inference.combinations import (
 from mirror_ppl.inference.courses import CHUNK
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.round_views import RoundViews, round_views
-from mirror_ppl.likelihood.densities import choices, log_weighted_latents
+from mirror_ppl.likelihood.densities import (
+    choices,
+    log_weighted_latents,
+    require_compilable,
+)
 from mirror_ppl.models.attention import KEPT, VALUES, AttentionValues, Proposal
 from mirror_ppl.models.chain import Chain
 from mirror_ppl.models.course import perceived
@@ -102,6 +106,7 @@ class Sightings:
         likely: Mapping[str, Tensor] | None = None,
         values: int = VALUES,
     ) -> None:
+        require_compilable(human)
         device = next(human.parameters()).device
         self.human = human
         self.screening = screening

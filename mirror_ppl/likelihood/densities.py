@@ -28,6 +28,21 @@ SPARE = 6
 """Dimensions that draws and enumeration may take to the left of people and rounds."""
 
 
+def require_compilable(human: HumanModel) -> None:
+    """Refuse human models whose program is not the one that is compiled.
+
+    Raises:
+        HumanModelError: this is one.
+    """
+    kind = type(human)
+    if kind.model is not HumanModel.model or kind.choose is not HumanModel.choose:
+        raise HumanModelError(
+            f"{kind.__name__} overrides model() or choose(), which cannot be compiled; override "
+            "prior, round_latents, sees, perceive, evidence, believe or act, or run "
+            "pyro.infer.SVI on its model"
+        )
+
+
 def sample_nodes(trace: Trace) -> dict[str, Any]:
     """Nodes of all sites that are sampled, observed or factors; no plates."""
     return {
