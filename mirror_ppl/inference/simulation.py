@@ -54,6 +54,7 @@ def play_rounds(
     }
     lengths = torch.zeros(people, rounds, dtype=torch.long, device=device)
     under_way = lengths == 0
+    varies = human.has_round_latents
     beliefs = _Beliefs(human, told, actions)
     # What the program itself draws comes from the generator, too, whatever else is drawn from it.
     own = torch.Generator(device)
@@ -67,7 +68,7 @@ def play_rounds(
         under_way &= ~domain.over(state)
         lengths += under_way
         with torch.random.fork_rng(devices=[]), pyro.plate("person", people, dim=-2):
-            latents = _round_latents(human, drawn, observed, seed + 1)
+            latents = _round_latents(human, drawn, observed, seed + 1) if varies else {}
             log_probability = beliefs.act(drawn, latents, observed[-1], step)
         probability = log_probability.exp().flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)
@@ -101,8 +102,6 @@ def _round_latents(
 
     Runs inside the person plate. One seed, so that what covariates leave alone stays the same.
     """
-    if not human.has_round_latents:
-        return {}
     so_far = {name: torch.stack([one[name] for one in observed], 2) for name in observed[0]}
     torch.manual_seed(seed)
     with pyro.plate("round", observed[0]["ego"].shape[1], dim=-1):

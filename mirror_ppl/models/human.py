@@ -42,6 +42,7 @@ from mirror_ppl.models.networks import Gaussian, log_softmax_of_few
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
+from mirror_ppl.models.world_program import first_state, next_state, reward
 
 Implants = Mapping[str, Tensor]
 ACTION = "action"
@@ -312,45 +313,53 @@ class HumanModel(nn.Module):
         chances = self.act(implants, belief, values)
         return pyro.sample(ACTION, NormalizedCategorical(chances), obs=action)
 
-    def model(self, rounds: Demonstrations) -> None:
+    def model(self, rounds: Demonstrations, world: bool = False) -> None:
         """The program: what P people see, believe and do in their rounds, step after step.
 
         Every engine computes what this says; :mod:`mirror_ppl.likelihood` does it at once for all
         that a person may have seen. Sites of steps are ``message_<modality>_<t>``, ``belief_<t>``
-        and ``action_<t>``, besides what :meth:`act` adds. Padding does not count.
+        and ``action_<t>``, besides what :meth:`act` adds, and with ``world`` ``state_<t>``,
+        ``observation_<modality>_<t>`` and ``reward_<t>``. Padding does not count.
 
         Args:
-            rounds: recorded, with actions to condition on.
+            rounds: recorded, to condition on; under ``pyro.poutine.uncondition`` only how they
+                begin and what is communicated counts, and how long they are.
+            world: whether what the self-model says of the world is part of it. Given recordings it
+                does not depend on implants; without, it takes the place of a simulator.
         """
-        domain, device = self.domain, rounds.actions.device
+        device, (people, number, steps) = rounds.actions.device, rounds.shape
         observation, actions = rounds.observation(), rounds.actions.clamp(min=0)
-        people, number, steps = rounds.shape
         with pyro.plate("person", people, dim=-2):
             implants = self.prior()
             with pyro.plate("round", number, dim=-1):
                 with MaskObserved(rounds.mask.any(-1)):
                     latents = self.round_latents({**implants, **recorded_covariates(self, rounds)})
-                knowledge = domain.nothing_known(1, device=device)
+                knowledge = self.domain.nothing_known(1, device=device)
                 belief = next(self.parameters()).new_zeros(people, number, self.belief_size)
-                action = torch.full((people, number), len(domain.actions), device=device)
+                action = torch.full((people, number), len(self.domain.actions), device=device)
+                state = belief
                 for step in range(steps):
                     with AtStep(step), MaskObserved(rounds.mask[..., step]):
                         now = at_step(observation, step)
+                        if world and step == 0:
+                            state = first_state(self.self_model, now)
+                        elif world:
+                            state, now = next_state(self.self_model, state, action, now)
                         told = {
                             name: pyro.deterministic(f"message_{name}", mask, event_dim=1)
                             for name, mask in messages_at(rounds.told, step).items()
                         }
-                        view, knowledge = self.perceive(
-                            {**implants, **latents}, knowledge, now, told, step
-                        )
-                        evidence = self.evidence(view, now)
+                        sites = {**implants, **latents}
+                        view, knowledge = self.perceive(sites, knowledge, now, told, step)
                         belief = pyro.deterministic(
                             "belief",
-                            self.belief_after(belief, evidence, action, view.still),
+                            self.belief_after(belief, self.evidence(view, now), action, view.still),
                             event_dim=1,
                         )
                         values = self.action_values(belief)
                         action = self.choose(implants, belief, values, actions[..., step])
+                        if world and rounds.rewards is not None:
+                            reward(self.self_model, state, action, rounds.rewards[..., step])
 
 
 def recorded_covariates(human: HumanModel, rounds: Demonstrations) -> dict[str, Tensor]:

@@ -157,14 +157,16 @@ class SelfModel(nn.Module):
 
     def decode(self, latent: Tensor) -> Observation:
         """Means of the observations of states ``[..., Z]``, in the domain's units."""
-        values = {}
-        for name, decoder in self.decoders.items():
-            mean = decoder(latent).mean
-            values[name] = mean * torch.tensor(
-                self.scales[name], dtype=mean.dtype, device=mean.device
-            )
-        values["ego"] = values["ego"].squeeze(-2)
-        return values
+        return self.in_units({name: decode(latent).mean for name, decode in self.decoders.items()})
+
+    def in_units(self, values: Observation) -> Observation:
+        """Observations in the domain's units, the inverse of :meth:`targets`."""
+        found = {
+            name: value * torch.tensor(self.scales[name], dtype=value.dtype, device=value.device)
+            for name, value in values.items()
+        }
+        found["ego"] = found["ego"].squeeze(-2)
+        return found
 
     def evidence(self, observation: Observation, visible: Visibility, actions: Tensor) -> Tensor:
         """What each step tells the encoder: ``x_t, v_t, a_{t-1}`` as ``[..., T + 1, H]``."""
