@@ -41,6 +41,9 @@ def require_compilable(human: HumanModel) -> None:
             "prior, round_latents, sees, perceive, evidence, believe or act, or run "
             "pyro.infer.SVI on its model"
         )
+    # Of data of several people it is noticed here that they are no one person's.
+    for name, node in prior_nodes(human, {}, 1, 1).items():
+        check_plates(name, log_prob(node), 1)
 
 
 def sample_nodes(trace: Trace) -> dict[str, Any]:
