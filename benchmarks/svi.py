@@ -64,7 +64,8 @@ class ByHand(torch.nn.Module):
         lapse = implants["lapse"][..., None]
         aware = torch.log1p(-lapse) + torch.log_softmax(logits, -1)
         actions = torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
-        likelihood = table.log_likelihoods(actions)  # [P, V]
+        acted = table.acted.expand(actions.shape[:-1])[..., None]
+        likelihood = table.along_views(actions.gather(-1, acted).squeeze(-1))  # [P, V]
         scores = table.scores(likelihood)  # [P, C]
         return -(total + torch.logsumexp(scores + self.log_prior, -1).sum())
 
