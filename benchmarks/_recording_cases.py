@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import h5netcdf
 import numpy as np
 import torch
 import xarray as xr
@@ -35,7 +36,10 @@ CHECKED, PLAIN, CLASSIC = "checked", "plain", "classic"
 """How a file is written: netCDF-4 by the package, netCDF-4 without checksums, netCDF-3."""
 WAYS = CHECKED, PLAIN, CLASSIC
 PACKED = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
-CANNOT = (KeyError, ValueError, TypeError, IndexError, OverflowError, AttributeError, OSError)
+CANNOT = (
+    *(KeyError, ValueError, TypeError, IndexError, OverflowError, AttributeError, OSError),
+    h5netcdf.CompatibilityError,
+)
 """What a damage raises where it cannot be done, often because of another one before."""
 SIMULATED = 6
 ORIGINALS = 12
