@@ -5,6 +5,7 @@ from functools import cache
 import torch
 
 from mirror_ppl.communication import Channels, Person, RoundSoFar
+from mirror_ppl.communication.minds import Beliefs, through
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.models import HumanModel
@@ -30,11 +31,41 @@ def human():
 
 
 class Averaging(HumanModel):
-    """People who believe the average of what they would have believed so far."""
+    """People who act on the average of what they believed so far.
 
-    def believe(self, view, observation, actions):
-        belief = super().believe(view, observation, actions)
-        return belief.cumsum(-2) / torch.arange(1, belief.shape[-2] + 1)[:, None]
+    A belief is the robot's, then this average, then the number of steps.
+    """
+
+    @property
+    def belief_size(self):
+        return 2 * self.self_model.latent + 1
+
+    def parts(self, belief):
+        """The belief of the last step, the average, and the number of steps."""
+        latent = self.self_model.latent
+        return belief.split([latent, latent, 1], -1)
+
+    def believe(self, belief, evidence, action, still=None):
+        last, average, number = self.parts(belief)
+        last = super().believe(last, evidence, action, still).mean
+        average = average + (last - average) / (number + 1)
+        return torch.cat([last, average, number + 1], -1)
+
+    def action_values(self, belief):
+        return super().action_values(self.parts(belief)[1])
+
+    def act(self, implants, belief, values):
+        return super().act(implants, self.parts(belief)[1], values)
+
+
+class Unused(Averaging):
+    """People who know the average of what they believed, and decide as if they did not."""
+
+    def action_values(self, belief):
+        return HumanModel.action_values(self, self.parts(belief)[0])
+
+    def act(self, implants, belief, values):
+        return HumanModel.act(self, implants, self.parts(belief)[0], values)
 
 
 def implants(number=1, model=None, sight=BLIND, **values):
@@ -64,6 +95,12 @@ def person(number=1, model=None, **values):
     """Somebody with draws of :func:`implants`."""
     model = model or human()
     return Person(model, implants(number, model, **values))
+
+
+def beliefs_before(person, past):
+    """Beliefs before the present step, and which of them each eye has."""
+    *_, last = Beliefs.at_first(person), *through(person, past)
+    return last
 
 
 def varied_draws(number, generator, model=None):

@@ -28,10 +28,10 @@ class Cautious(Few):
         own["sight_front_own"] = pyro.sample("sight_of_them", dist.Categorical(logits=near))
         return own | {"cautious": cautious, "sight_of_them": own["sight_front_own"]}
 
-    def perceive(self, implants, observation, told):
+    def perceive(self, implants, knowledge, observation, told, step):
         own = {"sight_front_own": implants["sight_of_them"]}
         own["assumes_clear"] = implants["assumes_clear"]
-        return super().perceive(own, observation, told)
+        return super().perceive(own, knowledge, observation, told, step)
 
 
 @pytest.fixture(scope="module")

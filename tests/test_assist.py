@@ -267,7 +267,7 @@ def test_outputs_that_would_overwrite_are_refused(posterior, tmp_path, capsys):
 # --- human models of one's own ----------------------------------------------------------------
 
 
-def test_a_model_that_is_not_stepwise_is_planned_with_but_has_no_divergence(
+def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     posterior, tmp_path, capsys
 ):
     example = Path(__file__).parents[1] / "docs" / "examples" / "late_reactions.py"
@@ -289,9 +289,11 @@ def test_a_model_that_is_not_stepwise_is_planned_with_but_has_no_divergence(
     assert command(assist, *own, "--communicator", "mirror-kl", "mirror") == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "LatePerson is not stepwise" in error and "leave mirror-kl out" in error
+    assert "beliefs of LatePerson have no density like the robot's" in error
+    assert "mirror-kl" in error
     assert command(assist, *own, "--json", tmp_path / "a.json") == 0
-    assert "mirror-kl is left out: LatePerson is not stepwise" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "mirror-kl is left out: beliefs of LatePerson have no density" in error
     played = results_of(tmp_path / "a.json")["communicators"]
     assert tuple(played) == tuple(name for name in COMMUNICATORS if name != "mirror-kl")
 

@@ -8,6 +8,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_course import gone_through
 from test_views import ragged
 
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, RoundSoFar, Standing
@@ -32,8 +33,11 @@ from mirror_ppl.inference.views import (
     restricted,
     rounds_of,
 )
+from mirror_ppl.likelihood.densities import log_weighted_latents
+from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.attention import KEPT, VALUES, choose_values, site_probabilities
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import first_success, noticed_sites, policy_implants
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import OneRadius, PerItem
@@ -102,11 +106,11 @@ def by_hand(human, implants, recordings, person, number):
     """Log-probabilities ``[16, T, A]`` of actions for each time at which the car is noticed."""
     observation, told, actions, _ = list(rounds_of(recordings, person))[number]
     when = {NOTICED[0]: torch.arange(STEPS + 1)}
-    view = human.perceive(when, observation, told)
-    belief = human.believe(view, observation, actions)[None]
+    belief = gone_through(human, when, observation, told, actions)
     values = human.self_model.action_values(belief)
     own = {name: value[person : person + 1] for name, value in implants.items()}
-    return human.act(own, belief, values)[0]
+    each = human.act(own, belief.flatten(0, 1)[None], values.flatten(0, 1)[None])
+    return each[0].unflatten(0, belief.shape[:2])
 
 
 # --- the program
@@ -125,7 +129,7 @@ def test_the_probability_of_attention_is_that_of_the_program(per_item):
     values = {site: torch.randint(STEPS + 1, (3, 2, 7)) for site in NOTICED}
     weights = torch.randn(3, 2, 7)
     with pyro.plate("person", 3, dim=-2):
-        found = per_item.log_attention(implants, values, weights)
+        found = log_weighted_latents(per_item, implants, values, weights)
     expected = weights.clone()
     for person, number, value in itertools.product(range(3), range(2), range(7)):
         for notices, noticed in zip(NOTICES, NOTICED, strict=True):
@@ -140,7 +144,7 @@ def test_an_item_is_seen_from_when_it_is_noticed(per_item, recordings):
     nothing = {name: torch.zeros_like(mask) for name, mask in told.items()}
     when = dict(zip(NOTICED, torch.tensor([[0], [4], [14], [15]]), strict=True))
     open_ = {"assumes_clear": torch.tensor([0]), "assumes_closing": torch.tensor([0])}
-    seen = per_item.perceive(when | open_, observation, nothing).visible["visual"][0]
+    seen = perceived(per_item, when | open_, observation, nothing).visible["visual"][0]
     steps = torch.arange(STEPS)
     for place, first in enumerate((0, 4, 14, 15)):
         assert torch.equal(seen[:, place], steps >= first)
@@ -266,7 +270,7 @@ def test_likelihoods_are_sums_over_when_something_was_noticed(self_model, record
     human, rounds = OneItem(self_model), ragged(recordings, lengths)
     implants = {name: value[0] for name, value in drawn(human, 1, 3).items()}
     table = build_view_table(human, rounds)
-    found = combination_scores(table, human.log_likelihoods(implants, table))[:, 0]
+    found = combination_scores(table, log_likelihoods(human, implants, table))[:, 0]
     for person, own in enumerate(lengths):
         expected = torch.zeros(())
         for number, length in enumerate(own):
@@ -283,12 +287,12 @@ def test_a_table_of_many_is_that_of_each(per_item, recordings):
     rounds = ragged(recordings, [[15, 6], [], [9]])
     implants = {name: value[0] for name, value in drawn(per_item, 1, 3).items()}
     together = build_view_table(per_item, rounds, screening=Screening(ways=4))
-    found = combination_scores(together, per_item.log_likelihoods(implants, together))
+    found = combination_scores(together, log_likelihoods(per_item, implants, together))
     for person in range(3):
         alone = rounds.select_people([person])
         own = {name: value[person : person + 1] for name, value in implants.items()}
         table = build_view_table(per_item, alone, screening=Screening(ways=4))
-        expected = combination_scores(table, per_item.log_likelihoods(own, table))
+        expected = combination_scores(table, log_likelihoods(per_item, own, table))
         torch.testing.assert_close(found[person : person + 1], expected, rtol=1e-4, atol=1e-4)
     assert together.attention is not None
     assert together.attention.log_weights.shape[:2] == (3, 2)
@@ -302,13 +306,13 @@ def test_people_may_have_different_numbers_of_values(per_item, recordings):
     for person, values in enumerate((20, 7)):
         table = build_view_table(per_item, rounds.select_people([person]), values=values)
         own = {name: value[person : person + 1] for name, value in implants.items()}
-        expected.append(combination_scores(table, per_item.log_likelihoods(own, table)))
+        expected.append(combination_scores(table, log_likelihoods(per_item, own, table)))
         tables.append(table)
     together = _joined(tables, rounds)
-    found = combination_scores(together, per_item.log_likelihoods(implants, together))
+    found = combination_scores(together, log_likelihoods(per_item, implants, together))
     torch.testing.assert_close(found, torch.cat(expected), rtol=1e-4, atol=1e-4)
     less = restricted(together, together.possible & (torch.arange(4) % 2 == 0))
-    found = combination_scores(less, per_item.log_likelihoods(implants, less))[:, ::2]
+    found = combination_scores(less, log_likelihoods(per_item, implants, less))[:, ::2]
     torch.testing.assert_close(found, torch.cat(expected)[:, ::2], rtol=1e-4, atol=1e-4)
 
 
@@ -331,7 +335,7 @@ def test_every_implant_of_noticing_has_a_gradient(per_item, recordings):
     implants = {name: value[0].clone() for name, value in drawn(per_item, 1).items()}
     for site in NOTICES:
         implants[site] = torch.full((1, 1), 0.3, requires_grad=True)
-    per_item.log_likelihoods(implants, table).sum().backward()
+    log_likelihoods(per_item, implants, table).sum().backward()
     for site in NOTICES:
         gradient = implants[site].grad
         assert gradient is not None
@@ -428,7 +432,7 @@ def test_the_example_is_a_mixture_of_seeing_and_not(self_model, recordings):
 
     def scores(model):
         table = build_view_table(model, one, some)
-        return combination_scores(table, model.log_likelihoods(implants, table))[0][some[0]]
+        return combination_scores(table, log_likelihoods(model, implants, table))[0][some[0]]
 
     seeing, blind = scores(HumanModel(self_model)), scores(Blind(self_model))
     away = float(implants["distracted"])
@@ -549,12 +553,12 @@ class Wrong(PerItem):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("returns", "attend has to return a dict of the sites that it samples, by name"),
-        ("support", '"m" of attend has no finite support'),
+        ("returns", "round_latents has to return a dict of the sites that it samples, by name"),
+        ("support", '"m" of round_latents has no finite support'),
         ("param", '"p" is a pyro.param; sample it'),
-        ("clash", r'"lapse" is a site of prior\(\) and of attend\(\)'),
-        ("event", r'"m" of attend has shape \(1,\) and event shape \(3,\), expected'),
-        ("raises", r"Wrong.attend fails: KeyError: 'nothing' \(test_attention.py, line"),
+        ("clash", r'"lapse" is a site of prior\(\) and of round_latents\(\)'),
+        ("event", r'"m" of round_latents has shape \(1,\) and event shape \(3,\), expected'),
+        ("raises", r"Wrong.round_latents fails: KeyError: 'nothing' \(test_attention.py, line"),
     ],
 )
 def test_what_cannot_be_attended_to_is_refused(self_model, kind, message):
@@ -565,7 +569,7 @@ def test_what_cannot_be_attended_to_is_refused(self_model, kind, message):
 
 
 class Empty(PerItem):
-    """Overrides attend, and nothing differs."""
+    """Overrides round_latents, and nothing differs."""
 
     def round_latents(self, implants):
         return {}
@@ -593,6 +597,6 @@ class ReadsSight(OneRadius):
 def test_attention_that_hangs_on_what_is_seen_is_refused(self_model, recordings):
     """On a value in the middle, too."""
     one = recordings.select_people([0]).select_rounds([0])
-    message = '"away" of attend depends on a discrete site that perceive'
+    message = '"away" of round_latents depends on a discrete site that perceive'
     with pytest.raises(HumanModelError, match=message):
         build_view_table(ReadsSight(self_model), one)

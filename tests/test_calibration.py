@@ -47,27 +47,31 @@ class Blank(nn.Module):
 class Coins(HumanModel):
     """Somebody who drives by throwing three coins in turn, so that the posterior is known.
 
-    One coin has any rate, one is of three kinds, and one, in ``act``, of two.
+    One coin has any rate, one is of three kinds, and one of two. A belief is the number of steps.
     """
 
     def prior(self):
         return {
             "rate": pyro.sample("rate", dist.Beta(2.0, 2.0)),
             "style": pyro.sample("style", dist.Categorical(STYLE_PRIOR)),
+            "hasty": pyro.sample("hasty", dist.Bernoulli(0.3)),
             "weights": pyro.sample("weights", dist.Normal(torch.zeros(3), 1.0).to_event(1)),
         }
 
-    def perceive(self, implants, observation, told):
-        return View({})
+    def perceive(self, implants, knowledge, observation, told, step):
+        return View({}), knowledge
 
-    def believe(self, view, observation, actions):
-        return torch.zeros(*actions.shape, 1)
+    def evidence(self, view, observation):
+        return torch.zeros(*observation["ego"].shape[:-1], 0)
+
+    def believe(self, belief, evidence, action, still=None):
+        return belief + 1
 
     def act(self, implants, belief, values):
-        hasty = pyro.sample("hasty", dist.Bernoulli(0.3))
-        coins = [implants["rate"], STYLES[implants["style"]], HASTE[hasty.long()]]
-        turn = torch.arange(belief.shape[-2]) % 3
-        switch = torch.stack(coins, -1)[..., turn].expand(belief.shape[:-1])
+        rate, style, hasty = (implants[site] for site in ("rate", "style", "hasty"))
+        coins = torch.stack(torch.broadcast_tensors(rate, STYLES[style], HASTE[hasty.long()]), -1)
+        turn = (belief[..., 0].long() - 1) % 3  # [..., P, B]
+        switch = coins.expand(*turn.shape, 3).gather(-1, turn[..., None]).squeeze(-1)
         return torch.stack([1 - switch, switch], -1).log()
 
 

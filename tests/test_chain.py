@@ -7,6 +7,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_course import gone_through
 
 from mirror_ppl.data import Demonstrations, concatenate
 from mirror_ppl.domains.bomb_defusal import BombDefusal
@@ -16,6 +17,7 @@ from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import draw_prior
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import build_view_table, restricted, rounds_of
+from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.models.chain import Chain
 from mirror_ppl.models.loading import check_contract
 from mirror_ppl.models.searcher import Searcher
@@ -106,14 +108,11 @@ def by_combination(human, rounds, draws):
             each = []
             for draw in range(number):
                 sites = {"reads_type": draws["reads_type"][draw, 0], **attention}
-                view = human.perceive(sites, seen, heard)
-                belief = human.believe(
-                    view.map(lambda part: part.expand(1, *part.shape[1:])), seen, actions[:, :steps]
-                )[None]
+                belief = gone_through(human, sites, seen, heard, actions[:, :steps])
                 own = {name: value[draw : draw + 1] for name, value in draws.items()}
                 with conditioned(own, 1, 1):
                     found_here = human.act(human.prior(), belief, human.action_values(belief))
-                each.append(found_here[0, 0, 0])
+                each.append(found_here[0, 0])
             each = torch.stack(each)  # [S, t, A]
             done = each.gather(-1, actions[:, :steps, None].expand(number, -1, 1)).squeeze(-1)
             before = done.cumsum(-1) - done
@@ -125,17 +124,37 @@ def by_combination(human, rounds, draws):
     return predicted, total
 
 
+class Late(Searcher):
+    """Does what they would have done one step before: a belief holds the one before it, too."""
+
+    @property
+    def belief_size(self):
+        return 2 * self.self_model.latent
+
+    def believe(self, belief, evidence, action, still=None):
+        before, _ = belief.chunk(2, -1)
+        return torch.cat([super().believe(before, evidence, action, still).mean, before], -1)
+
+    def action_values(self, belief):
+        return super().action_values(belief.chunk(2, -1)[1])
+
+    def act(self, implants, belief, values):
+        return super().act(implants, belief.chunk(2, -1)[1], values)
+
+
+@pytest.mark.parametrize("kind", [Searcher, Late])
 @pytest.mark.parametrize("told", [False, True])
-def test_the_sum_is_that_over_all_combinations(searcher, told):
-    rounds = recorded(told=told)
-    draws = draw_prior(searcher, 1, 4, 0)
+def test_the_sum_is_that_over_all_combinations(searcher, told, kind):
+    rounds, human = recorded(told=told), kind(searcher.self_model)
+    draws = draw_prior(human, 1, 4, 0)
     draws["reads_type"] = torch.tensor([0, 0, 1, 0]).view(4, 1, 1)
-    predicted, total = by_combination(searcher, rounds, draws)
-    table = build_view_table(searcher, rounds)
-    joints = log_joints(searcher, table, {n: v for n, v in draws.items() if n not in table.sites})
+    predicted, total = by_combination(human, rounds, draws)
+    table = build_view_table(human, rounds)
+    assert isinstance(table.attention, Chain)
+    joints = log_joints(human, table, {n: v for n, v in draws.items() if n not in table.sites})
     chosen = joints[torch.arange(4), 0, draws["reads_type"].flatten()]
     torch.testing.assert_close(chosen - torch.tensor(0.5).log(), total, rtol=1e-4, atol=1e-4)
-    found = predict_actions(searcher, table, draws)[:, 0]
+    found = predict_actions(human, table, draws)[:, 0]
     for place, expected in enumerate(predicted):
         steps = expected.shape[1]
         torch.testing.assert_close(found[:, place, :steps], expected, rtol=1e-4, atol=1e-4)
@@ -200,7 +219,7 @@ def test_the_sum_has_the_gradient_of_its_differences(searcher):
     def likelihood(value):
         given = {**draws, site: value}
         with conditioned(given, 1, 1):
-            return searcher.log_likelihoods(searcher.prior(), table).sum()
+            return log_likelihoods(searcher, searcher.prior(), table).sum()
 
     value = draws[site].clone().requires_grad_()
     (slope,) = torch.autograd.grad(likelihood(value), value)
@@ -224,7 +243,10 @@ def test_somebody_without_rounds_has_a_table(searcher):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda spans: {"guess": spans["guess"]}, "spans has to be of the sites of attend, guess"),
+        (
+            lambda spans: {"guess": spans["guess"]},
+            "spans has to be of the sites of round_latents, guess",
+        ),
         (
             lambda spans: {**spans, "found_1": replace(spans["found_1"], first=1)},
             'the span of "found_1", steps 1 to 4 of 7, begins before the one before it is over',
@@ -280,19 +302,12 @@ class Hangs(Searcher):
     [
         (ReadsLater, 'the span of "found_0" is steps 0 to .*, but at step .* it is read outside'),
         (TooFew, 'the span of "found_0" is .* its values from number 0 on differ'),
-        (Hangs, '"mood" of attend hangs on another of its sites'),
+        (Hangs, '"mood" of round_latents depends on another of its sites'),
     ],
 )
 def test_spans_that_are_not_so_are_found(searcher, kind, message):
     with pytest.raises(HumanModelError, match=message):
         check_contract(kind(searcher.self_model))
-
-
-class Late(Searcher):
-    """Has an act of its own, of whole rounds."""
-
-    def act(self, implants, belief, values):
-        return super().act(implants, belief, values)
 
 
 class Sees(Searcher):
@@ -302,7 +317,14 @@ class Sees(Searcher):
         return super().sees(implants, observation, step)
 
 
-@pytest.mark.parametrize("kind", [Late, Sees])
+class Perceives(Searcher):
+    """Perceives in a way of their own, of which nobody says what it reads."""
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        return super().perceive(implants, knowledge, observation, told, step)
+
+
+@pytest.mark.parametrize("kind", [Sees, Perceives])
 def test_who_may_break_spans_is_summed_out_as_elsewhere(searcher, kind):
     """By values that stand for all; exactly where there are few of them."""
     human, rounds = kind(searcher.self_model), recorded(((WAIT, 2, 1, 3),), told=False)

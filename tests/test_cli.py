@@ -268,8 +268,9 @@ class Numb(HumanModel):
         return values
 
 class Dreamer(HumanModel):
-    def perceive(self, implants, observation, told):
-        return super().perceive({**implants, "told": implants["lapse"]}, observation, told)
+    def perceive(self, implants, knowledge, observation, told, step):
+        sites = {**implants, "told": implants["lapse"]}
+        return super().perceive(sites, knowledge, observation, told, step)
 """
 
 

@@ -12,6 +12,7 @@ import pyro.distributions as dist
 import pytest
 import torch
 import tyro
+from example_course import gone_through
 from pyro import poutine
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
@@ -28,6 +29,7 @@ from mirror_ppl.inference.self_model_training import SelfModelOptions
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import PLATES, FitOptions, continuous_guide
 from mirror_ppl.inference.views import Screening, build_view_table
+from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.models import HumanModel, training_views
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.variants import VARIANTS
@@ -355,7 +357,7 @@ def test_late_gets_a_gradient_for_each_person(results, self_model):
     table = build_view_table(human, recordings, screening=Screening())
     with pyro.settings.context(module_local_params=True):
         guide = continuous_guide(human, table)
-        model = config_enumerate(human.model, "parallel")
+        model = config_enumerate(TableProgram(human), "parallel")
         TraceEnum_ELBO(max_plate_nesting=PLATES)(model, guide)(table).backward()
     gradients = {name: value.grad for name, value in guide.named_parameters()}
     for part in ("locs", "scales"):
@@ -366,23 +368,46 @@ def test_late_gets_a_gradient_for_each_person(results, self_model):
 
 def test_late_is_the_mixture_that_it_says(self_model):
     human = load_human_model(f"{ROOT}/{EXAMPLE}", self_model)
-    belief = torch.randn(2, 3, 5, self_model.latent)
-    values = self_model.action_values(belief)
+    own = torch.randn(2, 5, self_model.latent)
 
-    def act(model, sites):
+    def act(model, sites, belief):
         with poutine.condition(data=sites), pyro.plate("person", 2, dim=-2):
-            return model.act(model.prior(), belief, values).exp()
+            return model.act(model.prior(), belief, model.action_values(belief)).exp()
 
     sites = known(human, 2, reach_bin=2)
     sites["residual_in"] = torch.randn(2, 1, 49, 8)
     sites["residual_out"] = torch.randn(2, 1, 9, 2)
-    prompt = act(HumanModel(self_model), sites)
+    prompt = act(HumanModel(self_model), sites, own)
     late = torch.tensor([0.25, 0.75])[:, None]
-    mixed = act(human, sites | {"late": late})
-    torch.testing.assert_close(mixed[..., 0, :], prompt[..., 0, :])
-    share = late[..., None, None]
-    expected = (1 - share) * prompt[..., 1:, :] + share * prompt[..., :-1, :]
-    torch.testing.assert_close(mixed[..., 1:, :], expected)
+    # Step after step: at the first there is no belief before.
+    before = torch.cat([own[:, :1], own[:, :-1]], 1)
+    mixed = act(human, sites | {"late": late}, torch.cat([own, before], -1))
+    torch.testing.assert_close(mixed[:, 0], prompt[:, 0])
+    share = late[..., None]
+    expected = (1 - share) * prompt[:, 1:] + share * prompt[:, :-1]
+    torch.testing.assert_close(mixed[:, 1:], expected)
+
+
+def test_a_late_person_remembers_the_belief_of_one_step_before(self_model, results):
+    human, prompt = load_human_model(f"{ROOT}/{EXAMPLE}", self_model), HumanModel(self_model)
+    recordings = load_demonstrations(results / "runs" / "people.nc")
+    rounds = recordings.shape[1] * recordings.num_people
+    steps = recordings.shape[2]
+    observation = {
+        name: value.flatten(0, 1)[:, :steps] for name, value in recordings.observation().items()
+    }
+    told = {name: value.flatten(0, 1) for name, value in recordings.told.items()}
+    actions = recordings.actions.flatten(0, 1)
+    sites = {
+        name: value[:1, 0].expand(rounds)
+        for name, value in known(human, 1, reach_bin=2).items()
+        if not value.is_floating_point()
+    }
+    own = gone_through(prompt, sites, observation, told, actions)
+    now, before = gone_through(human, sites, observation, told, actions).chunk(2, -1)
+    torch.testing.assert_close(now, own)
+    torch.testing.assert_close(before[:, 1:], own[:, :-1])
+    torch.testing.assert_close(before[:, 0], own[:, 0])
 
 
 def known(human, people, reach_bin):
@@ -405,11 +430,11 @@ def test_a_late_person_is_told_from_a_prompt_one(self_model, generator):
     class InFullView(late_person):
         """Everybody sees everything, so that all the work goes into how they act."""
 
-        def perceive(self, implants, observation, told):
+        def perceive(self, implants, knowledge, observation, told, step):
             everything = {
                 name: value[0, 0] for name, value in sites.items() if not value.is_floating_point()
             }
-            return super().perceive(everything, observation, told)
+            return super().perceive(everything, knowledge, observation, told, step)
 
     human = InFullView(self_model)
     sites = known(human, 2, reach_bin=len(human.domain.reach_bins) - 1)
@@ -423,8 +448,7 @@ def test_a_late_person_is_told_from_a_prompt_one(self_model, generator):
     for row, value in enumerate(grid):
         data = sites | {"late": value.expand(2, 1)}
         with poutine.condition(data=data), pyro.plate("person", 2, dim=-2):
-            actions = human.act(human.prior(), table.belief, table.values)
-        log_weights[row] += table.log_likelihoods(actions).sum(-1)
+            log_weights[row] += log_likelihoods(human, human.prior(), table).sum(-1)
     below_half = log_weights.softmax(0)[grid < 0.5].sum(0)
     assert below_half[0] < 1e-3
     assert below_half[1] > 1 - 1e-3
@@ -445,14 +469,28 @@ class NoSight(HumanModel):
         return {"late": pyro.sample("late", dist.Beta(1.0, 4.0))}
 
 
+class SamplesInAct(HumanModel):
+    def act(self, implants, belief, values):
+        late = pyro.sample("late", dist.Beta(1.0, 4.0))
+        return late[..., None] + super().act(implants, belief, values)
+
+
 class MissingDimensions(HumanModel):
+    def prior(self):
+        return super().prior() | {"late": pyro.sample("late", dist.Beta(1.0, 4.0))}
+
     def act(self, implants, belief, values):
-        return pyro.sample("late", dist.Beta(1.0, 4.0)) + super().act(implants, belief, values)
+        return implants["late"] + super().act(implants, belief, values)
 
 
-class LostStep(HumanModel):
+class LostAction(HumanModel):
     def act(self, implants, belief, values):
-        return super().act(implants, belief, values)[..., :-1, :]
+        return super().act(implants, belief, values)[..., :-1]
+
+
+class UntoldMemory(HumanModel):
+    def believe(self, belief, evidence, action, still=None):
+        return torch.cat([super().believe(belief, evidence, action, still).mean, belief], -1)
 
 
 class Probabilities(HumanModel):
@@ -461,9 +499,9 @@ class Probabilities(HumanModel):
 
 
 class ReadsContinuous(HumanModel):
-    def perceive(self, implants, observation, told):
+    def perceive(self, implants, knowledge, observation, told, step):
         assert "lapse" in implants or implants["lapse"]
-        return super().perceive(implants, observation, told)
+        return super().perceive(implants, knowledge, observation, told, step)
 
 
 class ManyValues(HumanModel):
@@ -471,9 +509,9 @@ class ManyValues(HumanModel):
         uniform = dist.Categorical(torch.ones(100) / 100)
         return super().prior() | {"a": pyro.sample("a", uniform)}
 
-    def perceive(self, implants, observation, told):
+    def perceive(self, implants, knowledge, observation, told, step):
         assert (implants["a"] >= 0).all()
-        return super().perceive(implants, observation, told)
+        return super().perceive(implants, knowledge, observation, told, step)
 
 
 class SampledTwice(HumanModel):
@@ -499,8 +537,10 @@ class Parameter(HumanModel):
 
 MISTAKES = [
     NoSight,
+    SamplesInAct,
     MissingDimensions,
-    LostStep,
+    LostAction,
+    UntoldMemory,
     Probabilities,
     ReadsContinuous,
     ManyValues,

@@ -9,6 +9,7 @@ from example_person import DOMAIN, human, self_model
 from mirror_ppl.domains.driving import CAR_LANES, DrivingState
 from mirror_ppl.domains.driving_knowledge import ROAD_END, CarKnowledge, assumed_cars
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import assumption_sites, sight_sites
 from mirror_ppl.people.driving import Memory, in_sight, remember
 
@@ -358,7 +359,7 @@ def test_people_of_the_human_model_have_in_mind_what_drivers_remember(generator)
     states, messages = random_rounds(number, generator)
     index, reach = random_reaches(number, generator)
     observation, heard = stacked(states, messages)
-    view = human().perceive(implants(index), observation, heard)
+    view = perceived(human(), implants(index), observation, heard)
     lanes = torch.tensor(CAR_LANES)
     for step, memory in enumerate(remembering(states, messages, reach)):
         offset = (lanes - states[step].lane[:, None]).float()
@@ -384,13 +385,15 @@ class Mirrors(HumanModel):
         return super().sees(alike, observation, step)
 
 
-def test_a_model_that_overrides_sees_is_stepwise_and_notices_what_it_misses(generator):
+def test_a_model_that_overrides_sees_notices_what_it_misses(generator):
     model = Mirrors(self_model())
-    assert model.stepwise
     states, messages = random_rounds(40, generator, rate=0.1)
     observation, heard = stacked(states, messages)
     index, _ = random_reaches(40, generator)
-    found = model.perceive(implants(index), observation, heard).numbers()
+    found = perceived(model, implants(index), observation, heard).numbers()
     alike = index[:, [SIGHTS.index(name.replace("back", "front")) for name in SIGHTS]]
-    assert torch.equal(found, human().perceive(implants(alike), observation, heard).numbers())
-    assert not torch.equal(found, human().perceive(implants(index), observation, heard).numbers())
+    expected, other = (
+        perceived(human(), implants(each), observation, heard).numbers() for each in (alike, index)
+    )
+    assert torch.equal(found, expected)
+    assert not torch.equal(found, other)

@@ -35,6 +35,7 @@ from mirror_ppl.inference.sightings import Sightings
 from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import FitOptions
 from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.toy import RATES, ToyHuman, toy_posterior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -298,8 +299,7 @@ def test_evidence_adds_up_by_hand(toy, recordings):
     table = build_view_table(toy, two)
     for way in range(64):
         policy = {name: value[way] for name, value in evidence.ways.items()}
-        log_probabilities = toy.act(policy, table.belief, table.values)
-        likelihood = table.log_likelihoods(log_probabilities)[0]
+        likelihood = log_likelihoods(toy, policy, table)[0]
         views = table.index[0]
         exact[way] = torch.logsumexp(likelihood[views].sum(0) - math.log(7), 0)
     torch.testing.assert_close(evidence.log_evidence, exact, atol=1e-3, rtol=0)

@@ -7,20 +7,20 @@ from dataclasses import replace
 import pyro
 import pytest
 import torch
-from pyro import poutine
+from example_course import beliefs_of
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import ROAD_END, DrivingState
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.evaluation.self_model import fixed_views
 from mirror_ppl.inference.exact import log_joint
-from mirror_ppl.inference.experience import experience
 from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.svi import FitOptions, continuous_guide, fit_implants
 from mirror_ppl.inference.views import build_view_table
+from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.models import HumanModel, View
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import (
     RESIDUAL_HIDDEN,
     assumption_sites,
@@ -115,7 +115,7 @@ def test_threshold_of_its_direction_decides_at_every_edge(human, lane, car):
         assert human.sees(implants, observation, 0)["visual"][:, car].tolist() == expected
         # Each look the first of a round: a car seen twice would be known wherever it is then.
         rounds = {name: value[:, None] for name, value in observation.items()}
-        view = human.perceive(implants, rounds, nothing_told(1))
+        view = perceived(human, implants, rounds, nothing_told(1))
         assert view.visible["visual"][:, 0, car].tolist() == expected
         assert not view.visible["verbal"].any()
 
@@ -125,11 +125,11 @@ def test_many_people_perceive_at_once_as_they_do_alone(human, recordings):
     implants |= {site: torch.randint(2, (7,)) for site in ASSUMED}
     observation = {name: value[:1, 0, :STEPS] for name, value in recordings.observation().items()}
     told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
-    together = human.perceive(implants, observation, told)
+    together = perceived(human, implants, observation, told)
     assert all(mask.any() for mask in together.taken.values())
     for row in range(7):
         own = {site: value[row : row + 1] for site, value in implants.items()}
-        alone = human.perceive(own, observation, told)
+        alone = perceived(human, own, observation, told)
         assert torch.equal(together.numbers()[row], alone.numbers()[0])
         for name in told:
             assert torch.equal(together.visible[name][row], alone.visible[name][0])
@@ -142,7 +142,7 @@ def test_what_is_told_is_overlaid_on_what_is_seen(human):
     told = nothing_told(3)
     told["visual"][0, 1, 0] = True
     told["verbal"][0, 2, 3] = True
-    view = human.perceive(sight(back_own=3), observation, told)
+    view = perceived(human, sight(back_own=3), observation, told)
     # The car behind is seen, and from the second time on known; one ahead is shown at step 1;
     # another is spoken of at step 2.
     expected = [
@@ -161,7 +161,7 @@ def test_absent_is_what_was_never_seen_nor_told(human):
     observation = looked_at([[3, 9, -1, -4], [2, 9, -1, -4], [3, 9, -1, -4]])
     told = nothing_told(3)
     told["verbal"][0, 1, 1] = True
-    view = human.perceive(sight(1, front_own=2, back_own=1), observation, told)
+    view = perceived(human, sight(1, front_own=2, back_own=1), observation, told)
     assert view.taken["visual"][0].tolist() == [
         [True, True, False, True],
         [False, False, False, True],
@@ -169,7 +169,7 @@ def test_absent_is_what_was_never_seen_nor_told(human):
     ]
     assert not view.taken["verbal"].any()
     assert (view.imagined["visual"][..., 0][view.taken["visual"]] == ROAD_END).all()
-    view = human.perceive(sight(0, front_own=2, back_own=1), observation, told)
+    view = perceived(human, sight(0, front_own=2, back_own=1), observation, told)
     assert not any(mask.any() for mask in view.taken.values())
 
 
@@ -178,7 +178,7 @@ def test_a_car_seen_once_comes_closer_until_they_know_better(human):
     observation = looked_at([[5, 9, -9, -9], [6, 9, -9, -9], [7, 9, -9, -9], [8, 9, -9, -9]])
     told = nothing_told(4)
     told["visual"][0, 0, 0] = True
-    view = human.perceive(sight(closing=1, front_own=3), observation, told)
+    view = perceived(human, sight(closing=1, front_own=3), observation, told)
     assert view.visible["visual"][0, :, 0].tolist() == [True, False, True, True]
     assert view.visible["verbal"][0, :, 0].tolist() == [False, False, True, True]
     assert view.taken["visual"][0, :, 0].tolist() == [False, True, False, False]
@@ -186,10 +186,10 @@ def test_a_car_seen_once_comes_closer_until_they_know_better(human):
     assert view.imagined["visual"][0, :2, 0].tolist() == [[5, 0], [4, 0]]
     assert view.imagined["verbal"][0, :2, 0].tolist() == [[5, 0, -1], [4, 0, -1]]
     # Whoever sees less far goes on believing it, and others take nothing for granted.
-    view = human.perceive(sight(closing=1, front_own=1), observation, told)
+    view = perceived(human, sight(closing=1, front_own=1), observation, told)
     assert view.taken["visual"][0, :, 0].tolist() == [False, True, True, True]
     assert view.imagined["visual"][0, :, 0, 0].tolist() == [5, 4, 3, 2]
-    view = human.perceive(sight(closing=0, front_own=1), observation, told)
+    view = perceived(human, sight(closing=0, front_own=1), observation, told)
     assert not any(mask.any() for mask in view.taken.values())
 
 
@@ -200,7 +200,7 @@ def test_each_car_is_taken_as_what_is_known_of_it_allows(human):
     told["visual"][0, 0, :2] = True
     told["verbal"][0, 0, 2] = True
     for clear in (0, 1):
-        view = human.perceive(sight(clear, 1, front_own=3, front_other=3), observation, told)
+        view = perceived(human, sight(clear, 1, front_own=3, front_other=3), observation, told)
         # From 5 cells ahead it would be at 3 cells at step 2, and in sight; it is not.
         visual = [[0, 0, 0, clear], [1, 1, 0, clear], *[[0, 1, 0, clear]] * 2]
         assert view.taken["visual"][0].int().tolist() == visual
@@ -223,7 +223,7 @@ def test_each_car_is_taken_as_what_is_known_of_it_allows(human):
 def test_numbers_of_views_are_equal_where_views_are(human, recordings):
     observation, _ = first_round(recordings)
     told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
-    view = human.perceive(sight(1, 1, front_own=3, back_other=2), observation, told)
+    view = perceived(human, sight(1, 1, front_own=3, back_other=2), observation, told)
     numbers = view.numbers()
     for name, mask in view.taken.items():
         assert mask.any() and not mask.all()
@@ -249,14 +249,14 @@ def test_steps_by_hand_are_those_of_the_round(human, recordings):
     implants |= {site: torch.randint(2, (7,)) for site in ASSUMED}
     observation = {name: value[:1, 0, :STEPS] for name, value in recordings.observation().items()}
     told = {name: torch.rand(1, STEPS, 4) < 0.1 for name in ("visual", "verbal")}
-    view = human.perceive(implants, observation, told)
+    view = perceived(human, implants, observation, told)
     assert torch.equal(view.imagined["ego"], observation["ego"])
     whole = view.numbers()
     knowledge = DRIVING.nothing_known(1)
     for step in range(STEPS):
         now = {name: value[:, step] for name, value in observation.items()}
         heard = {name: mask[:, step] for name, mask in told.items()}
-        view, knowledge = human.look(implants, knowledge, now, heard, step)
+        view, knowledge = human.perceive(implants, knowledge, now, heard, step)
         assert torch.equal(view.numbers(), whole[:, step])
 
 
@@ -270,12 +270,11 @@ def test_a_model_may_say_what_is_visible_and_no_more(human, recordings):
 
     observation, actions = first_round(recordings)
     model = Attentive(human.self_model)
-    assert model.stepwise
-    view = model.perceive(sight(), observation, nothing_told(STEPS))
+    view = perceived(model, sight(), observation, nothing_told(STEPS))
     assert view.visible["visual"][0].all(0).tolist() == [True, False, True, False]
     bare = View(view.visible)
     torch.testing.assert_close(
-        model.believe(bare, observation, actions), model.believe(view, observation, actions)
+        beliefs_of(model, bare, observation, actions), beliefs_of(model, view, observation, actions)
     )
 
 
@@ -315,7 +314,7 @@ def test_belief_in_full_view_is_that_of_the_robot(human, recordings):
         nothing = {name: torch.zeros_like(mask) for name, mask in masks.items()}
         # Whether nothing is said of what is taken for granted, or that nothing is.
         for view in (View(masks), View(masks, nothing, emptied(observation))):
-            belief = human.believe(view, observation, actions)
+            belief = beliefs_of(human, view, observation, actions)
             torch.testing.assert_close(belief, expected)
     assert belief.shape == (1, STEPS, LATENT)
 
@@ -323,17 +322,17 @@ def test_belief_in_full_view_is_that_of_the_robot(human, recordings):
 def test_assuming_absence_is_like_seeing_an_empty_road(human, recordings):
     observation, actions = first_round(recordings)
     everything = torch.ones(1, STEPS, 4, dtype=torch.bool)
-    belief = human.believe(view_of(~everything, everything, observation), observation, actions)
+    belief = beliefs_of(human, view_of(~everything, everything, observation), observation, actions)
     empty = emptied(observation)
-    torch.testing.assert_close(belief, human.believe(view_of(everything), empty, actions))
+    torch.testing.assert_close(belief, beliefs_of(human, view_of(everything), empty, actions))
     # One car seen and the others taken to be absent: like seeing a road with one car.
     only = everything & (torch.arange(4) == 1)
     mixed = {name: value.clone() for name, value in empty.items()}
     mixed["visual"][..., 1, :] = observation["visual"][..., 1, :]
-    belief = human.believe(view_of(only, ~only, observation), observation, actions)
-    torch.testing.assert_close(belief, human.believe(view_of(everything), mixed, actions))
+    belief = beliefs_of(human, view_of(only, ~only, observation), observation, actions)
+    torch.testing.assert_close(belief, beliefs_of(human, view_of(everything), mixed, actions))
     # And not like knowing nothing of them.
-    unknown = human.believe(view_of(only), observation, actions)
+    unknown = beliefs_of(human, view_of(only), observation, actions)
     assert (unknown - belief).abs().max() > 0.1
 
 
@@ -344,30 +343,31 @@ def test_what_is_imagined_is_believed_like_what_is_seen_and_said(human, recordin
     imagined = DRIVING.observe(DrivingState(lane, torch.randint(-11, 12, (1, STEPS, 4)), speed))
     taken = {name: torch.rand(1, STEPS, 4) < 0.5 for name in ("visual", "verbal")}
     visible = {name: (torch.rand(1, STEPS, 4) < 0.5) & ~mask for name, mask in taken.items()}
-    belief = human.believe(View(visible, taken, imagined), observation, actions)
+    belief = beliefs_of(human, View(visible, taken, imagined), observation, actions)
     mixed = {"ego": observation["ego"]} | {
         name: torch.where(mask[..., None], imagined[name], observation[name])
         for name, mask in taken.items()
     }
     both = View({name: visible[name] | mask for name, mask in taken.items()})
-    torch.testing.assert_close(belief, human.believe(both, mixed, actions))
+    torch.testing.assert_close(belief, beliefs_of(human, both, mixed, actions))
     # Where they are themselves, people do not imagine.
     imagined["ego"] = 1 - imagined["ego"]
-    assert torch.equal(human.believe(View(visible, taken, imagined), observation, actions), belief)
+    same = beliefs_of(human, View(visible, taken, imagined), observation, actions)
+    assert torch.equal(same, belief)
 
 
 def test_masks_of_every_step_are_used(human, recordings):
     # The released MIRROR code applied the mask of the first frame to all of them.
     observation, actions = first_round(recordings)
     everything = torch.ones(1, STEPS, 4, dtype=torch.bool)
-    full = human.believe(view_of(everything), observation, actions)
+    full = beliefs_of(human, view_of(everything), observation, actions)
     for step in range(STEPS):
         less = everything.clone()
         less[:, step] = False
-        belief = human.believe(view_of(less), observation, actions)
+        belief = beliefs_of(human, view_of(less), observation, actions)
         assert torch.equal(belief[:, :step], full[:, :step])
         assert (belief[:, step:] != full[:, step:]).any(-1).all()
-        absent = human.believe(view_of(less, ~less, observation), observation, actions)
+        absent = beliefs_of(human, view_of(less, ~less, observation), observation, actions)
         assert torch.equal(absent[:, :step], full[:, :step])
         assert not torch.equal(absent[:, step], belief[:, step])
 
@@ -378,13 +378,13 @@ def test_masks_of_every_step_are_used(human, recordings):
 def test_telling_at_a_step_counts_from_that_step_on(human, recordings, name, clear, closing):
     observation, actions = first_round(recordings)
     implants = sight(clear, closing)
-    quiet = human.perceive(implants, observation, nothing_told(STEPS))
-    before = human.believe(quiet, observation, actions)
+    quiet = perceived(human, implants, observation, nothing_told(STEPS))
+    before = beliefs_of(human, quiet, observation, actions)
     for step in (0, 6, STEPS - 1):
         told = nothing_told(STEPS)
         told[name][0, step, 2] = True
-        view = human.perceive(implants, observation, told)
-        belief = human.believe(view, observation, actions)
+        view = perceived(human, implants, observation, told)
+        belief = beliefs_of(human, view, observation, actions)
         assert torch.equal(belief[:, :step], before[:, :step])
         assert (belief[:, step:] != before[:, step:]).any(-1).all()
 
@@ -392,11 +392,11 @@ def test_telling_at_a_step_counts_from_that_step_on(human, recordings, name, cle
 def test_belief_reads_the_action_before_it_and_never_the_last(human, recordings):
     observation, actions = first_round(recordings)
     view = view_of(torch.ones(1, STEPS, 4, dtype=torch.bool))
-    full = human.believe(view, observation, actions)
+    full = beliefs_of(human, view, observation, actions)
     for step in range(STEPS):
         other = actions.clone()
         other[:, step] = 1 - other[:, step]
-        belief = human.believe(view, observation, other)
+        belief = beliefs_of(human, view, observation, other)
         assert torch.equal(belief[:, : step + 1], full[:, : step + 1])
         assert (belief[:, step + 1 :] != full[:, step + 1 :]).any(-1).all()
 
@@ -414,7 +414,7 @@ def random_policy(*batch):
 
 
 def act_by_hand(one, belief, values):
-    """Probabilities ``[V, T, A]`` of one person's actions under one draw of their implants."""
+    """Probabilities ``[B, A]`` of one person's actions under one draw of their implants."""
     hidden = torch.tanh(belief @ one["residual_in"][:-1] + one["residual_in"][-1])
     delta = hidden @ one["residual_out"][:-1] + one["residual_out"][-1]
     chosen = torch.softmax(one["consistency"] * values + delta, -1)
@@ -423,10 +423,10 @@ def act_by_hand(one, belief, values):
 
 @pytest.mark.parametrize(("draws", "people"), [(1, 3), (2, 3), (2, 1)])
 def test_act_is_a_distribution_and_each_person_their_own(human, draws, people):
-    belief, values = torch.randn(3, 5, STEPS, LATENT), torch.randn(3, 5, STEPS, ACTIONS)
+    belief, values = torch.randn(3, 75, LATENT), torch.randn(3, 75, ACTIONS)
     implants = random_policy(draws, people)
     result = human.act(implants, belief, values)
-    assert result.shape == (draws, 3, 5, STEPS, ACTIONS)
+    assert result.shape == (draws, 3, 75, ACTIONS)
     torch.testing.assert_close(result.exp().sum(-1), torch.ones(result.shape[:-1]))
     for draw in range(draws):
         alone = human.act({name: value[draw] for name, value in implants.items()}, belief, values)
@@ -442,7 +442,7 @@ def test_act_is_a_distribution_and_each_person_their_own(human, draws, people):
 def test_prior_keeps_the_residual_small(human):
     with pyro.plate("draw", 500, dim=-3), pyro.plate("person", 1, dim=-2):
         implants = human.prior()
-    spread = residual(implants, torch.randn(1, 4, 1, LATENT)).std()
+    spread = residual(implants, torch.randn(1, 4, LATENT)).std()
     # Each weight out has standard deviation 0.1; at most 8 units and a bias feed on them.
     assert 0.1 < spread < 0.1 * math.sqrt(1 + RESIDUAL_HIDDEN)
 
@@ -452,7 +452,7 @@ def test_prior_keeps_the_residual_small(human):
 
 def test_every_continuous_implant_gets_a_gradient_from_the_likelihood(human, table):
     implants = {name: value.requires_grad_() for name, value in random_policy(2).items()}
-    likelihood = table.log_likelihoods(human.act(implants, table.belief, table.values))
+    likelihood = log_likelihoods(human, implants, table)
     likelihood[:, 0].sum().backward()
     for name, value in implants.items():
         assert (value.grad.flatten(1).abs().amax(1) > 0).all(), name
@@ -465,7 +465,7 @@ def test_every_continuous_implant_gets_a_gradient_from_the_elbo(human, table):
         torch.manual_seed(0)
         guide = continuous_guide(human, table)
         torch.manual_seed(1)
-        model = config_enumerate(human.model, "parallel")
+        model = config_enumerate(TableProgram(human), "parallel")
         TraceEnum_ELBO(max_plate_nesting=2)(model, guide)(table).backward()
         return {name: value.grad for name, value in guide.named_parameters()}
 
@@ -488,19 +488,6 @@ def test_every_discrete_implant_changes_the_likelihood(human, recordings):
         assert spread.flatten(1).amax(1).min() > 0.5, site
 
 
-def test_program_with_the_world_adds_the_robots_own_densities(human, table, generator):
-    actions = torch.randint(2, (4, STEPS), generator=generator)
-    start, plan = DRIVING.initial(4, generator), fixed_views(DRIVING, 4, generator)
-    rounds = experience(DRIVING, start, actions, plan).rounds
-    data = {site: torch.zeros(2, 1, dtype=torch.long) for site in table.sites}
-    data |= policy(human, 2) | {"z": torch.randn(4, STEPS + 1, LATENT)}
-    program = poutine.condition(human.model, data=data)
-    both = poutine.trace(program).get_trace(table, rounds)
-    person = poutine.trace(program).get_trace(table).log_prob_sum()
-    world = poutine.trace(poutine.condition(human.self_model.model, data=data)).get_trace(rounds)
-    torch.testing.assert_close(both.log_prob_sum(), person + world.log_prob_sum())
-
-
 # --- models of users --------------------------------------------------------------------------
 
 HEAD = """
@@ -511,8 +498,11 @@ from mirror_ppl.models import HumanModel, View
 """
 HASTY = """
 class Hasty(HumanModel):
+    def prior(self):
+        return {**super().prior(), "haste": pyro.sample("haste", dist.Beta(1.0, 4.0))}
+
     def act(self, implants, belief, values):
-        haste = pyro.sample("haste", dist.Beta(1.0, 4.0))[..., None, None]
+        haste = implants["haste"][..., None]
         return torch.log((1 - haste) * super().act(implants, belief, values).exp() + haste / 2)
 """
 GLANCER = """
@@ -521,12 +511,11 @@ class Glancer(HumanModel):
         every = pyro.sample("every", dist.Categorical(torch.tensor([0.5, 0.3, 0.2])))
         return {**super().prior(), "every": every}
 
-    def perceive(self, implants, observation, told):
-        view = super().perceive(implants, observation, told)
-        steps = torch.arange(view.visible["visual"].shape[-2])
-        looks = steps % (implants["every"][..., None] + 1) == 0
+    def perceive(self, implants, knowledge, observation, told, step):
+        view, knowledge = super().perceive(implants, knowledge, observation, told, step)
+        looks = step % (implants["every"] + 1) == 0
         view.visible["visual"] = view.visible["visual"] & looks[..., None]
-        return view
+        return view, knowledge
 """
 
 
@@ -563,8 +552,8 @@ def test_models_own_methods_are_called(tmp_path, human, recordings):
     observation, _ = first_round(recordings)
     implants = sight(front_own=6, front_other=6) | {"every": torch.tensor([0])}
     told = nothing_told(STEPS)
-    often = mine.perceive(implants, observation, told).visible["visual"]
-    rarely = mine.perceive({**implants, "every": torch.tensor([2])}, observation, told)
+    often = perceived(mine, implants, observation, told).visible["visual"]
+    rarely = perceived(mine, {**implants, "every": torch.tensor([2])}, observation, told)
     looks = torch.arange(STEPS) % 3 == 0
     assert often.any()
     assert torch.equal(rarely.visible["visual"], often & looks[:, None])
@@ -616,24 +605,41 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
         ("prior(self)", "return 1 / 0", r"Mine\.prior fails: ZeroDivisionError.*mine\.py, line 9"),
         ("prior(self)", "return None", "prior returned NoneType, expected a dict of sites"),
         (
-            "perceive(self, implants, observation, told)",
+            "perceive(self, implants, knowledge, observation, told, step)",
             "return torch.zeros(2) + torch.zeros(3)",
             r"Mine\.perceive fails: RuntimeError.*mine\.py, line 9",
         ),
         ("perceive(self, implants)", "return None", r"Mine\.perceive fails: TypeError"),
-        ("believe(self, view, observation, actions)", "return None", r"Mine\.believe fails"),
+        ("perceive(self, *look)", "return None", r"Mine\.perceive fails: TypeError"),
+        ("evidence(self, view, observation)", "return view.seen", r"Mine\.evidence fails: Attr"),
+        ("believe(self, *now)", "return None", r"Mine\.believe fails"),
+        (
+            "believe(self, belief, evidence, action, still=None)",
+            "return torch.cat([belief, belief], -1)",
+            r"believe returned shape \(2, 96\), expected \(2, 48\) for 2 beliefs",
+        ),
         (
             "act(self, implants, belief, values)",
             "return values[..., 0]",
-            r"act returned shape \(2, 1, 3\), expected \(2, 1, 3, 2\)",
+            r"act returned shape \(2, 1\), expected \(2, 1, 2\)",
         ),
         (
-            "perceive(self, implants, observation, told)",
+            "perceive(self, implants, knowledge, observation, told, step)",
             'return implants["lapse"]',
             r'perceive\(\) reads "lapse", which is not a discrete site of prior\(\)',
         ),
         ("act(self, implants, belief, values)", "return values", "they do not sum to 1"),
         ("act(self, implants, belief, values)", 'return implants["mood"]', "KeyError: 'mood'"),
+        (
+            "act(self, implants, belief, values)",
+            'return values + pyro.sample("mood", dist.Beta(1.0, 4.0))[..., None]',
+            'act samples "mood" at every step; sample it in prior',
+        ),
+        (
+            "act(self, implants, belief, values)",
+            'return values.log_softmax(-1) + 0 * pyro.param("mood", torch.ones(()))',
+            '"mood" is a pyro.param',
+        ),
         (
             "prior(self)",
             'pyro.sample("mood", dist.Poisson(3.0)); return super().prior()',

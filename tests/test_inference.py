@@ -32,6 +32,7 @@ from mirror_ppl.inference.svi import (
     negative_elbo,
 )
 from mirror_ppl.inference.views import build_view_table, combination_scores, restricted
+from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.view_table import NO_VIEW
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -45,15 +46,15 @@ PRIOR = torch.outer(torch.arange(1.0, 8) / 28, torch.tensor([0.3, 0.7])).flatten
 
 
 class Moody(Few):
-    """Few, with a discrete site that perception does not depend on, and one inside of act."""
+    """Few, with discrete sites before and after theirs that perception does not depend on."""
 
     def prior(self):
         mood = pyro.sample("mood", dist.Categorical(torch.tensor([0.2, 0.5, 0.3])))
-        return super().prior() | {"mood": mood}
+        own = super().prior()
+        return own | {"mood": mood, "bold": pyro.sample("bold", dist.Bernoulli(0.4))}
 
     def act(self, implants, belief, values):
-        bold = pyro.sample("bold", dist.Bernoulli(0.4))
-        factor = 1 + bold + implants["mood"]
+        factor = 1 + implants["bold"] + implants["mood"]
         return super().act(
             {**implants, "consistency": implants["consistency"] * factor}, belief, values
         )
@@ -69,11 +70,10 @@ class Nested(Few):
         own["assumes_clear"] = pyro.sample("assumes_clear_too", dist.Categorical(chances))
         return own | {"assumes_clear_too": own["assumes_clear"], "trust": trust}
 
-    def perceive(self, implants, observation, told):
+    def perceive(self, implants, knowledge, observation, told, step):
         own = {site: implants[site] for site in ("sight_front_own", "assumes_clear_too")}
-        return super().perceive(
-            {**own, "assumes_clear": own["assumes_clear_too"]}, observation, told
-        )
+        own["assumes_clear"] = own["assumes_clear_too"]
+        return super().perceive(own, knowledge, observation, told, step)
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def bound_at(human, table, values):
             for name, value in values.items():
                 pyro.sample(name, dist.Delta(value, event_dim=value.dim() - 2))
 
-    model = config_enumerate(human.model, "parallel")
+    model = config_enumerate(TableProgram(human), "parallel")
     return -TraceEnum_ELBO(max_plate_nesting=2).loss(model, guide, table)
 
 
@@ -426,7 +426,7 @@ def test_checkpoint_of_another_fit_is_refused(few, recordings, tmp_path):
 
 def test_pruning_gives_up_whoever_is_hopeless(few, table):
     policy = some_policy(few, 3)
-    score = combination_scores(table, few.log_likelihoods(policy, table))
+    score = combination_scores(table, log_likelihoods(few, policy, table))
     behind = score.amax(-1, keepdim=True) - score
     margin = behind[behind > 0].median().item() + 1e-3
     pruned = _prune(few, table, lambda table: policy, margin)
@@ -525,7 +525,7 @@ def test_the_marginal_elbo_is_that_of_enumeration(self_model):
     for some in (table, restricted(table, alive)):
         guide = continuous_guide(human, some)
         enumerated = TraceEnum_ELBO(max_plate_nesting=2, strict_enumeration_warning=False)(
-            config_enumerate(human.model, "parallel"), guide
+            config_enumerate(TableProgram(human), "parallel"), guide
         )
         found = []
         for loss in (negative_elbo(human, some, guide), enumerated):

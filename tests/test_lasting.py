@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from example_course import beliefs_of
 from example_person import (
     BLIND,
     CHANNELS,
@@ -9,15 +10,16 @@ from example_person import (
     FULL_SIGHT,
     SIGHTS,
     begun,
+    beliefs_before,
     flags,
     human,
     observed,
     person,
 )
 
-from mirror_ppl.communication.minds import Looks, StepwiseBeliefs
+from mirror_ppl.communication.minds import Looks
 from mirror_ppl.domains.driving import CARS, DrivingState
-from mirror_ppl.models import View
+from mirror_ppl.models import View, course
 from mirror_ppl.models.implants import assumption_sites
 
 STEPS = 4
@@ -69,7 +71,7 @@ def far_off(steps=STEPS):
 def perceived(implants=None, steps=STEPS, **told):
     nothing = torch.zeros(1, steps, 4, dtype=torch.bool)
     given = dict.fromkeys(NAMES, nothing) | told
-    return human().perceive(implants or viewer(), far_off(steps), given)
+    return course.perceived(human(), implants or viewer(), far_off(steps), given)
 
 
 def parts_of(view):
@@ -183,7 +185,7 @@ def test_what_is_told_is_no_longer_taken_to_be_absent(name, time, car):
 
 def believed(implants, **told):
     done = torch.zeros(1, STEPS, dtype=torch.long)
-    return human().believe(perceived(implants, **told), far_off(), done)[0]
+    return beliefs_of(human(), perceived(implants, **told), far_off(), done)[0]
 
 
 def differ(first, second):
@@ -267,7 +269,7 @@ def beginning():
 def steps_of_planning(*messages):
     """What lasts for somebody blind after each of these messages."""
     past = beginning()
-    beliefs, which = StepwiseBeliefs.before(person(), past)
+    beliefs, which = beliefs_before(person(), past)
     result, action = [], len(DOMAIN.actions)
     for message in messages:
         beliefs, which = beliefs.after(look(which, past, message, action))
@@ -299,7 +301,7 @@ def test_planning_goes_on_from_what_was_told_in_the_round_so_far():
     message = flags(visual=["front-left"], verbal=["rear-right"])
     past = past.then(CHANNELS.split(message), 0, past.now)
     past = past.then(CHANNELS.split(flags()), 0, past.now)
-    beliefs, which = StepwiseBeliefs.before(person(), past)
+    beliefs, which = beliefs_before(person(), past)
     assert lasting(beliefs, which) == (["rear-right"], ["front-left"])
     after, then = beliefs.after(look(which, past, flags(verbal=["front-right"]), 0))
     assert lasting(after, then) == (["front-right", "rear-right"], ["front-left"])

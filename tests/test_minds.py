@@ -1,15 +1,18 @@
-"""Beliefs in planning: against the human model on whole rounds, step by step and all over again."""
+"""Beliefs in planning: against the human model on whole rounds, one by one."""
 
 import itertools
 
 import pytest
 import torch
+from example_course import gone_through
 from example_person import (
     CHANNELS,
     DOMAIN,
     FULL_SIGHT,
     Averaging,
+    Unused,
     begun,
+    beliefs_before,
     flags,
     human,
     implants,
@@ -21,13 +24,13 @@ from example_person import (
 )
 
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
-from mirror_ppl.communication.minds import CourseBeliefs, Looks, Standing, StepwiseBeliefs
+from mirror_ppl.communication.minds import Looks, Standing
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import assumption_sites
 
 ACTIONS = len(DOMAIN.actions)
-KINDS = (StepwiseBeliefs, CourseBeliefs)
+KINDS = (HumanModel, Averaging)
 ASSUMED = assumption_sites(DOMAIN)
 
 
@@ -104,7 +107,7 @@ def test_everybody_sees_for_themselves():
     knowledge = DOMAIN.nothing_known(number)
     first = {name: value[:, 0] for name, value in observation.items()}
     told = {name: mask[:, 0] for name, mask in nothing.items()}
-    look, after = someone.look(someone.eye, knowledge, first, told, 0)
+    look, after = someone.perceive(someone.eye, knowledge, first, told, 0)
     assert torch.equal(look.numbers(), view.numbers()[:, 0])
     assert after.unsure.tolist() == [behind, ahead, ahead]
 
@@ -112,14 +115,17 @@ def test_everybody_sees_for_themselves():
 def test_each_draw_acts_by_its_own_implants(generator):
     draws = varied_draws(3, generator)
     someone = Person(human(), draws)
-    belief = torch.randn(3, 4, 2, self_model().latent, generator=generator)
-    values = torch.randn(3, 4, 2, ACTIONS, generator=generator)
+    belief = torch.randn(3, 4, self_model().latent, generator=generator)
+    values = torch.randn(3, 4, ACTIONS, generator=generator)
     together = someone.act(belief, values)
     assert together.shape == (3, 4, ACTIONS)
     for s, m in itertools.product(range(3), range(4)):
         own = {name: value[s] for name, value in draws.items()}
         alone = human().act(own, belief[s, m][None, None], values[s, m][None, None])
-        torch.testing.assert_close(together[s, m], alone[0, 0, -1])
+        torch.testing.assert_close(together[s, m], alone[0, 0])
+    # Where draws share beliefs it is as if each had them.
+    shared = someone.act(belief[:1], values[:1])
+    torch.testing.assert_close(shared, someone.act(belief[:1].expand(3, -1, -1), values[:1]))
 
 
 # --- beliefs in step --------------------------------------------------------------------------
@@ -165,7 +171,7 @@ class Tracks:
         )
 
     def expected(self, step):
-        """Beliefs ``[g, t + step + 1, Z]`` by perceive and believe on whole rounds."""
+        """Beliefs ``[g, Z]`` at the end of whole rounds up to this step."""
         number, past = len(self.eye), self.past
 
         def whole(before, *after):
@@ -179,12 +185,16 @@ class Tracks:
         told = whole(CHANNELS.join(past.told), *self.told[:, : step + 1].unbind(1))
         done = whole(past.actions, *self.actions[:, : step + 1].unbind(1))
         eyes = {name: value[self.eye] for name, value in self.person.eyes.items()}
-        model = self.person.human
-        view = model.perceive(eyes, observation, CHANNELS.split(told))
-        return model.believe(view, observation, done)
+        heard = CHANNELS.split(told)
+        return gone_through(self.person.human, eyes, observation, heard, done)[:, -1]
 
     def upto(self, step):
         return enumerate(self.futures.observation(each) for each in range(step + 1))
+
+
+def person_of(kind, number, generator):
+    """Somebody of a model of that class, with draws that differ in everything."""
+    return Person(kind(self_model()), varied_draws(number, generator))
 
 
 @pytest.fixture
@@ -194,20 +204,18 @@ def someone(generator):
 
 @pytest.mark.parametrize("time", [0, 1, 5])
 @pytest.mark.parametrize("kind", KINDS)
-def test_beliefs_are_those_of_whole_rounds(someone, generator, kind, time):
+def test_beliefs_are_those_of_whole_rounds(generator, kind, time):
+    someone = person_of(kind, 8, generator)
     past, _ = random_round(time, generator)
     tracks = Tracks(someone, past, 5, 120, generator)
-    beliefs, before = kind.before(someone, past)
-    parent = before[tracks.eye]
+    beliefs, own = beliefs_before(someone, past)
+    parent = own[tracks.eye]
     for step in range(5):
         beliefs, parent = beliefs.after(tracks.looks(step, parent))
-        mine = beliefs.courses[parent]
         expected = tracks.expected(step)
-        torch.testing.assert_close(mine[:, -1], expected[:, -1], rtol=0, atol=1e-5)
-        if kind is CourseBeliefs:
-            torch.testing.assert_close(mine, expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(beliefs.mean[parent], expected, rtol=0, atol=1e-5)
     # Messages, eyes and actions matter: of tracks that differ in one of them alone, some differ.
-    apart = (expected[:, None, -1] - expected[:, -1]).abs().amax(-1)
+    apart = (expected[:, None] - expected).abs().amax(-1)
     parts = (tracks.told.flatten(1), tracks.eye[:, None], tracks.path[:, -1:])
     different = torch.stack([(part[:, None] != part).any(-1) for part in parts])
     for part in different:
@@ -227,15 +235,16 @@ def test_beliefs_of_whoever_takes_things_for_granted_are_those_of_whole_rounds(
         sights = {name: torch.randint(5, (3,), generator=generator) for name in DOMAIN.directions}
         someone = person(
             12,
+            kind(self_model()),
             **{name: value.repeat_interleave(4) for name, value in sights.items()},
             **dict(zip(ASSUMED, torch.tensor(made * 3).unbind(-1), strict=True)),
         )
         tracks = Tracks(someone, past, 6, someone.eye_count, generator, alike=True)
-        beliefs, before = kind.before(someone, past)
-        parent = before[tracks.eye]
+        beliefs, own = beliefs_before(someone, past)
+        parent = own[tracks.eye]
         for step in range(6):
             beliefs, parent = beliefs.after(tracks.looks(step, parent))
-            mine, expected = beliefs.courses[parent, -1], tracks.expected(step)[:, -1]
+            mine, expected = beliefs.mean[parent], tracks.expected(step)
             torch.testing.assert_close(mine, expected, rtol=0, atol=1e-5)
             mine = mine[someone.eye].unflatten(0, (3, 4))
             apart = (mine[:, :, None] - mine[:, None]).abs().amax(-1)
@@ -248,34 +257,34 @@ def test_beliefs_of_whoever_takes_things_for_granted_are_those_of_whole_rounds(
 def test_a_car_that_is_imagined_elsewhere_is_believed_elsewhere(generator, kind):
     """It draws away: shown at step 0 it is taken to be at 4 cells at step 2, and at step 1 at 6."""
     past, shown = begun(0, [6, 30, -30, -30], [1, 1, -1, -1]), flags(visual=["front-left"])
-    tracks = Tracks(person(), past, 3, 2, generator)
+    tracks = Tracks(person(model=kind(self_model())), past, 3, 2, generator)
     tracks.told = torch.stack([plan(shown, None, None), plan(None, shown, None)])
     tracks.actions[:], tracks.path[:] = 0, 0
-    beliefs, before = kind.before(tracks.person, past)
-    parent = before[tracks.eye]
+    beliefs, own = beliefs_before(tracks.person, past)
+    parent = own[tracks.eye]
     for step in range(3):
         beliefs, parent = beliefs.after(tracks.looks(step, parent))
-        mine, expected = beliefs.courses[parent, -1], tracks.expected(step)[:, -1]
+        mine, expected = beliefs.mean[parent], tracks.expected(step)
         torch.testing.assert_close(mine, expected, rtol=0, atol=1e-5)
     # What is visible and taken for granted at the last step is the same.
     assert (mine[0] - mine[1]).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("time", [0, 4])
-def test_both_kinds_of_beliefs_agree(someone, generator, time):
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_belief_is_worked_out_once(generator, kind, time):
+    """Fewer than there are looks: each is had by somebody, and no two are alike."""
+    someone = person_of(kind, 8, generator)
     past, _ = random_round(time, generator)
     tracks = Tracks(someone, past, 6, 200, generator)
-    (quick, own), (slow, same) = (kind.before(someone, past) for kind in KINDS)
-    parent, other = own[tracks.eye], same[tracks.eye]
+    beliefs, own = beliefs_before(someone, past)
+    parent = own[tracks.eye]
     for step in range(6):
-        quick, parent = quick.after(tracks.looks(step, parent))
-        slow, other = slow.after(tracks.looks(step, other))
-        torch.testing.assert_close(
-            quick.courses[parent, -1], slow.courses[other, -1], rtol=0, atol=1e-5
-        )
-        # The quick ones work out fewer, and the slow ones one for each look.
-        assert len(quick.courses) < 200
-        assert len(slow.courses) == 200
+        beliefs, parent = beliefs.after(tracks.looks(step, parent))
+        torch.testing.assert_close(beliefs.mean[parent], tracks.expected(step), rtol=0, atol=1e-5)
+        assert len(beliefs.mean) < 200
+        assert parent.unique().tolist() == list(range(len(beliefs.mean)))
+        assert (beliefs.scale is None) == (kind is Averaging)
 
 
 def test_the_last_action_and_everything_told_so_far_is_in_a_belief(someone, generator):
@@ -284,12 +293,10 @@ def test_the_last_action_and_everything_told_so_far_is_in_a_belief(someone, gene
 
     def next_belief(past):
         tracks = Tracks(someone, past, 1, someone.eye_count, torch.Generator().manual_seed(0))
-        beliefs, before = StepwiseBeliefs.before(someone, past)
-        beliefs, index = beliefs.after(tracks.looks(0, before[tracks.eye]))
-        torch.testing.assert_close(
-            beliefs.courses[index, -1], tracks.expected(0)[:, -1], rtol=0, atol=1e-5
-        )
-        return beliefs.courses[index, -1]
+        beliefs, own = beliefs_before(someone, past)
+        beliefs, index = beliefs.after(tracks.looks(0, own[tracks.eye]))
+        torch.testing.assert_close(beliefs.mean[index], tracks.expected(0), rtol=0, atol=1e-5)
+        return beliefs.mean[index]
 
     base = next_belief(past)
     for step in range(3):
@@ -306,9 +313,9 @@ def test_the_last_action_and_everything_told_so_far_is_in_a_belief(someone, gene
 # --- which beliefs are shared -----------------------------------------------------------------
 
 
-def look_around(someone, past, messages, kind=StepwiseBeliefs):
+def look_around(someone, past, messages):
     """Beliefs after each eye's look with each message ``[M, N]``; which one, ``[M, U]``."""
-    beliefs, own = kind.before(someone, past)
+    beliefs, own = beliefs_before(someone, past)
     eye = torch.arange(someone.eye_count).repeat(len(messages))
     last = int(past.actions[-1]) if past.time else ACTIONS
     looks = Looks(
@@ -330,7 +337,7 @@ def test_eyes_that_see_the_same_share_a_belief():
     assert someone.eye_count == 5
     beliefs, which = look_around(someone, past, flags()[None])
     which = which[0, someone.eye]
-    assert len(beliefs.courses) == 2
+    assert len(beliefs.mean) == 2
     assert (which[:3] == which[0]).all() and (which[3:] == which[3]).all()
     assert which[0] != which[3]
 
@@ -340,7 +347,7 @@ def test_words_that_make_all_eyes_see_the_same_make_their_beliefs_the_same():
     someone = person(2, front_own=[0, FULL_SIGHT])
     shown = flags(visual=["front-left"])
     beliefs, which = look_around(someone, past, torch.stack([flags(), shown]))
-    silence, told = beliefs.courses[which][:, :, 0]
+    silence, told = beliefs.mean[which]
     assert not torch.allclose(silence[0], silence[1])
     torch.testing.assert_close(told[0], told[1], rtol=0, atol=0)
 
@@ -354,10 +361,10 @@ def test_what_eyes_saw_before_keeps_their_beliefs_apart():
         someone = person(2, front_own=[3, 4], assumes_clear=clear, assumes_closing=closing)
         beliefs, which = look_around(someone, past, flags()[None])
         assert len(set(which[0].tolist())) == 2
-        assert not torch.allclose(*beliefs.courses[which[0]])
+        assert not torch.allclose(*beliefs.mean[which[0]])
     # Two who both saw nothing share their beliefs from the beginning on.
-    before, own = StepwiseBeliefs.before(person(2, front_own=[2, 3]), past)
-    assert len(before.courses) == 1
+    beliefs, own = beliefs_before(person(2, front_own=[2, 3]), past)
+    assert len(beliefs.mean) == 1
     assert own.tolist() == [0, 0]
 
 
@@ -368,75 +375,49 @@ def test_somebody_who_takes_something_for_granted_believes_otherwise(assumption)
     someone = person(2, front_own=4, **{assumption: [0, 1]})
     beliefs, which = look_around(someone, past, flags()[None])
     assert len(set(which[0].tolist())) == 2
-    assert (beliefs.courses[which[0, 0]] - beliefs.courses[which[0, 1]]).abs().max() > 0.01
+    assert (beliefs.mean[which[0, 0]] - beliefs.mean[which[0, 1]]).abs().max() > 0.01
     spoken = flags(verbal=["front-left", "front-right", "rear-left", "rear-right"])
     _, which = look_around(someone, past, spoken[None])
     assert len(set(which[0].tolist())) == 1
 
 
-# --- models that look back further ------------------------------------------------------------
-
-
-class Same(HumanModel):
-    """Overrides a method without a change, so nothing is known of it."""
-
-    def believe(self, view, observation, actions):
-        return super().believe(view, observation, actions)
-
-
-class Vouched(Same):
-    stepwise = True
-
-
-def test_models_of_which_nothing_is_known_are_gone_through_again(generator):
-    past, _ = random_round(2, generator)
-    for model, kind in (
-        (HumanModel, StepwiseBeliefs),
-        (Averaging, CourseBeliefs),
-        (Same, CourseBeliefs),
-        (Vouched, StepwiseBeliefs),
-    ):
-        assert model.stepwise is (kind is StepwiseBeliefs)
-        standing = Standing.of(person(3, model(self_model())), past)
-        assert isinstance(standing.before, kind), model
-        assert standing.own.shape == (1,)
+# --- models that remember more ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("time", [0, 3])
-def test_a_model_that_looks_back_further_believes_as_in_whole_rounds(generator, time):
+def test_a_model_that_remembers_more_stands_in_a_round_with_its_memory(generator, time):
     past, _ = random_round(time, generator)
-    model = Averaging(self_model())
-    someone = Person(model, varied_draws(4, generator, model))
+    someone = person_of(Averaging, 4, generator)
     tracks = Tracks(someone, past, 4, 40, generator)
     standing = Standing.of(someone, past)
     beliefs, parent = standing.before, standing.own[tracks.eye]
     for step in range(4):
         beliefs, parent = beliefs.after(tracks.looks(step, parent))
-    mine = beliefs.courses[parent]
+    mine = beliefs.mean[parent]
     torch.testing.assert_close(mine, tracks.expected(3), rtol=0, atol=1e-5)
-    usual = human().believe
-    model.believe = usual  # what it would believe if it did not look back
-    assert (mine - tracks.expected(3)).abs().max() > 0.01
+    last, average, number = someone.human.parts(mine)
+    assert (number == time + 4).all()
+    # Besides what they would believe if they did not look back.
+    tracks.person = Person(human(), someone.draws)
+    torch.testing.assert_close(last, tracks.expected(3), rtol=0, atol=1e-5)
+    assert (average - last).abs().max() > 0.01
 
 
-def test_decisions_are_the_same_whichever_way_beliefs_are_worked_out(generator):
+def test_a_memory_that_is_not_used_leaves_decisions_as_they_are(generator):
     past, _ = random_round(3, generator)
     draws = varied_draws(6, generator)
-    quick, slow = (
+    usual, same = (
         Communicator(
             Person(model(self_model()), draws), ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0)
         ).plan(past)
-        for model in (HumanModel, Same)
+        for model in (HumanModel, Unused)
     )
-    assert torch.equal(quick.flags, slow.flags)
-    assert quick.gain.mean == pytest.approx(slow.gain.mean, abs=1e-4)
-    # Stepwise, messages are left out that tell nothing; all others are worth the same.
-    assert len(quick.found.candidates) < len(slow.found.candidates)
-    for candidate, utility in zip(quick.found.candidates, quick.found.valued.utility, strict=True):
-        same = (slow.found.candidates == candidate).flatten(1).all(1).nonzero()
-        if len(same):
-            expected = slow.found.valued.utility[same[0, 0]]
-            torch.testing.assert_close(utility, expected, rtol=0, atol=1e-4)
+    assert torch.equal(usual.flags, same.flags)
+    assert usual.gain.mean == pytest.approx(same.gain.mean, abs=1e-4)
+    assert torch.equal(usual.found.candidates, same.found.candidates)
+    torch.testing.assert_close(
+        usual.found.valued.utility, same.found.valued.utility, rtol=0, atol=1e-4
+    )
 
 
 def test_items_tell_what_somebody_does_not_know_yet():
@@ -455,7 +436,6 @@ def test_items_tell_what_somebody_does_not_know_yet():
     sighted = person(1, front_own=two, front_other=two)
     left &= ~flags(["front-left"], ["front-left"])
     assert torch.equal(Standing.of(sighted, past).telling(allowed), left)
-    # Of a model that looks back further nothing is known.
-    assert torch.equal(
-        Standing.of(person(model=Averaging(self_model())), past).telling(allowed), allowed
-    )
+    # Of a model that remembers more it is the same.
+    sighted = person(1, Averaging(self_model()), front_own=two, front_other=two)
+    assert torch.equal(Standing.of(sighted, past).telling(allowed), left)

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from example_course import gone_through
 from example_person import DOMAIN, begun
 from example_rounds import untrained
 
 from mirror_ppl.baselines import NetworkPerson
 from mirror_ppl.baselines.person import NETWORK
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
-from mirror_ppl.communication.minds import CourseBeliefs, Looks, StepwiseBeliefs
+from mirror_ppl.communication.minds import Looks, Standing
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.driving import STAY, SWITCH
@@ -66,8 +67,7 @@ def test_acts_as_the_network_does(domain, generator):
     steps = recordings.shape[2]
     observation = {name: value[0, :, :steps] for name, value in recordings.observation().items()}
     told = {name: mask[0] for name, mask in recordings.told.items()}
-    view = human.perceive({}, observation, told)
-    belief = human.believe(view, observation, recordings.actions[0].clamp(min=0))
+    belief = gone_through(human, {}, observation, told, recordings.actions[0].clamp(min=0))
     found = human.act({}, belief, human.action_values(belief))
     real = recordings.mask[0]
     torch.testing.assert_close(found[real], expected[0][real], rtol=1e-4, atol=1e-5)
@@ -76,25 +76,20 @@ def test_acts_as_the_network_does(domain, generator):
     assert person.eye_count == 1
     for number in range(recordings.shape[1]):
         past, last = first_of(recordings, number)
-        for kind in (StepwiseBeliefs, CourseBeliefs):
-            before, own = kind.before(person, past)
-            looks = Looks(
-                parent=own[:1],
-                eye=torch.zeros(1, dtype=torch.long),
-                action=past.actions[-1:]
-                if past.time
-                else torch.tensor([len(human.domain.actions)]),
-                row=torch.zeros(1, dtype=torch.long),
-                observation={name: value[None] for name, value in past.now.items()},
-                told={name: mask[None] for name, mask in last.items()},
-            )
-            beliefs, index = before.after(looks)
-            courses = beliefs.courses[index].expand(2, 1, -1, -1)
-            planned = person.act(courses, human.action_values(courses))
-            for draw in planned[:, 0]:
-                torch.testing.assert_close(
-                    draw, expected[0, number, past.time], rtol=1e-4, atol=1e-5
-                )
+        standing = Standing.of(person, past)
+        looks = Looks(
+            parent=standing.own[:1],
+            eye=torch.zeros(1, dtype=torch.long),
+            action=torch.tensor([standing.last_action]),
+            row=torch.zeros(1, dtype=torch.long),
+            observation={name: value[None] for name, value in past.now.items()},
+            told={name: mask[None] for name, mask in last.items()},
+        )
+        beliefs, index = standing.before.after(looks)
+        belief = beliefs.mean[index].expand(2, 1, -1)
+        planned = person.act(belief, human.action_values(belief))
+        for draw in planned[:, 0]:
+            torch.testing.assert_close(draw, expected[0, number, past.time], rtol=1e-4, atol=1e-5)
 
 
 def test_who_acts_on_what_they_are_told_is_told(generator):
@@ -143,9 +138,9 @@ def test_what_the_setting_shows_anyway_can_be_told(generator):
     domain = human.domain
     now = domain.observe(domain.initial(1, generator))
     told = {name: torch.zeros_like(mask) for name, mask in domain.communicable(now).items()}
-    silent, _ = human.look({}, None, now, told, 0)
+    silent, _ = human.perceive({}, None, now, told, 0)
     told["visual"] = domain.sought(now)
-    shown, _ = human.look({}, None, now, told, 0)
+    shown, _ = human.perceive({}, None, now, told, 0)
     difference = human.evidence(shown, now) - human.evidence(silent, now)
     apart = (human.networks.weights["input"][0] - difference).abs().sum(-1)
     assert difference.abs().sum() > 0

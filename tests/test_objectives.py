@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
+from example_course import beliefs_of, gone_through
 from example_person import (
     CHANNELS,
     DOMAIN,
@@ -34,6 +35,7 @@ from mirror_ppl.domains.base import total_reward
 from mirror_ppl.domains.driving import CARS, DrivingState
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.course import perceived
 
 ACTIONS = len(DOMAIN.actions)
 
@@ -88,9 +90,8 @@ def chances(model, draw, past, told):
     observation = {name: value[None, :steps] for name, value in now.observation.items()}
     masks = {name: mask[None] for name, mask in now.told.items()}
     eyes = {name: value[0] for name, value in draw.items() if not value.is_floating_point()}
-    belief = model.believe(model.perceive(eyes, observation, masks), observation, now.actions[None])
-    values = self_model().action_values(belief)
-    return model.act(draw, belief[None], values[None])[0, 0, -1].exp().tolist()
+    belief = gone_through(model, eyes, observation, masks, now.actions[None])[:, -1:]
+    return model.act(draw, belief, model.action_values(belief))[0, 0].exp().tolist()
 
 
 @torch.no_grad()
@@ -482,13 +483,13 @@ def told_belief(draw, past, told):
     eyes = {name: value[0] for name, value in draw.items() if not value.is_floating_point()}
     now = past.then(CHANNELS.split(told), 0, past.now)
     observation = {name: value[None, :-1] for name, value in now.observation.items()}
-    view = human().perceive(eyes, observation, {name: m[None] for name, m in now.told.items()})
+    view = perceived(human(), eyes, observation, {n: mask[None] for n, mask in now.told.items()})
     evidence = human().evidence(view, observation)[0, -1]
     before, last = torch.zeros(self_model().latent), torch.tensor(ACTIONS)
     if past.time:
-        before = human().believe(view, observation, now.actions[None])[0, -2]
+        before = beliefs_of(human(), view, observation, now.actions[None])[0, -2]
         last = past.actions[-1]
-    return human().advance(before, evidence, last)
+    return human().believe(before, evidence, last)
 
 
 @torch.no_grad()
@@ -522,8 +523,8 @@ def test_models_without_a_density_are_refused(generator):
     with pytest.raises(HumanModelError) as error:
         Divergence().at(Standing.of(Person(model, implants(2, model)), past), 5, 0)
     assert str(error.value) == (
-        "Averaging is not stepwise, and its beliefs have no density to compare; see "
-        "HumanModel.stepwise"
+        "beliefs of Averaging have no density like the robot's, which mirror-kl compares: its "
+        "believe returns no Gaussian, or one of another size"
     )
 
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from example_person import Averaging
 
 from mirror_ppl.communication import Person
 from mirror_ppl.data import asset_path, load_demonstrations
@@ -65,10 +66,9 @@ def test_what_is_known_before_the_first_round_is_the_prior(human, network, round
     assert online.rounds == 0
 
 
-@pytest.mark.parametrize("stepwise", [True, False])
-def test_rounds_may_be_of_different_lengths(human, rounds, stepwise):
+@pytest.mark.parametrize("kind", [HumanModel, Averaging])
+def test_rounds_may_be_of_different_lengths(human, rounds, kind):
     """As if the shorter one had been padded to the length of the others."""
-    kind = type("Own", (HumanModel,), {"stepwise": stepwise})
     own = kind(human.self_model)
     variables = rounds.variables()
     variables["length"] = torch.tensor([[15, 7, 15, 15]])

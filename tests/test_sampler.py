@@ -68,14 +68,14 @@ def exact(table):
 
     By conjugacy: actions are throws of two coins, given the reach.
     """
-    seen = table.belief[0, :, :, 0] > 0  # [N, T']
+    seen = table.belief[0, :, 0] > 0  # [N]
     evenness = torch.linspace(EVEN[0] - 6 * EVEN[1], EVEN[0] + 6 * EVEN[1], 4001).double().exp()
     prior = dist.LogNormal(*torch.tensor(EVEN).double()).log_prob(evenness) + evenness.log()
     evidence, rates = [], []
     for combination in range(table.index.shape[-1]):
         moments = table.moments[0, table.index[0, :, combination]]
         moments = moments[moments >= 0]
-        near, second = seen.flatten()[moments], table.acted.flatten()[moments] == 1
+        near, second = seen[moments], table.acted[0, moments] == 1
         one, two = (second & near).sum(), (~second & near).sum()
         three, four = (second & ~near).sum(), (~second & ~near).sum()
         own = prior + beta(evenness + one, evenness + two) - beta(evenness, evenness)
@@ -238,12 +238,12 @@ def test_priors_that_hang_on_other_sites_count_as_they_are(toy, table, kind, nam
     """Half of the prior is Beta(1, 1) and half Beta(60, 60): the posterior by conjugacy."""
     human = kind(toy.self_model)
     assert dependent_sites(human, scalar_sites(human)) == ()
-    seen = table.belief[0, :, :, 0] > 0
+    seen = table.belief[0, :, 0] > 0
     evidence = torch.zeros(2, table.index.shape[-1]).double()
     for combination in range(table.index.shape[-1]):
         moments = table.moments[0, table.index[0, :, combination]]
         moments = moments[moments >= 0]
-        near, second = seen.flatten()[moments], table.acted.flatten()[moments] == 1
+        near, second = seen[moments], table.acted[0, moments] == 1
         one, two = (second & near).sum(), (~second & near).sum()
         three, four = (second & ~near).sum(), (~second & ~near).sum()
         a, b = RATES["otherwise"]

@@ -22,6 +22,7 @@ from mirror_ppl.domains.rescue_house import (
 from mirror_ppl.domains.search_rescue import UTTERANCES, RescueState, SearchRescue
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import check_contract
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.training_views import draw_views
@@ -411,7 +412,7 @@ def test_a_person_sees_as_far_as_their_radius_and_remembers():
         "sight_radius": torch.tensor([smoke, everything, smoke]),
         "assumes_open": torch.tensor([0, 0, 1]),
     }
-    view = human.perceive(implants, observation, told)
+    view = perceived(human, implants, observation, told)
     assert view.visible["visual"].shape == (3, steps, 9)
     assert view.visible["verbal"].shape == (3, steps, 5)
     assert not any(mask[:2].any() for mask in view.taken.values())

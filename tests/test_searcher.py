@@ -6,10 +6,12 @@ from itertools import permutations
 import pyro
 import pytest
 import torch
+from example_course import beliefs_of
+from example_person import beliefs_before
 from pyro import poutine
 
 from mirror_ppl.communication import Person, RoundSoFar
-from mirror_ppl.communication.minds import Looks, StepwiseBeliefs
+from mirror_ppl.communication.minds import Looks
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
@@ -21,6 +23,7 @@ from mirror_ppl.inference.summary import summarize
 from mirror_ppl.inference.views import rounds_of
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.attention import Proposal, site_probabilities
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.searcher import Searcher
@@ -67,7 +70,7 @@ def test_it_is_the_package_s_own_model_of_bomb_defusal(searcher):
     assert type(load_human_model("mirror", searcher.self_model)) is Searcher
     assert type(load_human_model(None, SelfModel(get_domain("driving")))) is HumanModel
     check_contract(searcher)
-    assert searcher.stepwise and searcher.has_round_latents
+    assert searcher.has_round_latents
 
 
 def test_what_is_looked_for_is_known_of_the_stages_that_were_reached(searcher):
@@ -138,16 +141,16 @@ def test_an_unknown_type_is_taken_for_what_is_guessed(searcher):
     for guess in (0, 1):
         own |= {"guess": torch.tensor([guess]), "reads_type": torch.tensor([0])}
         knowledge = WORLD.nothing_known(1)
-        view, knowledge = searcher.look(own, knowledge, now, nothing, 0)
+        view, knowledge = searcher.perceive(own, knowledge, now, nothing, 0)
         assert view.taken["verbal"].all() and not view.visible["verbal"].any()
         assert view.imagined["verbal"].flatten().tolist() == [guess]
         assert not view.taken["visual"].any()
         # It is believed as if it were told.
         told = {**nothing, "verbal": torch.ones(1, 1, dtype=torch.bool)}
         if guess == int(observation["verbal"][0, 0, 0, 0]):
-            heard, _ = searcher.look(own, WORLD.nothing_known(1), now, told, 0)
+            heard, _ = searcher.perceive(own, WORLD.nothing_known(1), now, told, 0)
             torch.testing.assert_close(searcher.evidence(heard, now), searcher.evidence(view, now))
-        heard, _ = searcher.look(own, knowledge, now, told, 1)
+        heard, _ = searcher.perceive(own, knowledge, now, told, 1)
         assert heard.visible["verbal"].all() and not heard.taken["verbal"].any()
 
 
@@ -159,21 +162,16 @@ def test_beliefs_stay_as_they_are_while_there_is_no_news(searcher):
     own |= {"guess": torch.tensor([1]), "reads_type": torch.tensor([0])}
     told = {"visual": torch.zeros(1, 11, 6).bool(), "verbal": torch.zeros(1, 11, 1).bool()}
     told["verbal"][0, [4, 5]] = True
-    view = searcher.perceive(own, observation, told)
+    view = perceived(searcher, own, observation, told)
     assert view.still is not None
     news = (~view.still[0]).nonzero().flatten().tolist()
     assert news == [0, 2, 4, 6]
-    belief = searcher.believe(view, observation, torch.tensor([[*actions, WAIT]]))[0]
+    belief = beliefs_of(searcher, view, observation, torch.tensor([[*actions, WAIT]]))[0]
     assert (belief[1:] != belief[:-1]).any(-1).nonzero().flatten().tolist() == [1, 3, 5]
-    # The same step by step.
-    state = torch.zeros(1, searcher.self_model.latent)
-    last = torch.tensor([5])
-    for step in range(11):
-        now = {name: value[:, step] for name, value in observation.items()}
-        at = view.map(lambda part: part[:, step])  # noqa: B023 - used at once
-        state = searcher.advance(state, searcher.evidence(at, now), last, at.still).mean
-        torch.testing.assert_close(state[0], belief[step])
-        last = torch.tensor([[*actions, WAIT][step]])
+    # The same by the robot's own networks, of whole rounds.
+    model, done = searcher.self_model, torch.tensor([actions])
+    evidence = searcher.evidence(view, observation) + model.encoder.previous_actions(done)
+    torch.testing.assert_close(model.believe(evidence, view.still)[0], belief)
 
 
 def test_who_is_asked_to_play_searches_for_what_each_stage_shows():
@@ -197,11 +195,11 @@ def test_who_is_asked_to_play_searches_for_what_each_stage_shows():
 
 def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(searcher, monkeypatch):
     """Where the robot would press b, they press ORDERS[rule][b]: values go with the buttons."""
-    values = torch.tensor([0.5, 1.0, 2.0, 3.0, 4.0]).expand(1, 1, 1, 5)
-    belief = torch.zeros(1, 1, 1, 48)
+    values = torch.tensor([0.5, 1.0, 2.0, 3.0, 4.0]).expand(1, 1, 5)
+    belief = torch.zeros(1, 1, 48)
     for kind, rule in ((0, 1), (1, 9)):
         monkeypatch.setattr(
-            searcher, "believed_kind", lambda belief, kind=kind: torch.full((1, 1, 1), float(kind))
+            searcher, "believed_kind", lambda belief, kind=kind: torch.full((1, 1), float(kind))
         )
         some = implants(searcher, lapse=1e-9, consistency=1.0) | {
             **{name: torch.zeros(1, 1, *shape) for name, shape in RESIDUAL.items()},
@@ -284,7 +282,7 @@ def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(searcher):
     eyes |= {"guess": torch.tensor([1, 1]), "reads_type": torch.tensor([0, 0])}
     person.eyes, person.eye, person.eye_count = eyes, torch.arange(2), 2
     rounds = RoundSoFar.begin(WORLD, {name: value[0, 0] for name, value in observation.items()})
-    beliefs, own = StepwiseBeliefs.before(person, rounds)
+    beliefs, own = beliefs_before(person, rounds)
     quiet = {"visual": torch.zeros(2, 6).bool(), "verbal": torch.zeros(2, 1).bool()}
     numbers = []
     for step in range(3):
@@ -292,12 +290,12 @@ def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(searcher):
         now = {name: value[0, step : step + 1] for name, value in observation.items()}
         looks = Looks(own, torch.arange(2), torch.full((2,), last), own * 0, now, quiet)
         beliefs, own = beliefs.after(looks)
-        numbers.append((len(beliefs.courses), own.tolist()))
+        numbers.append((len(beliefs.mean), own.tolist()))
     # One found it at once, the other after a step: as that says other things, they never agree.
     assert [number for number, _ in numbers] == [2, 2, 2]
     # Had both been told, they would have formed it at the same time, and it stays one.
     both = {"visual": torch.ones(2, 6).bool(), "verbal": torch.ones(2, 1).bool()}
-    beliefs, own = StepwiseBeliefs.before(person, rounds)
+    beliefs, own = beliefs_before(person, rounds)
     for step in range(3):
         last = 5 if step == 0 else WAIT
         now = {name: value[0, step : step + 1] for name, value in observation.items()}
@@ -306,7 +304,7 @@ def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(searcher):
         rows, heard = (torch.arange(2), quiet) if step else (own * 0, both)
         looks = Looks(own, torch.arange(2), torch.full((2,), last), rows, two, heard)
         beliefs, own = beliefs.after(looks)
-        assert len(beliefs.courses) == 1
+        assert len(beliefs.mean) == 1
         assert own.tolist() == [0, 0]
 
 

@@ -2,10 +2,12 @@
 
 import pytest
 import torch
+from example_course import beliefs_of, gone_through
 from test_searcher import WORLD, course, implants
 
 from mirror_ppl.domains.bomb_panel import RULES
 from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import check_contract, load_human_model
 from mirror_ppl.models.searcher import RULE, Searcher
 from mirror_ppl.models.self_model import SelfModel
@@ -40,7 +42,7 @@ def test_the_sites_of_each(name, sites, attends, robot):
     human = variant(name, robot)
     check_contract(human)
     assert set(sample_sites(human, 1, 1)) == sites
-    assert human.has_round_latents == attends and human.stepwise
+    assert human.has_round_latents == attends
 
 
 def test_perception_alone_is_mirror_with_the_robot_s_rules_and_no_residual(robot):
@@ -55,10 +57,10 @@ def test_perception_alone_is_mirror_with_the_robot_s_rules_and_no_residual(robot
     told["verbal"][0, 5] = True
     found = []
     for human in (mirror, part):
-        view = human.perceive({name: sites[name][0] for name in sites}, observation, told)
-        belief = human.believe(view, observation, actions)
+        seen = {name: sites[name][0] for name in sites}
+        belief = gone_through(human, seen, observation, told, actions)
         chosen = {name: own[name] for name in own if human is mirror or name in SEARCH | CHOICE}
-        found.append(human.act(chosen, belief[None], human.action_values(belief)[None]))
+        found.append(human.act(chosen, belief, human.action_values(belief)))
     torch.testing.assert_close(*found)
 
 
@@ -67,9 +69,9 @@ def test_policy_alone_sees_all_at_once_and_presses_by_the_rules(robot):
     observation, _ = course([0, 1, 2])
     told = {"visual": torch.zeros(1, 4, 6).bool(), "verbal": torch.zeros(1, 4, 1).bool()}
     for human in (part, plain):
-        view = human.perceive({}, observation, told)
+        view = perceived(human, {}, observation, told)
         assert view.visible["visual"].all() and view.visible["verbal"].all() and not view.taken
-    belief = part.believe(view, observation, torch.zeros(1, 4, dtype=torch.long))[None]
+    belief = beliefs_of(part, view, observation, torch.zeros(1, 4, dtype=torch.long))
     values = part.action_values(belief)
     own = {name: torch.zeros(1, 1) for name in RULES_OF}
     own |= {"consistency": torch.full((1, 1), 3.0), "lapse": torch.full((1, 1), 0.1)}

@@ -55,9 +55,9 @@ def test_who_defuses_bombs_waits_however_long_and_then_presses():
         for _ in range(STAGES):
             for since in range(when + 1):
                 now = world.observe(state)
-                view, knowledge = human.look(own, knowledge, now, told, step)
+                view, knowledge = human.perceive(own, knowledge, now, told, step)
                 evidence = human.evidence(view, now)
-                belief = human.advance(belief, evidence, last, view.still).mean
+                belief = human.believe(belief, evidence, last, view.still).mean
                 chances = torch.softmax(4 * model.action_values(belief), -1)
                 live, symbols = read_panel(now["visual"])
                 symbol = symbols.take_along_dim(live[:, None], -1).squeeze(-1)

@@ -7,6 +7,8 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_course import gone_through
+from example_person import Averaging, Unused
 
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
@@ -22,6 +24,7 @@ from mirror_ppl.inference.views import (
     restricted,
     rounds_of,
 )
+from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
 from mirror_ppl.models.training_views import (
@@ -61,13 +64,13 @@ class Few(HumanModel):
         like = next(self.self_model.parameters())
         return own | policy_implants(self.domain, self.self_model.latent, like)
 
-    def perceive(self, implants, observation, told):
+    def perceive(self, implants, knowledge, observation, told, step):
         known = {
             site: torch.full_like(implants["sight_front_own"], value)
             for site, value in self.KNOWN.items()
         }
         own = {site: implants[site] for site in ("sight_front_own", "assumes_clear")}
-        return super().perceive(known | own, observation, told)
+        return super().perceive(known | own, knowledge, observation, told, step)
 
 
 class Sure(Few):
@@ -77,8 +80,8 @@ class Sure(Few):
         like = next(self.self_model.parameters())
         return policy_implants(self.domain, self.self_model.latent, like)
 
-    def perceive(self, implants, observation, told):
-        return View(self.domain.visibility("fog", observation))
+    def perceive(self, implants, knowledge, observation, told, step):
+        return View(self.domain.visibility("fog", observation)), knowledge
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +123,7 @@ def policies(human, number, people):
 
 
 def log_likelihoods_by_hand(human, rounds, person, number, values, policy):
-    """Of one round ``[M]``: perceive, believe and act for each combination by itself.
+    """Of one round ``[M]``: each combination by itself, one step after the other.
 
     Args:
         values: the discrete implants ``[M]`` by name.
@@ -135,10 +138,9 @@ def log_likelihoods_by_hand(human, rounds, person, number, values, policy):
     result = []
     for one in range(len(next(iter(values.values())))):
         implants = {site: value[one : one + 1] for site, value in values.items()}
-        view = human.perceive(implants, observation, told)
-        belief = human.believe(view, observation, actions)[None]
-        chosen = human.act(policy, belief, human.self_model.action_values(belief))
-        result.append(chosen[0, 0].gather(-1, actions[0, :, None]).sum())
+        belief = gone_through(human, implants, observation, told, actions)
+        chosen = human.act(policy, belief, human.action_values(belief))
+        result.append(chosen[0].gather(-1, actions[0, :, None]).sum())
     return torch.stack(result)
 
 
@@ -154,16 +156,16 @@ def assert_tables_equal(one, other, tolerance=0.0):
 # --- tables of views --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [HumanModel, Few], ids=["own", "few"])
+@pytest.mark.parametrize("kind", [HumanModel, Averaging, Few], ids=["own", "averaging", "few"])
 def test_table_agrees_with_perceive_believe_act(self_model, recordings, kind):
     human, rounds = kind(self_model), ragged(recordings, LENGTHS)
-    number = 9604 if kind is HumanModel else 14
+    number = 14 if kind is Few else 9604
     some = torch.randperm(number)[:28].sort().values
     table = build_view_table(human, rounds, [some] * 3)
     assert table.sites == ((*SIGHTS, *ASSUMED) if number > 14 else (SIGHTS[0], ASSUMED[0]))
     assert math.prod(table.sizes) == table.index.shape[-1] == number
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
-    found = combination_scores(table, human.log_likelihoods(policy, table))
+    found = combination_scores(table, log_likelihoods(human, policy, table))
     axes = torch.unravel_index(some, table.sizes)
     values = dict(zip(table.sites, axes, strict=True))
     for person, lengths in enumerate(LENGTHS):
@@ -206,12 +208,12 @@ def test_no_view_is_kept_twice_or_for_nothing(self_model, recordings):
             moments = table.moments[person, views]
             assert torch.equal(moments != NO_VIEW, steps.expand(len(views), -1))
             real = rounds_actions(recordings, person, number)[steps]
-            assert (table.acted[person].flatten()[moments[:, steps]] == real).all()
+            assert (table.acted[person, moments[:, steps]] == real).all()
             # Different views lead to different beliefs, so none is there twice.
-            beliefs = table.belief[person].flatten(0, 1)[moments[:, steps]].flatten(1)
+            beliefs = table.belief[person, moments[:, steps]].flatten(1)
             assert len(beliefs.unique(dim=0)) == len(views)
         moments = table.moments[person][table.moments[person] != NO_VIEW]
-        used = (moments // table.belief.shape[2]).unique()
+        used = moments.unique()
         assert used.tolist() == list(range(len(used)))
         assert (table.belief[person, max(len(used), 1) :] == 0).all()
 
@@ -228,7 +230,7 @@ def test_values_of_shared_beginnings_are_those_of_the_belief(self_model, recordi
     close = (table.values - expected).abs().amax(-1) < 1e-4
     assert close.shape[1] > 500
     for person in range(2):
-        assert close[person].flatten()[table.moments[person].clamp(min=0)].all()
+        assert close[person, table.moments[person].clamp(min=0)].all()
 
 
 def test_beginnings_are_numbered():
@@ -248,7 +250,7 @@ def test_padding_has_no_influence(self_model, recordings):
 
     def scores(rounds):
         table = build_view_table(human, rounds)
-        return combination_scores(table, human.log_likelihoods(policy, table))
+        return combination_scores(table, log_likelihoods(human, policy, table))
 
     together = scores(rounds)
     for person, lengths in enumerate(LENGTHS):
@@ -286,7 +288,7 @@ def test_scores_are_those_of_the_possible_combinations(self_model, recordings):
     # Of somebody without rounds nothing is given up.
     assert torch.equal(table.possible, alive | ~table.real.any(-1)[:, None])
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
-    likelihoods = human.log_likelihoods(policy, table)
+    likelihoods = log_likelihoods(human, policy, table)
     expected = combination_scores(table, likelihoods)
     found = table.scores(likelihoods)
     for combination in range(14):
@@ -324,7 +326,7 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, rec
     with pyro.plate("way", screening.ways, dim=-3), pyro.plate("person", 1, dim=-2):
         torch.manual_seed(screening.seed)
         ways = human.prior()
-    likelihood = whole.log_likelihoods(human.act(ways, whole.belief, whole.values))
+    likelihood = log_likelihoods(human, ways, whole)
     expected = torch.ones(rounds.num_people, 14, dtype=torch.bool)
     score = torch.zeros(screening.ways, rounds.num_people, 14)
     for number in range(4):
@@ -346,25 +348,20 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, rec
     assert margin < 15 or expected.gather(-1, best).all()
 
 
-class Whole(HumanModel):
-    """The same, but taken for one that acts on whole rounds."""
-
-    stepwise = False
-
-
-def test_a_model_that_is_not_stepwise_has_the_same_likelihoods(self_model, recordings):
+def test_a_memory_that_is_not_used_leaves_the_likelihoods_as_they_are(self_model, recordings):
     rounds, found = ragged(recordings, LENGTHS), []
     some = torch.randperm(9604)[:40].sort().values
     policy = {name: value[0] for name, value in policies(HumanModel(self_model), 1, 1).items()}
-    for kind in (HumanModel, Whole):
+    for kind in (HumanModel, Unused, Averaging):
         human = kind(self_model)
         table = build_view_table(human, rounds, [some] * 3)
-        found.append(combination_scores(table, human.log_likelihoods(policy, table)))
-        assert table.belief.shape[2] == (1 if human.stepwise else STEPS)
-    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-4)
+        found.append(combination_scores(table, log_likelihoods(human, policy, table)))
+        assert table.belief.shape[-1] == human.belief_size
+    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-4)
+    assert (found[0] - found[2]).abs().max() > 0.1
 
 
-@pytest.mark.parametrize("kind", [HumanModel, Whole], ids=["stepwise", "whole"])
+@pytest.mark.parametrize("kind", [HumanModel, Averaging], ids=["own", "averaging"])
 def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordings, kind):
     human, rounds = kind(self_model), ragged(recordings, [[15, 9]])
     resolution = 0.1
@@ -382,7 +379,7 @@ def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordi
             pyro.plate("way", screening.ways, dim=-3),
             pyro.plate("person", 1, dim=-2),
         ):
-            likelihoods = human.log_likelihoods(human.prior(), table)
+            likelihoods = log_likelihoods(human, human.prior(), table)
         scores.append(combination_scores(table, likelihoods)[:, 0])
     torch.testing.assert_close(scores[1], merged.score, rtol=1e-4, atol=1e-3)
     off = (scores[1] - scores[0]).abs().amax(-1)
@@ -391,7 +388,7 @@ def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordi
     assert off.max() > 1e-3 and off[screening.alike :].mean() < 0.5
     assert (tables[1].index != NO_VIEW).all()
     number = [table.belief.shape[1] for table in tables]
-    assert number[1] < (0.3 if human.stepwise else 1.0) * number[0]
+    assert number[1] < 0.3 * number[0]
 
 
 def test_restricted_keeps_what_is_alive_and_forgets_the_rest(self_model, recordings):
@@ -404,7 +401,7 @@ def test_restricted_keeps_what_is_alive_and_forgets_the_rest(self_model, recordi
     scores = {}
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
     for name, part in (("all", table), ("some", small)):
-        scores[name] = combination_scores(part, human.log_likelihoods(policy, part))
+        scores[name] = combination_scores(part, log_likelihoods(human, policy, part))
     assert torch.equal(scores["some"][alive], scores["all"][alive])
     assert (scores["some"][0][~alive[0]] == IMPOSSIBLE).all()
     for person in range(3):
@@ -429,9 +426,9 @@ def test_people_without_discrete_implants_have_one_view_a_round(self_model, reco
 
 def test_perceive_may_only_read_what_can_be_enumerated(self_model, recordings):
     class Dreamer(HumanModel):
-        def perceive(self, implants, observation, told):
+        def perceive(self, implants, knowledge, observation, told, step):
             implants["lapse"]
-            return super().perceive(implants, observation, told)
+            return super().perceive(implants, knowledge, observation, told, step)
 
     message = 'perceive\\(\\) reads "lapse", which is not a discrete site .*sight_front_own'
     with pytest.raises(HumanModelError, match=message):
@@ -445,9 +442,9 @@ def test_too_many_combinations_are_refused(self_model, recordings):
             many = pyro.sample("many", dist.Categorical(torch.ones(size) / size))
             return super().prior() | {"many": many}
 
-        def perceive(self, implants, observation, told):
+        def perceive(self, implants, knowledge, observation, told, step):
             implants["many"]
-            return super().perceive(implants, observation, told)
+            return super().perceive(implants, knowledge, observation, told, step)
 
     message = rf"depends on {14 * (MAX_COMBINATIONS // 14 + 1)} combinations .* at most 100000"
     with pytest.raises(HumanModelError, match=message):
