@@ -397,7 +397,7 @@ class Peeking(ToyHuman):
 
     def act(self, implants, belief, values):
         far = (implants["reach"] > 3)[..., None]
-        seen = torch.where(far[..., None], 1.0, belief)
+        seen = torch.where(far, 1.0, belief)
         return super().act(implants, seen, values)
 
 

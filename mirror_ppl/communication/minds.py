@@ -258,7 +258,7 @@ class Beliefs:
         first, index = distinct_rows(
             torch.cat([torch.stack([looks.parent, looks.action, which], -1), *known], -1)
         )
-        state = human.believe(
+        state = human.infer(
             self.mean[looks.parent[first]],
             evidence[which[first]],
             looks.action[first],

@@ -176,7 +176,6 @@ class _Course:
         self.observation, self.told = observation, told
         like = next(human.parameters())
         self._beliefs = [like.new_zeros(1, human.belief_size)]
-        self._number = 1
         self._known: dict[tuple[int, ...], int] = {}
         # Steps at which the same was done before the same observation are alike to the encoder.
         symbols = human.domain.symbols(observation)
@@ -224,31 +223,36 @@ class _Course:
         """Beliefs ``[n]`` after looks at a step."""
         looks = torch.stack([belief, view.numbers()], -1)
         first, which = distinct_rows(looks)
-        still = None if view.still is None else view.still[first]
-        found, new = [], []
+        still = [False] * len(first) if view.still is None else view.still[first].tolist()
+        keys, new = [], {}
         for place, (before, seen) in enumerate(looks[first].tolist()):
-            if still is not None and still[place]:
-                found.append(before)
-                continue
-            key = (before, seen, self._observed[step], self._done[step])
-            if key not in self._known:
-                self._known[key] = self._number
-                self._number += 1
-                new.append(place)
-            found.append(self._known[key])
+            # Where nothing came up, evidence does not count.
+            shown = () if still[place] else (seen, self._observed[step])
+            keys.append((before, self._done[step], *shown))
+            if keys[-1] not in self._known:
+                new.setdefault(keys[-1], place)
         if new:
-            some = first[new]
-            observation = {
-                name: value[:, step].expand(len(some), *value.shape[2:])
-                for name, value in self.observation.items()
-            }
-            evidence = self.human.evidence(view.map(lambda part: part[some]), observation)
-            before = torch.cat(self._beliefs)
-            self._beliefs = [before]
-            action = torch.full_like(some, self._done[step])
-            after = self.human.belief_after(before[belief[some]], evidence, action)
-            self._beliefs.append(after)
-        return torch.tensor(found, device=belief.device)[which]
+            some = first[torch.tensor(list(new.values()), device=first.device)]
+            found = self._inferred(belief[some], view.map(lambda part: part[some]), step)
+            self._known.update(zip(new, found.tolist(), strict=True))
+        places = [self._known[key] for key in keys]
+        return torch.tensor(places, device=belief.device)[which]
+
+    def _inferred(self, belief: Tensor, view: View, step: int) -> Tensor:
+        """New beliefs ``[n]`` after others, or the same ones where nothing came up."""
+        observation = {
+            name: value[:, step].expand(len(belief), *value.shape[2:])
+            for name, value in self.observation.items()
+        }
+        evidence = self.human.evidence(view, observation)
+        every = torch.cat(self._beliefs)
+        action = torch.full_like(belief, self._done[step])
+        after = self.human.belief_after(every[belief], evidence, action, view.still)
+        other = torch.ones_like(belief, dtype=torch.bool)
+        if view.still is not None:
+            other = ~view.still | (after != every[belief]).any(-1)
+        self._beliefs = [every, after[other]]
+        return torch.where(other, len(every) - 1 + other.cumsum(0), belief)
 
     def moments(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
         """Beliefs ``[N, Z]`` and actions ``[N]`` of the moments with these numbers."""

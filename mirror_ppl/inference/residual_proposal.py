@@ -80,7 +80,9 @@ class ResidualProposal:
             implants = self.human.prior()
             without = self.human.act(implants, self.belief, self.values)
         without = without.expand(number, *without.shape[1:])[:, 0]  # [S, N, A]
-        features = implant_priors.residual_features(implants, self.belief)[:, 0]  # [S, N, R]
+        # A larger belief begins with the robot's own.
+        belief = self.belief[..., : self.human.self_model.latent]
+        features = implant_priors.residual_features(implants, belief)[:, 0]  # [S, N, R]
         scale = trace.trace.nodes[SITE]["fn"].base_dist.scale.flatten()[0]
         return _laplace(without, features, self.counts, scale)
 

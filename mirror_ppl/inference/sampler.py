@@ -297,7 +297,8 @@ class Sampler:
     ) -> None:
         self._policies.append(policy)
         self._joints.append(joint)
-        self._corrections.append(log_correction(self.human, self._perceived, policy, 1)[:, 0])
+        found = log_correction(self.human, self._perceived, policy, 1)[:, 0]
+        self._corrections.append(found.expand(len(joint)))
         self.place = torch.cat([self.place, place])
         groups = []
         for names in (self.sites, self.supports):

@@ -85,7 +85,7 @@ class HumanModel(nn.Module):
 
     @property
     def belief_size(self) -> int:
-        """Z, the size of beliefs."""
+        """Z, the size of beliefs; larger ones begin with the robot's own."""
         return self.self_model.latent
 
     def action_values(self, belief: Tensor) -> Tensor:
@@ -274,7 +274,8 @@ class HumanModel(nn.Module):
             belief: of the step before ``[..., Z]``; zero before the first.
             evidence: of this step ``[..., H]``, from :meth:`evidence`.
             action: what was done in between ``[...]``; the number of actions if nothing was.
-            still: where nothing came up and the mean stays ``[...]``, see :class:`View`.
+            still: where nothing came up and the mean stays ``[...]``, see :class:`View`; evidence
+                is 0 there.
         """
         encoder = self.self_model.encoder
         state = encoder(belief, evidence + encoder.action(action))
@@ -286,8 +287,16 @@ class HumanModel(nn.Module):
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
     ) -> Tensor:
         """The belief ``[..., Z]`` itself; arguments as of :meth:`believe`."""
-        found = self.believe(belief, evidence, action, still)
+        found = self.infer(belief, evidence, action, still)
         return found.mean if isinstance(found, Gaussian) else found
+
+    def infer(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
+    ) -> Gaussian | Tensor:
+        """What :meth:`believe` returns; it is not shown evidence where nothing came up."""
+        if still is not None:
+            evidence = torch.where(still[..., None], 0.0, evidence)
+        return self.believe(belief, evidence, action, still)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of actions at one step, ``[..., P, B, A]``.

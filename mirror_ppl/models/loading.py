@@ -208,6 +208,7 @@ def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
         found = human.act(implants, belief, human.action_values(belief))
     for name in latent_sites(trace.trace):
         raise HumanModelError(f'act samples "{name}" at every step; sample it in prior')
+    _refuse_parameters(trace.trace)
     expected = (len(belief), 1, len(human.domain.actions))
     if tuple(found.shape[-3:]) != expected:
         raise HumanModelError(
@@ -223,20 +224,18 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
     """What differs from round to round, in one round of each ``[people]``."""
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
         returned = human.round_latents(implants)
-    for name, site in trace.trace.nodes.items():
-        if not returned and site["type"] == "sample" and not site_is_subsample(site):
-            raise HumanModelError(
-                f'round_latents has "{name}", but no site that differs from round to round: put it '
-                "into prior"
-            )
     sites = latent_sites(trace.trace)
     if not isinstance(returned, Mapping) or set(returned) != set(sites):
         raise HumanModelError(
             "round_latents has to return a dict of the sites that it samples, by name"
         )
     for name, site in trace.trace.nodes.items():
-        if site["type"] == "param":
-            raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
+        if not sites and site["type"] == "sample" and not site_is_subsample(site):
+            raise HumanModelError(
+                f'round_latents has "{name}", but no site that differs from round to round: put it '
+                "into prior"
+            )
+    _refuse_parameters(trace.trace)
     for name, site in sites.items():
         if not site["fn"].support.is_discrete:
             raise HumanModelError(f'"{name}" of round_latents is not discrete')
@@ -264,11 +263,15 @@ def _check_names(domain: Domain, sites: Iterable[str]) -> None:
             )
 
 
-def _check_sites(trace: poutine.Trace, people: int) -> None:
-    """Refuse what could be sampled, but not inferred."""
+def _refuse_parameters(trace: poutine.Trace) -> None:
     for name, site in trace.nodes.items():
         if site["type"] == "param":
             raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
+
+
+def _check_sites(trace: poutine.Trace, people: int) -> None:
+    """Refuse what could be sampled, but not inferred."""
+    _refuse_parameters(trace)
     for name, site in latent_sites(trace).items():
         fn = site["fn"]
         if fn.support.is_discrete and not fn.has_enumerate_support:

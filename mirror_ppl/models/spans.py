@@ -37,7 +37,7 @@ def check_spans(spans: Mapping[str, Span], sizes: Mapping[str, int], steps: int)
     """
     if set(spans) != set(sizes):
         raise HumanModelError(
-            f"spans has to be of the sites of attend, {', '.join(sizes)}; not of "
+            f"spans has to be of the sites of round_latents, {', '.join(sizes)}; not of "
             f"{', '.join(spans) or 'none'}"
         )
     begin = 0
