@@ -129,7 +129,7 @@ def _ending(error: BaseException) -> tuple[int, str] | None:
     """Exit status and line of an exception; None of a mistake of the code."""
     if isinstance(error, MirrorError):
         text = " ".join(str(error).split()) or type(error).__name__
-        return EXIT_BAD_INPUT, f"error: {text}"
+        return EXIT_BAD_INPUT, f"error: {_printable(text)}"
     if isinstance(error, _Terminated):
         return EXIT_TERMINATED, "terminated"
     if isinstance(error, KeyboardInterrupt):
@@ -137,13 +137,18 @@ def _ending(error: BaseException) -> tuple[int, str] | None:
     if isinstance(error, BrokenPipeError):  # as in `... | head`
         return EXIT_BROKEN_PIPE, ""
     if passed_user_code(error):
-        return EXIT_BAD_INPUT, f"error: {describe(error)}"
+        return EXIT_BAD_INPUT, f"error: {_printable(describe(error))}"
     if isinstance(error, OSError) and error.errno in NO_ROOM:
         where = f": {error.filename}" if error.filename else ""
         return EXIT_BAD_INPUT, f"error: cannot write: {error.strerror or error}{where}"
     if isinstance(error, MemoryError) or any(sign in str(error) for sign in NO_MEMORY):
         return EXIT_BAD_INPUT, f"error: there is too little memory {' '.join(str(error).split())}"
     return None
+
+
+def _printable(text: str) -> str:
+    """A text without what would change a terminal."""
+    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
 
 
 class _Terminated(KeyboardInterrupt):

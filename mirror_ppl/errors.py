@@ -36,8 +36,13 @@ def shown(value: Any) -> str:
 
 
 def is_name(value: object) -> bool:
-    """Whether a value can be a name: printable text of at most 100 characters, not empty."""
-    return isinstance(value, str) and value.isprintable() and 0 < len(value) <= MOST_CHARACTERS
+    """Whether a value can be a name: printable text of at most 100 characters, not empty.
+
+    Without spaces at its ends, which nobody sees.
+    """
+    if not isinstance(value, str) or value.strip() != value:
+        return False
+    return value.isprintable() and 0 < len(value) <= MOST_CHARACTERS
 
 
 class MirrorError(Exception):

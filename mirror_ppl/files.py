@@ -346,6 +346,8 @@ def _held(path: Path) -> BinaryIO | None:
                 return file
         except BaseException:
             file.close()
+            with suppress(OSError):
+                path.unlink()
             raise
         file.close()
 

@@ -67,8 +67,8 @@ class Options:
     prior_from: Path | None = None
     """A posterior.nc of --pooling partial, whose population is the prior of these people."""
     allow_contradictions: str = "0%"
-    """Share of steps whose action may contradict the next observation, such as 2%: for recordings
-    of noisy rigs. The summary counts them."""
+    """Percentage of steps whose action may contradict the next observation, such as 2%: for
+    recordings of noisy rigs. The summary counts them."""
     explore: int = 8
     """Rounds that the model plays in each scenario, to say which would tell more of what people
     see; 0 leaves it out."""

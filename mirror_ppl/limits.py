@@ -63,7 +63,8 @@ def share(text: str, option: str) -> float:
         OptionError: it is none; says what is expected.
     """
     try:
-        percent = float(text.strip().removesuffix("%"))
+        # A number alone might be meant as a share.
+        percent = float(text.strip().removesuffix("%")) if "%" in text or text == "0" else nan
     except ValueError:
         percent = nan
     if not 0 <= percent <= 100:  # noqa: PLR2004 - per cent

@@ -84,13 +84,13 @@ def test_what_fits_is_not_refused(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("0%", 0), ("2.5%", 0.025), ("100", 1), (" 3 % ", 0.03)]
+    ("text", "value"), [("0%", 0), ("2.5%", 0.025), ("100%", 1), ("0", 0), (" 3 % ", 0.03)]
 )
 def test_shares(text, value):
     assert share(text, "--share") == value
 
 
-@pytest.mark.parametrize("text", ["", "%", "nan", "-1%", "101%", "inf", "a"])
+@pytest.mark.parametrize("text", ["", "%", "nan", "0.04", "4", "-1%", "101%", "inf", "a"])
 def test_what_is_no_share(text):
     with pytest.raises(OptionError, match="--share must be from 0% to 100%, such as 2.5%, not "):
         share(text, "--share")

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from matplotlib.text import Text
 from running import command
 
 from mirror_ppl import compare, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations, to_dataset
+from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.plots.picture import Picture, displayable, label_of
 
 STRANGE = (
@@ -20,7 +22,7 @@ STRANGE = (
     "\u5c71\u7530",
     "n" * 100,
 )
-REFUSED = ("two\nlines", "tab\t", "n" * 101, "", "\ud800")
+REFUSED = ("two\nlines", "tab\t", "n" * 101, "", " ", "ana ", "\ud800")
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +62,14 @@ def test_other_ids_are_refused_at_load(some, tmp_path, capsys, name):
     assert line.startswith(f"error: {tmp_path / 'some.nc'}: ") and line.count("\n") == 1
     assert len(line) < 300 + len(str(tmp_path))
     assert not (tmp_path / "out").exists()
+
+
+def test_ids_that_are_no_text_are_refused(some, tmp_path):
+    for ids in (np.arange(8.0), np.arange(8).astype("datetime64[D]")):
+        dataset = to_dataset(some).assign_coords(person=("person", ids))
+        dataset.to_netcdf(tmp_path / "some.nc", engine="scipy")
+        with pytest.raises(DemonstrationsError, match="person has ids of the dtype .*, expected"):
+            load_demonstrations(tmp_path / "some.nc")
 
 
 def test_pictures_show_text_as_it_is():

@@ -343,9 +343,15 @@ class OfOthers(HumanModel):
         return implants
 
 
+class NotANumber(HumanModel):
+    def act(self, implants, belief, values):
+        return super().act(implants, belief, values) * torch.nan
+
+
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
+        (NotANumber, "NotANumber.act returns nan"),
         (Own, r"Own overrides model\(\) or choose\(\), which cannot be compiled; override prior"),
         (OfOthers, '"questionnaire" has a log density of shape'),
     ],

@@ -2,6 +2,8 @@
 
 import math
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from example_person import Averaging
@@ -13,6 +15,7 @@ from mirror_ppl.inference.guides import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import sight_sites
+from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
@@ -97,3 +100,25 @@ def test_people_are_not_mixed(human, network):
     two = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([0, 1])
     with pytest.raises(ValueError, match="of 2 people, not one"):
         OnlinePosterior(human, network).add(two)
+
+
+def test_the_rounds_of_somebody_else_are_refused(human):
+    two = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0])
+    online = OnlinePosterior(human)
+    online.add(two.select_people([0]))
+    with pytest.raises(ValueError, match="rounds are of 'person-02', those before of 'person-01'"):
+        online.add(two.select_people([1]))
+
+
+def test_a_network_of_another_model_is_refused(human, network):
+    other = Averaging(human.self_model)
+    OnlinePosterior(other, network)  # whose implants are the same
+    toy = ToyHuman(human.self_model)
+    for given in (toy, LatePrior(human.self_model)):
+        with pytest.raises(ValueError, match="the network is for another human model than"):
+            OnlinePosterior(given, network)
+
+
+class LatePrior(HumanModel):
+    def prior(self):
+        return super().prior() | {"late": pyro.sample("late", dist.Beta(1.0, 4.0))}

@@ -75,7 +75,7 @@ def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contrad
     if found.share > allowed:
         number, steps = sum(found.contradicting.values()), sum(found.steps.values())
         message = f"{_first(demonstrations, wrong)}; {number} of {steps} steps "
-        message += f"({found.share:.1%}) contradict the next observation, {allowed:.1%} may"
+        message += f"({found.share:.1%}) contradict the next observation, {100 * allowed:.3g}% may"
         raise DemonstrationsError(message + _shifted(demonstrations, wrong))
     return found
 

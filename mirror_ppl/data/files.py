@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mirror_ppl.checks import as_path
+from mirror_ppl.checks import as_path, require_kind
 from mirror_ppl.data import schema
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.data.provenance import DESCRIPTION, RESERVED
@@ -53,7 +53,8 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrat
     Raises:
         OutputError: the file cannot be written.
     """
-    dataset = to_dataset(demonstrations)
+    path = as_path(path)
+    dataset = to_dataset(require_kind(demonstrations, Demonstrations, "demonstrations"))
     packed = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
     encoding = {str(name): packed for name in dataset.data_vars}
     return write_whole(path, dataset.to_netcdf(engine="h5netcdf", encoding=encoding))
@@ -161,6 +162,9 @@ def from_dataset(
         # Where rounds of different lengths are put together, absent ones easily become nan.
         variables["length"] = variables["length"].nan_to_num(0)
     if "person" in dataset.coords:
+        kind = dataset["person"].dtype
+        if kind.kind not in "OSUiub":
+            raise DemonstrationsError(f"person has ids of the dtype {kind}, expected text")
         people = _texts(dataset["person"])
     else:
         people = map(str, range(dataset.sizes.get("person", 0)))

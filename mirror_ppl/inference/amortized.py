@@ -26,6 +26,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor, nn
 
+from mirror_ppl.errors import InputError
 from mirror_ppl.inference.alike import Alike
 from mirror_ppl.inference.sampler import Sampler, Weighted, places, scalar_sites
 from mirror_ppl.inference.sightings import Screening, Sightings
@@ -165,6 +166,23 @@ def reference_places(human: HumanModel) -> Tensor:
     """Places ``[W, D]`` of the ways that evidence is about; always the same of a human model."""
     sightings = Sightings(human, guide_screening())
     return places(scalar_sites(human), sightings.draw_ways())
+
+
+def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:
+    """Refuse networks that were trained for another human model.
+
+    Raises:
+        InputError: this is one.
+    """
+    own = AmortizedGuide(reference_places(human))
+    device = network.ways.device
+    if network.ways.shape != own.ways.shape or not torch.allclose(
+        network.ways, own.ways.to(device), atol=1e-3
+    ):
+        raise InputError(
+            f"the network is for another human model than {type(human).__name__} in "
+            f"{human.domain.name}; see load_guide"
+        )
 
 
 @torch.no_grad()

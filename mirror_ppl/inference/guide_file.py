@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from mirror_ppl.checks import require_kind
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import AssetError
 from mirror_ppl.files import json_text
@@ -66,6 +67,7 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
         AssetError: the file is missing or damaged, or is for another human model, self-model,
             domain or version of it.
     """
+    require_kind(human, HumanModel, "human")
     metadata, tensors = read_tensors(path, {FORMAT: "guide"})
     for name, own in (
         ("domain", human.domain.name),

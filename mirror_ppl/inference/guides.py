@@ -29,7 +29,12 @@ from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, w
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.errors import InputError, UnknownNameError
-from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
+from mirror_ppl.inference.amortized import (
+    AmortizedGuide,
+    guide_screening,
+    require_network_of,
+    sample_amortized,
+)
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.nuts import sample_nuts
 from mirror_ppl.inference.pooling import POOLINGS, Pooling, Population
@@ -39,6 +44,7 @@ from mirror_ppl.inference.second_look import LIKELY_DRAWS, looks_twice, rough, s
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
 from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import fingerprint
 
@@ -103,8 +109,10 @@ class InferenceOptions:
             raise UnknownNameError.of("guide", self.guide, GUIDES)
         if self.pooling not in POOLINGS:
             raise UnknownNameError.of("pooling", self.pooling, POOLINGS)
-        object.__setattr__(self, "draws", whole_number(self.draws, "draws", 1))
+        object.__setattr__(self, "draws", whole_number(self.draws, "draws", *LIMITS["draws"]))
         object.__setattr__(self, "refine", whole_number(self.refine, "refine", 0))
+        if self.screening is not None:
+            require_kind(self.screening, Screening, "screening")
         share = real_number(self.allow_contradictions, "allow_contradictions", 0, 1)
         object.__setattr__(self, "allow_contradictions", share)
         if self.refine and self.guide not in ("amortized", "exact"):
@@ -148,7 +156,7 @@ def infer(
         check_world(demonstrations, options.allow_contradictions)
     seed = seed_number(seed)
     if network is not None:
-        require_kind(network, AmortizedGuide, "network")
+        require_network_of(human, require_kind(network, AmortizedGuide, "network"))
     if population is not None:
         require_kind(population, Population, "population")
     if checkpoint is not None:

@@ -11,7 +11,12 @@ from mirror_ppl.checks import real_number, require_kind, seed_number, whole_numb
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.amortized import AmortizedGuide, guide_screening, sample_amortized
+from mirror_ppl.inference.amortized import (
+    AmortizedGuide,
+    guide_screening,
+    require_network_of,
+    sample_amortized,
+)
 from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
 from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.recorded import check_rounds
@@ -19,6 +24,7 @@ from mirror_ppl.inference.sampler import Weighted, scalar_sites
 from mirror_ppl.inference.second_look import Round, looks_twice, rough, second_look
 from mirror_ppl.inference.sightings import Screening, Sightings
 from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
 
 ENOUGH = 64.0
@@ -42,6 +48,7 @@ class OnlinePosterior:
             than through beliefs.
 
     Attributes:
+        person: whose rounds they are; ``None`` before the first.
         pareto_k: of the importance weights at the last asking; above 0.7 they are not to be relied
             on.
         seconds: that adding took the last time, and asking.
@@ -56,6 +63,9 @@ class OnlinePosterior:
     ) -> None:
         self.human = require_kind(human, HumanModel, "human")
         self.network = None if network is None else require_kind(network, AmortizedGuide, "network")
+        if self.network is not None:
+            require_network_of(human, self.network)
+        self.person: str | None = None
         self.seed = seed_number(seed)
         self.allow_contradictions = real_number(allow_contradictions, "allow_contradictions", 0, 1)
         self._rounds: list[Round] = []
@@ -79,11 +89,16 @@ class OnlinePosterior:
             demonstrations: of one person, of any number of rounds.
 
         Raises:
-            InputError: they are no demonstrations, of more than one person, or of another domain.
+            InputError: they are no demonstrations, of more than one person, of another person than
+                those before, or of another domain.
             DemonstrationsError: they cannot be in the domain's world.
         """
         check_rounds(self.human, demonstrations, people=1)
         check_world(demonstrations, self.allow_contradictions)
+        (person,) = demonstrations.people
+        if self.person not in (None, person):
+            raise InputError(f"the rounds are of {person!r}, those before of {self.person!r}")
+        self.person = person
         began = monotonic()
         if int(demonstrations.round_counts[0]):
             for one_round in rounds_of(demonstrations, 0):
@@ -98,7 +113,7 @@ class OnlinePosterior:
             InputError: the number is none, or there was no round yet; see
                 :func:`mirror_ppl.inference.prior.draw_prior`.
         """
-        number = whole_number(number, "number", 1)
+        number = whole_number(number, "number", *LIMITS["draws"])
         if not self.rounds:
             raise InputError(
                 "there was no round yet; what is known is the prior: expected one round or more"

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.combinations import perceived_sites
 from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.prior import checked_draws
@@ -148,6 +149,8 @@ def predict_rounds(
         ]
         table = build_view_table(human, recorded, candidates, likely=own, values=PREDICTED_VALUES)
         parts.append(predict_actions(human, table, own))
+        if bool(parts[-1].isnan().any()):
+            raise HumanModelError(f"{type(human).__name__}.act returns nan")
         del table
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 

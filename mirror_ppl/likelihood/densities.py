@@ -175,6 +175,8 @@ def choices(
             check_plates(name, log_prob(node), belief.shape[-3], belief.shape[-2])
     each = [log_prob(node) for node in nodes.values()]
     total = each[0] if len(each) == 1 else torch.stack(torch.broadcast_tensors(*each)).sum(0)
+    if bool(total.isnan().any()):
+        raise HumanModelError(f"{type(human).__name__}.act returns nan")
     return nodes[ACTION]["fn"].logits, total
 
 

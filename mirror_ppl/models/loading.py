@@ -96,7 +96,8 @@ def load_human_model(
         )
     path = Path(path_text)
     if not os.path.isfile(path):
-        raise HumanModelError(f"{path}: there is no such file")
+        there = "is not a regular file" if os.path.exists(path) else "there is no such file"
+        raise HumanModelError(f"{path}: {there}")
     module_name = f"_human_model_{path.stem}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
@@ -132,6 +133,7 @@ def check_contract(human: HumanModel) -> None:
     Raises:
         HumanModelError: a method fails or returns the wrong thing; names the method and the line.
     """
+    require_kind(human, HumanModel, "human")
     domain = human.domain
     device = next(human.parameters()).device
     generator = torch.Generator(device).manual_seed(0)
