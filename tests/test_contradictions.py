@@ -101,7 +101,7 @@ def test_expected_and_found_by_hand():
     )
     assert refused(changed).startswith(
         "person 'person-01', round 0, step 7: after action 1 (switch) the ego lane is expected to "
-        "be 1 at time 8, found 0; 1 of 150 steps (0.7%) contradict the next observation, 0.0% may"
+        "be 1 at time 8, found 0; 1 of 150 steps (0.7%) contradict the next observation, 0% may"
     )
 
 
@@ -160,9 +160,7 @@ def noisy():
 def test_a_share_of_contradictions_may_be_allowed():
     rounds = noisy()
     assert int(rounds.mask.sum()) == 150
-    assert "2 of 150 steps (1.3%) contradict the next observation, 1.0% may" in refused(
-        rounds, 0.01
-    )
+    assert "2 of 150 steps (1.3%) contradict the next observation, 1% may" in refused(rounds, 0.01)
     found = check_world(rounds, 0.02)
     assert found.share == pytest.approx(2 / 150)
     assert set(found.contradicting.values()) == {1}

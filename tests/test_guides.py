@@ -417,7 +417,7 @@ def test_models_whose_views_are_not_enough_are_refused(self_model, recordings):
 def test_guides_that_are_not_there(toy, recordings):
     with pytest.raises(UnknownNameError, match=r'unknown guide "magic"; known: .*exact'):
         InferenceOptions("magic")
-    with pytest.raises(ValueError, match="draws must be at least 1, not 0"):
+    with pytest.raises(ValueError, match="draws must be from 1 to 100000, not 0"):
         InferenceOptions(draws=0)
     with pytest.raises(ValueError, match="needs its network"):
         infer(toy, recordings, InferenceOptions("amortized"), 0)

@@ -566,7 +566,7 @@ def test_models_own_methods_are_called(tmp_path, human, recordings):
         ("mine.py:My-Class", "is not of the form"),
         ("miror", 'perhaps you meant "mirror"'),
         ("nowhere.py:Mine", r"nowhere\.py: there is no such file"),
-        (".:Mine", "there is no such file"),
+        (".:Mine", "is not a regular file"),
         ("mine.txt:Mine", "not a Python file"),
         ("mine.py:Other", r"no class Other derived from .*HumanModel; it has: Mine, Naughty"),
         ("mine.py:pyro", "no class pyro derived from"),

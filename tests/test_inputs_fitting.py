@@ -192,7 +192,8 @@ ONLINE = {
     "network": (lambda: OnlinePosterior(human(), "x"), "the class AmortizedGuide, not 'x'"),
     "seed": (lambda: OnlinePosterior(human(), seed=0.5), "seed must be a whole number, not 0.5"),
     "half a draw": (lambda: OnlinePosterior(human()).draws(2.5), "must be a whole number, not 2.5"),
-    "no draws": (lambda: OnlinePosterior(human()).draws(0), "number must be at least 1, not 0"),
+    "no draws": (lambda: OnlinePosterior(human()).draws(0), "number must be from 1 to 100000"),
+    "endless draws": (lambda: OnlinePosterior(human()).draws(10**12), "must be from 1 to 100000"),
     "no rounds": (lambda: OnlinePosterior(human()).draws(), "no round yet"),
 }
 

@@ -163,8 +163,10 @@ def from_dataset(
         variables["length"] = variables["length"].nan_to_num(0)
     if "person" in dataset.coords:
         kind = dataset["person"].dtype
-        if kind.kind not in "OSUiub":
-            raise DemonstrationsError(f"person has ids of the dtype {kind}, expected text")
+        times = " since " in str(dataset["person"].attrs.get("units"))
+        if kind.kind not in "OSUiub" or times:
+            what = "times" if times else f"the dtype {kind}"
+            raise DemonstrationsError(f"person has ids of {what}, expected text")
         people = _texts(dataset["person"])
     else:
         people = map(str, range(dataset.sizes.get("person", 0)))
