@@ -28,7 +28,7 @@ from mirror_ppl.data import (
 )
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.fitting import split_rounds
+from mirror_ppl.inference.results.fitting import split_rounds
 from mirror_ppl.people import simulate
 
 DOMAINS = ("driving", "search_rescue", "bomb_defusal")

@@ -22,13 +22,13 @@ from benchmarks._damage_weights import OF_WEIGHTS
 from benchmarks._judging import ANOTHER, EQUAL, REFUSED, Verdict, fault_of, measured
 from benchmarks._recording_cases import CANNOT, DOMAINS
 from mirror_ppl.data import asset_path
-from mirror_ppl.inference.guide_file import load_guide
-from mirror_ppl.inference.pooling import Pooling
-from mirror_ppl.inference.population_file import load_population
-from mirror_ppl.inference.posterior_file import load_posterior
+from mirror_ppl.inference.population.pooling import Pooling
+from mirror_ppl.inference.results.population_file import load_population
+from mirror_ppl.inference.results.posterior_file import load_posterior
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training.guide_file import load_guide
 
 Values = Mapping[str, object]
 POOLED = "pooled"

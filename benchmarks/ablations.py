@@ -39,16 +39,16 @@ from mirror_ppl.evaluation.study_report import difference
 from mirror_ppl.evaluation.study_summary import paired
 from mirror_ppl.evaluation.tables import TextTable, page
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.posterior_predictive import predict_rounds
-from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
-from mirror_ppl.inference.summary import predictive, score
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.results.posterior_predictive import predict_rounds
+from mirror_ppl.inference.results.summary import predictive, score
 from mirror_ppl.models.distributions import GaussianChain
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, save_self_model
 from mirror_ppl.progress import Progress
+from mirror_ppl.training.self_model import SelfModelOptions, train_self_model
 
 DOMAIN, SETTING = "driving", "fog"
 DRAWS = 200

@@ -14,11 +14,11 @@ import torch
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.guide_file import load_guide, shipped_guide
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training.guide_file import load_guide, shipped_guide
 
 DRAWS = 4000
 """For distances of marginals."""

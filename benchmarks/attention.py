@@ -15,13 +15,13 @@ from time import perf_counter
 import torch
 from torch import Tensor
 
-from mirror_ppl.inference import sightings
-from mirror_ppl.inference.calibration import prior_people
-from mirror_ppl.inference.exact import log_joints
-from mirror_ppl.inference.prior import Draws, draw_prior
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.inference.calibration.study import prior_people
+from mirror_ppl.likelihood import view_table_builder as builder
+from mirror_ppl.likelihood.enumeration import log_joints
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.models.prior import Draws, draw_prior
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.variants import PerItem
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -45,7 +45,7 @@ def main() -> None:
     recordings = play_rounds(human, people, options.rounds, "fog", generator)
     print("values  kept  ratios  mean  seconds")
     for values, kept in ((64, 64), (256, 256), (512, 512), (512, 96), (1024, 96)):
-        sightings.KEPT = kept
+        builder.KEPT = kept
         found, began = [], perf_counter()
         for person in range(options.people):
             near = _near({name: value[person] for name, value in people.items()}, human, generator)
@@ -77,12 +77,12 @@ def _near(truth: Draws, human: PerItem, generator: torch.Generator) -> Draws:
 
 def _scores(human: PerItem, rounds: list, near: Draws, values: int, again: int) -> Tensor:
     """Log-evidence ``[NEAR]``, with values of attention of their own."""
-    seen = Sightings(human, Screening(), likely=near, values=values)
-    number = sightings._number_of
-    sightings._number_of = lambda recorded: (number(recorded) + again * 7919) % 2**62
+    seen = ViewTableBuilder(human, Screening(), likely=near, values=values)
+    number = builder._number_of
+    builder._number_of = lambda recorded: (number(recorded) + again * 7919) % 2**62
     for one_round in rounds:
         seen.add(*one_round)
-    sightings._number_of = number
+    builder._number_of = number
     table = seen.table()
     policy = {name: value for name, value in near.items() if name not in table.sites}
     return log_joints(human, table, policy)[:, 0].logsumexp(-1)

@@ -33,7 +33,7 @@ from mirror_ppl.communication import (
 )
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.svi import FitOptions, fit_implants
-from mirror_ppl.inference.views import Screening, build_view_table
+from mirror_ppl.likelihood.tables import Screening, build_view_table
 from mirror_ppl.models import HumanModel, SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 

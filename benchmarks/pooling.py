@@ -13,9 +13,9 @@ import argparse
 import torch
 from torch import Tensor
 
-from mirror_ppl.inference.fitting import fit_people, split_rounds
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.pooling import Population
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.population.pooling import Population
+from mirror_ppl.inference.results.fitting import fit_people, split_rounds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate

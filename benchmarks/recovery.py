@@ -17,8 +17,8 @@ from typing import Any
 import torch
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.engines import InferenceOptions
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -23,8 +23,8 @@ from mirror_ppl.communication import RoundSoFar
 from mirror_ppl.evaluation.assistance import PlannerOptions, Truth, play, speaker
 from mirror_ppl.evaluation.assistance_cells import Pairing
 from mirror_ppl.evaluation.oracle import Oracle
-from mirror_ppl.inference.experience import map_state
 from mirror_ppl.people.driving import Drivers
+from mirror_ppl.training.experience import map_state
 
 
 @dataclass(frozen=True)

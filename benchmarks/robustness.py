@@ -12,8 +12,8 @@ import torch
 
 from benchmarks.recovery import row
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.engines import InferenceOptions
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import perceptual_implants, policy_implants, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights

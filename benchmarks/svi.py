@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 from torch.distributions import biject_to
 
-from mirror_ppl.inference.combinations import grid_of, log_priors, perceived_sites
-from mirror_ppl.inference.prior import sample_sites
 from mirror_ppl.inference.svi import continuous_guide, negative_elbo
-from mirror_ppl.inference.views import Screening, build_view_table
+from mirror_ppl.likelihood.combinations import grid_of, log_priors, perceived_sites
+from mirror_ppl.likelihood.tables import Screening, build_view_table
+from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import residual
-from mirror_ppl.models.view_table import ViewTable
+from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate
 

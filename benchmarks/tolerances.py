@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.fitting import Fit, fit_people
-from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.engines import InferenceOptions
 from mirror_ppl.inference.importance import ImportanceOptions
-from mirror_ppl.inference.views import Screening
+from mirror_ppl.inference.results.fitting import Fit, fit_people
+from mirror_ppl.likelihood.tables import Screening
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -22,7 +22,7 @@ from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
     from mirror_ppl.evaluation.assistance import Played
-    from mirror_ppl.inference.posterior_file import PosteriorFile
+    from mirror_ppl.inference.results.posterior_file import PosteriorFile
 
 FAR_BELOW = -10
 """Ways from silence to the oracle of which less is told."""
@@ -243,7 +243,7 @@ def _outputs(options: Options) -> list[Path]:
 def _people(options: Options):
     """The posterior, and what its people were simulated with."""
     from mirror_ppl.domains import get_domain, require_known
-    from mirror_ppl.inference.posterior_file import load_posterior
+    from mirror_ppl.inference.results.posterior_file import load_posterior
     from mirror_ppl.people import PEOPLE
 
     if options.domain is not None:

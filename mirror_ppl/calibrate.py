@@ -16,8 +16,8 @@ from mirror_ppl.progress import Progress
 if TYPE_CHECKING:
     from mirror_ppl.data import Demonstrations
     from mirror_ppl.inference.amortized import AmortizedGuide
-    from mirror_ppl.inference.guides import InferenceOptions, Inferred
-    from mirror_ppl.inference.ranks import Calibration
+    from mirror_ppl.inference.calibration.ranks import Calibration
+    from mirror_ppl.inference.engines import InferenceOptions, Inferred
     from mirror_ppl.models.human import HumanModel
 
 PROGRAM = "python -m mirror_ppl.calibrate"
@@ -87,12 +87,13 @@ def main(options: Options) -> int:
     from mirror_ppl.data import asset_path, load_demonstrations
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.files import output_folder, write_together
-    from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
-    from mirror_ppl.inference.guide_file import network_for
-    from mirror_ppl.inference.guides import GUIDES, InferenceOptions, run_identity
-    from mirror_ppl.models.loading import check_contract, load_human_model
+    from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
+    from mirror_ppl.inference.engines import GUIDES, InferenceOptions, run_identity
+    from mirror_ppl.likelihood.contract import check_contract
+    from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
+    from mirror_ppl.training.guide_file import network_for
 
     if options.guide not in GUIDES:
         raise UnknownNameError.of("guide", options.guide, GUIDES)
@@ -144,7 +145,7 @@ def _infer(
     recordings: Demonstrations,
     seed: int,
 ) -> Inferred:
-    from mirror_ppl.inference.guides import infer
+    from mirror_ppl.inference.engines import infer
 
     return infer(human, recordings, options, seed, network)
 

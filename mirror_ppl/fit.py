@@ -105,18 +105,19 @@ def main(options: Options) -> None:
     from mirror_ppl.domains import get_domain
     from mirror_ppl.evaluation.fit_report import show_fit
     from mirror_ppl.files import json_text, output_folder, write_together
-    from mirror_ppl.inference.export import add_identifiability, netcdf_content
-    from mirror_ppl.inference.fitting import fit_people
-    from mirror_ppl.inference.guide_file import network_for
-    from mirror_ppl.inference.guides import InferenceOptions
-    from mirror_ppl.inference.identifiability import identify
-    from mirror_ppl.inference.pooling import Pooling
-    from mirror_ppl.inference.population_file import load_population
+    from mirror_ppl.inference.engines import InferenceOptions
+    from mirror_ppl.inference.population.pooling import Pooling
+    from mirror_ppl.inference.results.export import add_identifiability, netcdf_content
+    from mirror_ppl.inference.results.fitting import fit_people
+    from mirror_ppl.inference.results.identifiability import identify
+    from mirror_ppl.inference.results.population_file import load_population
     from mirror_ppl.inference.svi import FitOptions
-    from mirror_ppl.models.loading import check_contract, load_human_model
+    from mirror_ppl.likelihood.contract import check_contract
+    from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.identifiability import plot_identifiability
     from mirror_ppl.plots.sight import FILES, sight_pictures
+    from mirror_ppl.training.guide_file import network_for
 
     device = usable_device(options.device)
     svi = FitOptions(steps=options.steps)
@@ -195,8 +196,8 @@ def main(options: Options) -> None:
 def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
     """Refuse what will not fit, before any work is done."""
     from mirror_ppl.domains import get_domain
-    from mirror_ppl.inference.fitting import split_rounds
-    from mirror_ppl.inference.posterior_predictive import PEOPLE_AT_ONCE
+    from mirror_ppl.inference.results.fitting import split_rounds
+    from mirror_ppl.inference.results.posterior_predictive import PEOPLE_AT_ONCE
 
     parts = [part for part in split_rounds(demonstrations, options.train_rounds) if part]
     actions = len(get_domain(demonstrations.domain).actions)

@@ -111,10 +111,10 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
 
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.evaluation.self_model import self_model_quality
-    from mirror_ppl.inference.self_model_training import SelfModelOptions, train_self_model
     from mirror_ppl.models.sizes import PAPER, SIZES
     from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
+    from mirror_ppl.training.self_model import SelfModelOptions, train_self_model
 
     default, *_ = EMBEDDINGS
     if require_known(options.speech, "speech", tuple(EMBEDDINGS)) != default and not any(
@@ -155,10 +155,11 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
 
 
 def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
-    from mirror_ppl.inference.guide_file import save_guide
-    from mirror_ppl.inference.guide_training import GuideOptions, train_guide
-    from mirror_ppl.models.loading import check_contract, load_human_model
+    from mirror_ppl.likelihood.contract import check_contract
+    from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
+    from mirror_ppl.training.guide import GuideOptions, train_guide
+    from mirror_ppl.training.guide_file import save_guide
 
     weights = options.self_model or shipped_weights(options.domain)
     self_model, _ = load_self_model(weights, options.domain)
@@ -190,8 +191,8 @@ def _described(options: Options, settings: Any, quality: dict[str, float], measu
 
 def _card(path: Path) -> dict[str, Any]:
     """The card of a weights file."""
-    from mirror_ppl.inference import guide_file
     from mirror_ppl.models import weights
+    from mirror_ppl.training import guide_file
 
     return weights.read_card(path, {weights.FORMAT: "self-model", guide_file.FORMAT: "guide"})
 

@@ -48,8 +48,8 @@ import torch
 warnings.filterwarnings("ignore", message="IProgress not found")
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.engines import InferenceOptions
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 

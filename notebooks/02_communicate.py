@@ -48,8 +48,8 @@ from mirror_ppl.communication import (
 )
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.engines import InferenceOptions
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -66,7 +66,7 @@ quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
 # worth sending on average over these.
 #
 # A posterior that was saved is read with `load_posterior(path).draws(human, 64)`, from
-# `mirror_ppl.inference.posterior_file`.
+# `mirror_ppl.inference.results.posterior_file`.
 
 # %%
 domain = get_domain("driving")

@@ -40,13 +40,13 @@ import torch
 warnings.filterwarnings("ignore", message="IProgress not found")
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.guide_file import load_guide, shipped_guide
-from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.svi import FitOptions
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.plots.picture import Picture
+from mirror_ppl.training.guide_file import load_guide, shipped_guide
 
 # The networks are small: one thread is as fast as several.
 torch.set_num_threads(1)
@@ -163,7 +163,7 @@ figure
 # calibration is rejected.
 
 # %%
-from mirror_ppl.inference.calibration import CalibrationOptions, calibrate
+from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
 
 settings = InferenceOptions("amortized", 50)
 
@@ -201,9 +201,9 @@ plot_ecdf(calibration)
 # `python -m mirror_ppl.fit` writes this picture as `open.png`.
 
 # %%
-from mirror_ppl.inference.export import add_identifiability
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.identifiability import identify
+from mirror_ppl.inference.results.export import add_identifiability
+from mirror_ppl.inference.results.fitting import fit_people
+from mirror_ppl.inference.results.identifiability import identify
 from mirror_ppl.plots.identifiability import plot_identifiability
 
 some = recordings.select_people(recordings.people[: 2 if quick else 6])
@@ -272,7 +272,7 @@ pd.DataFrame(rows).T.rename_axis("nats an action above their own entropy")
 
 # %%
 from mirror_ppl.evaluation.comparison import compare_fits, read_fit
-from mirror_ppl.inference.export import save_inference_data
+from mirror_ppl.inference.results.export import save_inference_data
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.plots.comparison import plot_comparison
 

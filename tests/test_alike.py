@@ -8,12 +8,12 @@ from scipy.stats import chisquare
 from test_views import Few
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.alike import Alike, fixed_prior
-from mirror_ppl.inference.combinations import grid_of, perceived_sites
-from mirror_ppl.inference.exact import combination_values, log_joints
-from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.sampler import Sampler
-from mirror_ppl.inference.views import build_view_table
+from mirror_ppl.likelihood.combination_sets import Alike, fixed_prior
+from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
+from mirror_ppl.likelihood.enumeration import combination_values, log_joints
+from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 

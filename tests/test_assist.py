@@ -7,11 +7,12 @@ import pytest
 from running import command
 
 from mirror_ppl import assist, fit
+from mirror_ppl.arviz import az
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation import assistance_cells
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
-from mirror_ppl.inference.export import az, save_inference_data
+from mirror_ppl.inference.results.export import save_inference_data
 
 SMALL = ("--rounds", "2", "--draws", "4", "--horizon", "2", "--jobs", "1")
 

@@ -16,30 +16,31 @@ from mirror_ppl.communication.worlds import SelfModelWorld
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.calibration import prior_people
-from mirror_ppl.inference.exact import log_joints
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.calibration.study import prior_people
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.online import OnlinePosterior
-from mirror_ppl.inference.predictive import predict_actions
-from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import FitOptions
-from mirror_ppl.inference.views import (
+from mirror_ppl.likelihood.attention import KEPT, VALUES, choose_values, site_probabilities
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.densities import log_weighted_latents
+from mirror_ppl.likelihood.enumeration import log_joints
+from mirror_ppl.likelihood.predictive import predict_actions
+from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import (
     _joined,
     build_view_table,
     combination_scores,
     restricted,
     rounds_of,
 )
-from mirror_ppl.likelihood.densities import log_weighted_latents
-from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.attention import KEPT, VALUES, choose_values, site_probabilities
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import first_success, noticed_sites, policy_implants
-from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.variants import OneRadius, PerItem
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -360,11 +361,11 @@ def test_the_posterior_is_the_exact_one(self_model):
     exact = torch.softmax(total, 0)
     mean = (exact * grid).sum()
     spread = (exact * (grid - mean).square()).sum().sqrt()
-    sightings = Sightings(human, Screening())
+    builder = ViewTableBuilder(human, Screening())
     for one_round in rounds_of(rounds, 0):
-        sightings.add(*one_round)
+        builder.add(*one_round)
     torch.manual_seed(0)
-    found = sample_exactly(human, sightings.table(), ImportanceOptions())
+    found = sample_importance(human, builder.table(), ImportanceOptions())
     weights, value = found.log_weights.exp(), found.policy[NOTICES[0]].flatten().double()
     error = 5 / math.sqrt(found.effective)
     assert abs((weights * value).sum() - mean) < error * spread

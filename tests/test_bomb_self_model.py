@@ -8,17 +8,17 @@ import torch
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.evaluation.self_model import fixed_views, self_model_quality
-from mirror_ppl.inference.experience import experience
-from mirror_ppl.inference.self_model_training import (
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import PAPER, SIZES
+from mirror_ppl.models.weights import load_self_model
+from mirror_ppl.train import Options, main
+from mirror_ppl.training.experience import experience
+from mirror_ppl.training.self_model import (
     SelfModelOptions,
     self_model_loss,
     train_self_model,
 )
-from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.sizes import PAPER, SIZES
-from mirror_ppl.models.training_views import draw_views
-from mirror_ppl.models.weights import load_self_model
-from mirror_ppl.train import Options, main
+from mirror_ppl.training.views import draw_views
 
 WORLD = BombDefusal()
 

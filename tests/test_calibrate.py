@@ -5,8 +5,8 @@ from PIL import Image
 from running import command
 
 from mirror_ppl import calibrate
-from mirror_ppl.inference.calibration import Calibration
-from mirror_ppl.inference.guides import Inferred, infer
+from mirror_ppl.inference.calibration.study import Calibration
+from mirror_ppl.inference.engines import Inferred, infer
 
 TOY = """from mirror_ppl.models.toy import ToyHuman
 

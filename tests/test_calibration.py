@@ -14,13 +14,18 @@ from torch import nn
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import UnknownNameError
-from mirror_ppl.inference import calibration
-from mirror_ppl.inference.calibration import CalibrationOptions, Inferred, calibrate, prior_people
-from mirror_ppl.inference.exact import draw_combinations, log_joint
-from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.views import Screening, build_view_table
+from mirror_ppl.inference.calibration import study as calibration
+from mirror_ppl.inference.calibration.study import (
+    CalibrationOptions,
+    Inferred,
+    calibrate,
+    prior_people,
+)
+from mirror_ppl.likelihood.enumeration import draw_combinations, log_joint
+from mirror_ppl.likelihood.tables import Screening, build_view_table
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import policy_implants
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")

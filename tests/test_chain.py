@@ -12,14 +12,14 @@ from example_course import gone_through
 from mirror_ppl.data import Demonstrations, concatenate
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.exact import conditioned, log_joints
-from mirror_ppl.inference.predictive import predict_actions
-from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.views import build_view_table, restricted, rounds_of
+from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.enumeration import conditioned, log_joints
+from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import log_likelihoods
-from mirror_ppl.models.chain import Chain
-from mirror_ppl.models.loading import check_contract
+from mirror_ppl.likelihood.tables import build_view_table, restricted, rounds_of
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 
@@ -201,13 +201,13 @@ def test_what_is_given_up_changes_nothing_of_the_rest(searcher):
 
 def test_screening_counts_what_the_table_does(searcher):
     """Ways are scored as the table of the same rounds has it, without merging moments."""
-    sightings = Sightings(searcher, Screening(margin=1e6, ways=3, resolution=0))
+    builder = ViewTableBuilder(searcher, Screening(margin=1e6, ways=3, resolution=0))
     for one_round in rounds_of(recorded(), 0):
-        sightings.add(*one_round)
-    table = sightings.table()
-    policy = {name: value for name, value in sightings.ways.items() if name not in table.sites}
+        builder.add(*one_round)
+    table = builder.table()
+    policy = {name: value for name, value in builder.ways.items() if name not in table.sites}
     joints = log_joints(searcher, table, policy)[:, 0]
-    torch.testing.assert_close(sightings.score + sightings.log_prior, joints)
+    torch.testing.assert_close(builder.score + builder.log_prior, joints)
 
 
 def test_the_sum_has_the_gradient_of_its_differences(searcher):

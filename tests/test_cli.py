@@ -27,9 +27,9 @@ from mirror_ppl.data import (
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.evaluation import self_model as evaluation
-from mirror_ppl.inference.export import in_units
-from mirror_ppl.inference.fitting import split_rounds
-from mirror_ppl.inference.summary import score, summarize
+from mirror_ppl.inference.results.export import in_units
+from mirror_ppl.inference.results.fitting import split_rounds
+from mirror_ppl.inference.results.summary import score, summarize
 from mirror_ppl.models.weights import load_self_model
 
 RESULTS = {"open.png", "posterior.nc", "samples.png", "sight.png", "summary.json"}

@@ -14,10 +14,11 @@ from matplotlib.container import ErrorbarContainer
 from running import command
 
 from mirror_ppl import compare, fit
+from mirror_ppl.arviz import az
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import OptionError, PosteriorError
 from mirror_ppl.evaluation.comparison import compare_fits, label_models, read_fit
-from mirror_ppl.inference.export import az, save_inference_data
+from mirror_ppl.inference.results.export import save_inference_data
 from mirror_ppl.plots.comparison import plot_comparison
 from mirror_ppl.plots.reading import BLUE, GREY
 

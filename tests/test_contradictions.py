@@ -12,8 +12,8 @@ from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError, MirrorError
-from mirror_ppl.inference.fitting import fit_people
 from mirror_ppl.inference.online import OnlinePosterior
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mirror_ppl.distinct import distinct_rows, random_keys, uniform_of
+from mirror_ppl.row_hashing import distinct_rows, random_keys, uniform_of
 
 
 def check(rows):

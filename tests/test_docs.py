@@ -22,19 +22,21 @@ from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions
+from mirror_ppl.inference.engines import InferenceOptions
 from mirror_ppl.inference.importance import PRUNING_DRAWS, ImportanceOptions
-from mirror_ppl.inference.self_model_training import SelfModelOptions
-from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.inference.svi import PLATES, FitOptions, continuous_guide
-from mirror_ppl.inference.views import Screening, build_view_table
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
-from mirror_ppl.models import HumanModel, training_views
-from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.likelihood.tables import Screening, build_view_table
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import PEOPLE
+from mirror_ppl.training import views as training_views
+from mirror_ppl.training.self_model import SelfModelOptions
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

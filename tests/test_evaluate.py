@@ -21,8 +21,8 @@ from mirror_ppl.evaluation.learners import LEARNERS, PLANNABLE, TEST, Group, lea
 from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
 from mirror_ppl.evaluation.study_report import REPORTS
 from mirror_ppl.evaluation.study_summary import Interval, Place, Share, Standing
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions, Inferred
+from mirror_ppl.inference.engines import InferenceOptions, Inferred
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.plots.study import STYLES, plot_curves, plot_relevance
 

@@ -20,13 +20,14 @@ from benchmarks._damage_structure import OF_HDF5
 from benchmarks._damage_weights import OF_WEIGHTS
 from benchmarks._judging import fault_of, measured
 from mirror_ppl import __main__
+from mirror_ppl.arviz import az
 from mirror_ppl.console import guarded
 from mirror_ppl.errors import AssetError
-from mirror_ppl.inference.export import az, in_units, netcdf_content
-from mirror_ppl.inference.guide_file import load_guide, shipped_guide
-from mirror_ppl.inference.posterior_file import load_posterior
+from mirror_ppl.inference.results.export import in_units, netcdf_content
+from mirror_ppl.inference.results.posterior_file import load_posterior
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
+from mirror_ppl.training.guide_file import load_guide, shipped_guide
 
 DOMAINS = "driving", "search_rescue", "bomb_defusal"
 CASES = st.integers(0, 2**32)

@@ -16,7 +16,7 @@ from mirror_ppl import calibrate as calibrate_command
 from mirror_ppl import fit, simulate, train
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
-from mirror_ppl.inference import fitting, guide_training, guides
+from mirror_ppl.inference import engines
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
     evidence_of,
@@ -24,21 +24,23 @@ from mirror_ppl.inference.amortized import (
     reference_places,
     sample_amortized,
 )
-from mirror_ppl.inference.calibration import CalibrationOptions, calibrate, prior_people
-from mirror_ppl.inference.exact import acts_on_beliefs
-from mirror_ppl.inference.guide_file import load_guide, network_for, save_guide
-from mirror_ppl.inference.guide_training import GuideOptions, simulate_examples, train_guide
-from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
+from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
+from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.importance import ImportanceOptions
+from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.sampler import Sampler, places, scalar_sites
-from mirror_ppl.inference.sightings import Sightings
-from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import FitOptions
-from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.likelihood.enumeration import acts_on_beliefs
 from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import build_view_table, rounds_of
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import RATES, ToyHuman, toy_posterior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training import guide as guide_training
+from mirror_ppl.training.guide import GuideOptions, simulate_examples, train_guide
+from mirror_ppl.training.guide_file import load_guide, network_for, save_guide
 
 DRAWS = 400
 TRAINING = GuideOptions(people=150, rounds=(1, 3), steps=600, batch=64, together=50)
@@ -271,11 +273,11 @@ def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):
 
 
 def sightings_of(human, recordings, person, order):
-    sightings = Sightings(human, guide_screening())
+    builder = ViewTableBuilder(human, guide_screening())
     rounds = list(rounds_of(recordings, person))
     for number in order:
-        sightings.add(*rounds[number])
-    return sightings
+        builder.add(*rounds[number])
+    return builder
 
 
 def test_the_order_of_rounds_does_not_matter(toy, recordings, network):
@@ -285,15 +287,15 @@ def test_the_order_of_rounds_does_not_matter(toy, recordings, network):
     torch.testing.assert_close(one.log_evidence, other.log_evidence)
     assert one.steps == other.steps == 45
     found = []
-    for sightings in (forward, backward):
+    for builder in (forward, backward):
         torch.manual_seed(4)
-        found.append(sample_amortized(toy, network, sightings))
+        found.append(sample_amortized(toy, network, builder))
     torch.testing.assert_close(found[0].log_weights, found[1].log_weights, atol=1e-4, rtol=1e-3)
 
 
 def test_evidence_adds_up_by_hand(toy, recordings):
-    sightings = sightings_of(toy, recordings, 3, [0, 1])
-    evidence = evidence_of(sightings)
+    builder = sightings_of(toy, recordings, 3, [0, 1])
+    evidence = evidence_of(builder)
     exact = torch.zeros(64)
     two = recordings.select_people([3]).select_rounds([0, 1])
     table = build_view_table(toy, two)
@@ -366,7 +368,7 @@ def test_people_do_not_depend_on_who_else_is_there(toy, recordings, network):
 
 
 def test_inference_goes_on_from_its_checkpoint(toy, recordings, tmp_path, monkeypatch):
-    monkeypatch.setattr(guides, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    monkeypatch.setattr(engines, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     run = (tmp_path / "fit.checkpoint", "this run")
 
     def stop(name, done, total, message):

@@ -14,11 +14,13 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import ROAD_END, DrivingState
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.exact import log_joint
-from mirror_ppl.inference.predictive import predict_actions
 from mirror_ppl.inference.svi import FitOptions, continuous_guide, fit_implants
-from mirror_ppl.inference.views import build_view_table
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.enumeration import log_joint
+from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
+from mirror_ppl.likelihood.tables import build_view_table
+from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import (
@@ -27,8 +29,7 @@ from mirror_ppl.models.implants import (
     residual,
     sight_sites,
 )
-from mirror_ppl.models.loading import check_contract, load_human_model
-from mirror_ppl.models.view_table import NO_VIEW
+from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.calibration import prior_people
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.identifiability import POLICIES, _entropy_and_shared, identify
-from mirror_ppl.inference.pooling import Population
-from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.calibration.study import prior_people
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.population.pooling import Population
+from mirror_ppl.inference.results.identifiability import POLICIES, _entropy_and_shared, identify
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import RATES, ToyHuman
 from mirror_ppl.models.variants import NoImplants
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -216,7 +216,8 @@ def test_twenty_rounds_leave_less_open_than_one(toy):
 
 @pytest.mark.parametrize("explored", [0, 2])
 def test_the_picture(toy, rounds, draws, explored, tmp_path):
-    from mirror_ppl.inference.export import add_identifiability, az
+    from mirror_ppl.arviz import az
+    from mirror_ppl.inference.results.export import add_identifiability
 
     found = identify(toy, rounds, draws, 0, rounds=explored)
     data = az.from_dict(

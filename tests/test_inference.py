@@ -15,12 +15,8 @@ from test_views import Few, Sure, log_likelihoods_by_hand, policies, ragged
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import CheckpointError
-from mirror_ppl.inference.exact import draw_combinations, log_joint, log_prior, marginals
-from mirror_ppl.inference.fitting import fit_people
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.predictive import predict_actions
-from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.inference.svi import (
     FitOptions,
     _draw_by_enumeration,
@@ -31,10 +27,14 @@ from mirror_ppl.inference.svi import (
     fit_implants,
     negative_elbo,
 )
-from mirror_ppl.inference.views import build_view_table, combination_scores, restricted
+from mirror_ppl.likelihood.enumeration import draw_combinations, log_joint, log_prior, marginals
+from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
+from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted
+from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.view_table import NO_VIEW
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")
@@ -478,13 +478,13 @@ def test_impossible_options_are_refused(name, value, message):
 def test_people_are_fitted_in_batches_that_do_not_depend_on_each_other(
     self_model, tmp_path, monkeypatch
 ):
-    from mirror_ppl.inference import guides
+    from mirror_ppl.inference import engines
 
     human = HumanModel(self_model)
     recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0])
     recordings = recordings.select_people([0, 1, 2])
     options = InferenceOptions("svi", 6, FitOptions(steps=4, checkpoint_every=2))
-    monkeypatch.setattr(guides, "PEOPLE_AT_ONCE", 2)
+    monkeypatch.setattr(engines, "PEOPLE_AT_ONCE", 2)
     found = infer(human, recordings, options, 3)
     first = infer(human, recordings.select_people([0, 1]), options, 3)
     last = infer(human, recordings.select_people([2]), options, 3 + 2)

@@ -11,19 +11,19 @@ from example_recordings import RAGGED, fields
 from refused import refused
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.inference.fitting import fit_people, split_rounds
-from mirror_ppl.inference.guide_file import load_guide, shipped_guide
-from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
-from mirror_ppl.inference.pooling import Pooling
-from mirror_ppl.inference.population_file import load_population
-from mirror_ppl.inference.posterior_file import PosteriorFile, load_posterior
-from mirror_ppl.inference.posterior_predictive import predict_rounds
-from mirror_ppl.inference.prior import draw_prior
+from mirror_ppl.inference.population.pooling import Pooling
+from mirror_ppl.inference.results.fitting import fit_people, split_rounds
+from mirror_ppl.inference.results.population_file import load_population
+from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
+from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
 from mirror_ppl.people import simulate, simulated_people
+from mirror_ppl.training.guide_file import load_guide, shipped_guide
 
 FEW = InferenceOptions(draws=3)
 LATE = "docs/examples/late_reactions.py:LatePerson"

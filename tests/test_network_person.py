@@ -16,7 +16,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.driving import STAY, SWITCH
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.models.loading import check_contract
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.people import simulate
 

@@ -11,7 +11,6 @@ from torch.distributions import Normal
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.self_model import fixed_views
-from mirror_ppl.inference.experience import experience
 from mirror_ppl.models.distributions import GaussianChain
 from mirror_ppl.models.networks import (
     MIN_SCALE,
@@ -26,6 +25,7 @@ from mirror_ppl.models.networks import (
 )
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.sizes import Sizes
+from mirror_ppl.training.experience import experience
 
 DRIVING = get_domain("driving")
 LATENT, ACTIONS, HIDDEN = 48, 2, 64

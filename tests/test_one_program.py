@@ -14,12 +14,12 @@ from pyro.infer import Predictive, TraceEnum_ELBO, config_enumerate
 from pyro.infer.inspect import get_dependencies
 
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.exact import combination_values, log_joints
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.views import build_view_table
+from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.densities import log_correction
+from mirror_ppl.likelihood.enumeration import combination_values, log_joints
+from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.toy import ToyHuman, toy_posterior
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.people import simulate

@@ -10,13 +10,13 @@ from example_person import Averaging
 
 from mirror_ppl.communication import Person
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.guide_file import load_guide, shipped_guide
-from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training.guide_file import load_guide, shipped_guide
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from matplotlib.colors import to_hex
 from scipy.stats import binom
 from test_ranks import RARELY, gaussian, judged
 
-from mirror_ppl.inference.ranks import LEVELS, collect
-from mirror_ppl.inference.uniformity import ecdf_band, rank_edges
+from mirror_ppl.inference.calibration.ranks import LEVELS, collect
+from mirror_ppl.inference.calibration.uniformity import ecdf_band, rank_edges
 from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
 from mirror_ppl.plots.reading import BLUE, ORANGE
 

@@ -6,18 +6,18 @@ import torch
 from scipy import stats
 from torch.distributions import Beta, Normal
 
-from mirror_ppl.inference.calibration import prior_people
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.pooling import (
+from mirror_ppl.inference.calibration.study import prior_people
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.population.pooling import (
     CONCENTRATION_WIDTH,
     SPREAD,
     SPREAD_WIDTH,
     Pooling,
     Population,
 )
-from mirror_ppl.inference.population_sampler import ContinuousSites, DiscreteSite, HyperPriors
-from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.population.sampler import ContinuousSites, DiscreteSite, HyperPriors
 from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import RATES, ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 

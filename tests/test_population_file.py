@@ -8,14 +8,15 @@ import torch
 from running import command
 
 from mirror_ppl import fit
+from mirror_ppl.arviz import az
 from mirror_ppl.data import load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import CheckpointError, PosteriorError
-from mirror_ppl.inference.export import az, save_inference_data
-from mirror_ppl.inference.pooling import Pooling
-from mirror_ppl.inference.population_file import load_population
-from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.population.pooling import Pooling
+from mirror_ppl.inference.results.export import save_inference_data
+from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -126,12 +127,12 @@ def test_a_population_is_a_prior_of_others(inside, capsys):
 
 
 def test_runs_with_and_without_a_population_do_not_continue_each_other(inside, toy, monkeypatch):
-    from mirror_ppl.inference import guides
-    from mirror_ppl.inference.fitting import fit_people
+    from mirror_ppl.inference import engines
+    from mirror_ppl.inference.results.fitting import fit_people
 
-    monkeypatch.setattr(guides, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    monkeypatch.setattr(engines, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     demonstrations = load_demonstrations(inside / "some.nc")
-    options = guides.InferenceOptions(draws=20)
+    options = engines.InferenceOptions(draws=20)
     checkpoint = inside / "some.checkpoint"
     fit_people(toy, demonstrations, options, 0, 2, checkpoint=checkpoint)
     known = load_population(inside / "pooled" / "posterior.nc", Pooling(toy))
@@ -181,7 +182,7 @@ def test_fit_refuses(inside, capsys, args, message):
 
 
 def test_people_of_a_known_population_are_not_pooled(folder, toy):
-    from mirror_ppl.inference.guides import InferenceOptions, infer
+    from mirror_ppl.inference.engines import InferenceOptions, infer
 
     known = load_population(folder / "pooled" / "posterior.nc", Pooling(toy))
     some = load_demonstrations(folder / "some.nc")
@@ -214,8 +215,8 @@ def test_damaged_populations_are_refused(folder, toy, change, message):
 
 def test_reaches_of_a_population_are_in_the_unit_of_distance(toy):
     """Of the package's own human model; nobody is fitted, so the population is the prior."""
-    from mirror_ppl.inference.pooling import Population
-    from mirror_ppl.inference.population_file import add_population
+    from mirror_ppl.inference.population.pooling import Population
+    from mirror_ppl.inference.results.population_file import add_population
 
     pooling = Pooling(HumanModel(toy.self_model))
     population = Population(

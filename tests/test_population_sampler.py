@@ -7,7 +7,7 @@ import torch
 from torch.distributions import Beta, LogNormal, MultivariateNormal, Normal
 from torch.nn.functional import one_hot
 
-from mirror_ppl.inference.population_sampler import (
+from mirror_ppl.inference.population.sampler import (
     ContinuousSites,
     DiscreteSite,
     HyperPriors,

@@ -5,11 +5,12 @@ import pytest
 import torch
 from example_person import DOMAIN, SIGHTS, human, self_model, varied_draws
 
+from mirror_ppl.arviz import az
 from mirror_ppl.communication import Person
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import HumanModelError, PosteriorError, UnknownNameError
-from mirror_ppl.inference.export import az, in_units, save_inference_data
-from mirror_ppl.inference.posterior_file import load_posterior
+from mirror_ppl.inference.results.export import in_units, save_inference_data
+from mirror_ppl.inference.results.posterior_file import load_posterior
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import fingerprint

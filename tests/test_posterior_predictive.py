@@ -7,17 +7,17 @@ import torch
 from test_views import ragged
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference import posterior_predictive
-from mirror_ppl.inference.posterior_predictive import (
+from mirror_ppl.inference.results import posterior_predictive
+from mirror_ppl.inference.results.posterior_predictive import (
     _drawn,
     _groups,
     chosen_log_probability,
     predict_people,
     predict_rounds,
 )
-from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.summary import score
+from mirror_ppl.inference.results.summary import score
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.variants import PerItem
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 

@@ -9,7 +9,7 @@ import xarray as xr
 from scipy.stats import beta, binom, chisquare, norm
 
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.ranks import LEVELS, Calibration, collect, judge, ranks
+from mirror_ppl.inference.calibration.ranks import LEVELS, Calibration, collect, judge, ranks
 
 RARELY = 1e-5
 """Failure rate of what a test may not get wrong, whatever the seed."""

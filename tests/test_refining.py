@@ -6,10 +6,10 @@ from running import command
 
 from mirror_ppl import fit
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference import guides
-from mirror_ppl.inference.guides import InferenceOptions, infer
+from mirror_ppl.inference import engines
+from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.svi import FitOptions, continuous_guide
-from mirror_ppl.inference.views import build_view_table
+from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models.variants import PerceptualOnly, PolicyOnly
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -66,7 +66,7 @@ def test_refining_starts_near_the_end(human):
 
 
 def test_refining_of_many_is_done_in_batches(human, recordings, monkeypatch):
-    monkeypatch.setattr(guides, "PEOPLE_AT_ONCE", 2)
+    monkeypatch.setattr(engines, "PEOPLE_AT_ONCE", 2)
     found = infer(human, recordings, InferenceOptions(draws=8, refine=2), seed=0)
     assert found.draws["lapse"].shape == (8, 3, 1)
 

@@ -7,14 +7,14 @@ import torch
 
 from mirror_ppl.inference import importance, residual_proposal
 from mirror_ppl.inference import sampler as sampler_module
-from mirror_ppl.inference.exact import expected_counts
-from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.residual_proposal import ResidualProposal, _laplace
 from mirror_ppl.inference.sampler import Sampler, complete
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.likelihood.enumeration import expected_counts
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
@@ -35,10 +35,10 @@ def played(human):
 
 @pytest.fixture(scope="module")
 def table(human, played):
-    sightings = Sightings(human, Screening())
+    builder = ViewTableBuilder(human, Screening())
     for one_round in rounds_of(played, 0):
-        sightings.add(*one_round)
-    return sightings.table()
+        builder.add(*one_round)
+    return builder.table()
 
 
 def test_the_gaussian_is_at_the_mode_and_as_curved_as_the_likelihood():
@@ -162,15 +162,15 @@ def test_the_residual_is_proposed_only_where_scalars_are_not_enough(human, table
     )
     monkeypatch.setattr(importance, "FEW", 0.0)
     torch.manual_seed(0)
-    sample_exactly(human, table, ImportanceOptions(proposals=256, enough=100))
+    sample_importance(human, table, ImportanceOptions(proposals=256, enough=100))
     assert not learned
     options = ImportanceOptions(proposals=256, enough=1e6, stages=4)
-    sample_exactly(human, table, options)
+    sample_importance(human, table, options)
     assert learned == [256 * 3]
     # At once where few draws have all the weight.
     learned.clear()
     monkeypatch.setattr(importance, "FEW", 1e6)
-    sample_exactly(human, table, options)
+    sample_importance(human, table, options)
     assert learned == [256]
 
 

@@ -13,11 +13,11 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.inference import importance
 from mirror_ppl.inference import sampler as sampler_module
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
-from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
-from mirror_ppl.inference.prior import draw_prior
+from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.sampler import Sampler, Weighted, places, scalar_sites
-from mirror_ppl.inference.views import build_view_table
+from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.toy import RATES, ToyHuman
 from mirror_ppl.people import simulate
@@ -100,7 +100,7 @@ def test_the_posterior_is_that_of_conjugacy(toy, table):
     assert 0.2 < truth["habit"] < 0.95  # of a prior of .02, so that proposals have to find it
     for seed in range(3):
         torch.manual_seed(seed)
-        found = sample_exactly(toy, table, ImportanceOptions())
+        found = sample_importance(toy, table, ImportanceOptions())
         assert found.effective > 200 and found.pareto_k < 0.7
         weights = found.log_weights.exp().float()
         for name, expected in truth.items():
@@ -137,7 +137,7 @@ def test_weights_are_toned_down_until_enough_draws_count():
     torch.manual_seed(0)
     sharp = weighted(20 * torch.randn(1000))
     assert sharp.effective < 3
-    found = sharp.toned_down(64.0)
+    found = sharp.tempered(64.0)
     assert found.effective == pytest.approx(64, rel=0.01)
     # A power of them: log weights are in line.
     slope = (found.log_weights[1:] - found.log_weights[0]) / (
@@ -146,13 +146,13 @@ def test_weights_are_toned_down_until_enough_draws_count():
     torch.testing.assert_close(slope, slope[0].expand_as(slope))
     assert 0 < slope[0] < 1
     # Of few draws a quarter, and what is flat enough stays as it is.
-    assert weighted([0.0, -50.0] * 10).toned_down(64.0).effective >= 5
+    assert weighted([0.0, -50.0] * 10).tempered(64.0).effective >= 5
     flat = weighted(torch.randn(1000))
-    assert flat.toned_down(64.0) is flat
+    assert flat.tempered(64.0) is flat
     # Draws that cannot be stay so.
     impossible = torch.full((100,), -torch.inf)
     impossible[:2] = torch.tensor([0.0, -1000.0])
-    found = weighted(impossible).toned_down(64.0)
+    found = weighted(impossible).tempered(64.0)
     assert found.effective == pytest.approx(2, rel=0.01)
     assert (found.log_weights[2:] == -torch.inf).all()
 
@@ -255,7 +255,7 @@ def test_priors_that_hang_on_other_sites_count_as_they_are(toy, table, kind, nam
     assert 0.02 < expected < 0.98
     for seed in range(3):
         torch.manual_seed(seed)
-        found = sample_exactly(human, table, ImportanceOptions(proposals=2048))
+        found = sample_importance(human, table, ImportanceOptions(proposals=2048))
         high = evenness_of(found.policy[name]).flatten() > 1
         share = float((found.log_weights.exp() * high).sum())
         error = (expected * (1 - expected) / found.effective) ** 0.5
@@ -291,7 +291,7 @@ def test_any_distribution_can_be_a_prior(toy, table, odd, middle, expected):
     human = Odd(toy.self_model)
     human.odd = odd
     torch.manual_seed(0)
-    found = sample_exactly(human, table, ImportanceOptions())
+    found = sample_importance(human, table, ImportanceOptions())
     below = (found.policy["odd"][..., 0] == 1) if odd.event_dim else found.policy["odd"] < middle
     share = float((found.log_weights.exp() * below.flatten()).sum())
     assert abs(share - expected) < 4.5 * (expected * (1 - expected) / found.effective) ** 0.5
@@ -316,7 +316,7 @@ class OnlyAHabit(ToyHuman):
 
 def test_discrete_sites_alone_are_proposed_too(toy, table):
     torch.manual_seed(0)
-    found = sample_exactly(OnlyAHabit(toy.self_model), table, ImportanceOptions())
+    found = sample_importance(OnlyAHabit(toy.self_model), table, ImportanceOptions())
     assert found.effective > 400  # of the prior's draws 2 in 100 would count
 
 

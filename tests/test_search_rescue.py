@@ -21,11 +21,11 @@ from mirror_ppl.domains.rescue_house import (
 )
 from mirror_ppl.domains.search_rescue import UTTERANCES, RescueState, SearchRescue
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.course import perceived
-from mirror_ppl.models.loading import check_contract
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.training_views import draw_views
+from mirror_ppl.training.views import draw_views
 
 WORLD: Domain = SearchRescue()
 UP, DOWN, LEFT, RIGHT = range(4)

@@ -16,18 +16,19 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.domains.bomb_panel import BUTTONS, OLD_RULES, RULES, read_panel
-from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.simulation import play_rounds
-from mirror_ppl.inference.summary import summarize
-from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.results.summary import summarize
+from mirror_ppl.likelihood.attention import Proposal, site_probabilities
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.attention import Proposal, site_probabilities
 from mirror_ppl.models.course import perceived
-from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate
 
@@ -314,11 +315,11 @@ def test_a_person_s_probabilities_come_out_of_their_rounds():
     human = Searcher(Knowing(WORLD))
     recorded = simulate("bomb_defusal", "labelled", people=1, rounds=12, seed=0)
     human.learn_world(recorded)
-    sightings = Sightings(human, Screening())
+    builder = ViewTableBuilder(human, Screening())
     for one_round in rounds_of(recorded, 0):
-        sightings.add(*one_round)
-    found = sample_exactly(human, sightings.table(), ImportanceOptions(proposals=256))
-    draws = found.sample(200, sightings.grid)
+        builder.add(*one_round)
+    found = sample_importance(human, builder.table(), ImportanceOptions(proposals=256))
+    draws = found.sample(200, builder.grid)
     mean = torch.stack([draws[f"notices_terminal {k}"].mean() for k in range(1, 7)]).mean()
     # About 30 finds, and a prior worth one: a standard error of a fifth.
     truth = recorded.truth["notices_terminal 1"][0]

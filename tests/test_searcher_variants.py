@@ -6,9 +6,10 @@ from example_course import beliefs_of, gone_through
 from test_searcher import WORLD, course, implants
 
 from mirror_ppl.domains.bomb_panel import RULES
-from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.course import perceived
-from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.searcher import RULE, Searcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.people import simulate

@@ -22,17 +22,17 @@ from mirror_ppl.evaluation.self_model import (
     returns,
     self_model_quality,
 )
-from mirror_ppl.inference import self_model_training
-from mirror_ppl.inference.experience import drive, experience
-from mirror_ppl.inference.self_model_training import (
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import Sizes
+from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
+from mirror_ppl.training import self_model as self_model_training
+from mirror_ppl.training.experience import drive, experience
+from mirror_ppl.training.self_model import (
     SelfModelOptions,
     self_model_loss,
     train_self_model,
 )
-from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.sizes import Sizes
-from mirror_ppl.models.training_views import draw_views
-from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
+from mirror_ppl.training.views import draw_views
 
 DRIVING = get_domain("driving")
 STEPS = DRIVING.horizon

@@ -10,11 +10,11 @@ from mirror_ppl.domains.bomb_panel import OLD_RULES, STAGES, read_panel, right_b
 from mirror_ppl.errors import AssetError
 from mirror_ppl.evaluation.self_model import self_model_quality
 from mirror_ppl.inference.amortized import AmortizedGuide
-from mirror_ppl.inference.guide_file import network_for
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import PEOPLE
+from mirror_ppl.training.guide_file import network_for
 
 
 @pytest.mark.parametrize("name", ["search_rescue", "bomb_defusal"])

@@ -6,10 +6,10 @@ from example_course import gone_through
 from example_person import Averaging, Unused
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, sight_sites
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 

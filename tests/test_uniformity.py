@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chisquare, norm
 
-from mirror_ppl.inference import uniformity
-from mirror_ppl.inference.uniformity import (
+from mirror_ppl.inference.calibration import uniformity
+from mirror_ppl.inference.calibration.uniformity import (
     ecdf_band,
     ecdf_p_value,
     histogram_p_value,

@@ -9,15 +9,16 @@ from running import command
 from mirror_ppl import assist, fit, simulate
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.combinations import perceived_sites
-from mirror_ppl.inference.prior import sample_sites
-from mirror_ppl.inference.views import build_view_table, combination_scores
+from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import build_view_table, combination_scores
+from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import NOTICES, assumption_sites, sight_sites
-from mirror_ppl.models.loading import check_contract, load_human_model
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.variants import VARIANTS
-from mirror_ppl.models.view_table import combination_number
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 POLICY = {"consistency", "lapse", "residual_in", "residual_out"}

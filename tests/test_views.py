@@ -12,28 +12,28 @@ from example_person import Averaging, Unused
 
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.base import roll_out
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.combinations import MAX_COMBINATIONS
-from mirror_ppl.inference.courses import _beginnings
-from mirror_ppl.inference.experience import roll_out
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.views import (
+from mirror_ppl.likelihood.belief_nodes import _beginnings
+from mirror_ppl.likelihood.combinations import MAX_COMBINATIONS
+from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import (
     build_view_table,
     combination_scores,
     restricted,
     rounds_of,
 )
-from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
-from mirror_ppl.models.training_views import (
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training.views import (
     KIND_PROBABILITIES,
     TOLD_PROBABILITY,
     draw_views,
 )
-from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
-from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")
 STEPS = DRIVING.horizon
@@ -366,11 +366,11 @@ def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordi
     human, rounds = kind(self_model), ragged(recordings, [[15, 9]])
     resolution = 0.1
     screening = Screening(margin=math.inf, resolution=resolution, alike=8)
-    whole, merged = Sightings(human, None), Sightings(human, screening)
+    whole, merged = ViewTableBuilder(human, None), ViewTableBuilder(human, screening)
     for one_round in rounds_of(rounds, 0):
         whole.add(*one_round)
         merged.add(*one_round)
-    tables = [sightings.table() for sightings in (whole, merged)]
+    tables = [builder.table() for builder in (whole, merged)]
     ways = merged.draw_ways()
     scores = []
     for table in tables:

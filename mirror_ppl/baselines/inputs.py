@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn.functional import one_hot, pad
 
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains import Domain, Observation, Visibility
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
 Sight = Literal["setting", "everything"]
 """Which items a network reads: those that the setting shows or that were told, or all visual ones.

@@ -22,16 +22,16 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.distinct import as_whole_numbers, distinct_rows
 from mirror_ppl.domains.base import Observation, Visibility, map_state
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.prior import checked_draws
+from mirror_ppl.likelihood.attention import AttentionValues, Proposal
 from mirror_ppl.likelihood.densities import choices, log_weighted_latents
-from mirror_ppl.models.attention import AttentionValues, Proposal
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.models.view import View
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
 COUNTED = 3
 """Up to how many items of a message have to be cheaper than others that tell the same."""
@@ -89,7 +89,7 @@ class Person:
         """The person in a round under way, with what they attend to as their actions tell it.
 
         Each draw gets one value of attention from ``p(m | psi, what was done so far)``, of all
-        there are or of some that stand for them (:mod:`mirror_ppl.models.attention`). Nothing
+        there are or of some that stand for them (:mod:`mirror_ppl.likelihood.attention`). Nothing
         changes if no attention differs from round to round.
         """
         if not self.human.has_round_latents:

@@ -18,12 +18,12 @@ from mirror_ppl.checks import require_methods, whole_number
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.minds import Looks, Standing
 from mirror_ppl.communication.worlds import Futures, World, robot_belief
-from mirror_ppl.distinct import uniform_of
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.combinations import discrete_sites
-from mirror_ppl.models.attention import attention_sites
+from mirror_ppl.likelihood.attention import attention_sites
+from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.row_hashing import uniform_of
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 from mirror_ppl.communication.messages import count_messages, every_message
 from mirror_ppl.communication.objectives import Value, Valued
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
-from mirror_ppl.distinct import distinct_rows
+from mirror_ppl.row_hashing import distinct_rows
 
 MOST_CANDIDATES = 4096
 """How many candidates are valued one by one; beyond that they are searched."""

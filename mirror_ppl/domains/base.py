@@ -306,6 +306,14 @@ def map_state(function: Callable[..., Tensor], *states: Any) -> Any:
     )
 
 
+def roll_out(domain: Domain, start: Any, actions: Tensor) -> Any:
+    """States ``[B, T + 1]`` of rounds from ``start`` ``[B]`` under ``actions`` ``[B, T]``."""
+    states = [start]
+    for action in actions.unbind(1):
+        states.append(domain.transition(states[-1], action))
+    return map_state(lambda *parts: torch.stack(parts, 1), *states)
+
+
 def require_known(name: str, kind: str, known: Sequence[str], where: str = "") -> str:
     """Return ``name`` if it is one of ``known``, in the domain ``where``.
 

@@ -29,9 +29,10 @@ from mirror_ppl.evaluation.assistance import (
     speaker,
 )
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.posterior_file import PosteriorFile, load_posterior
+from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.loading import check_contract, file_of, load_human_model
+from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.workers import run_tasks
 

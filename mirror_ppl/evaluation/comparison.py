@@ -31,10 +31,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from mirror_ppl.arviz import az
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.export import az
-from mirror_ppl.inference.posterior_file import read_results
+from mirror_ppl.inference.results.posterior_file import read_results
 from mirror_ppl.models.loading import model_name
 
 FILE = "posterior.nc"

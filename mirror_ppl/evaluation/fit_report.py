@@ -8,8 +8,8 @@ from typing import Any
 from rich.table import Table
 
 from mirror_ppl.console import console_for_tables
-from mirror_ppl.inference.identifiability import NEGLIGIBLE
-from mirror_ppl.inference.ranks import HIGH_PARETO_K
+from mirror_ppl.inference.calibration.ranks import HIGH_PARETO_K
+from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
 from mirror_ppl.models.implants import NOTICES
 
 FEW = 20

@@ -31,16 +31,16 @@ from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, listeners
-from mirror_ppl.inference.guide_file import network_for
-from mirror_ppl.inference.guides import InferenceOptions, infer
-from mirror_ppl.inference.pooling import Population
-from mirror_ppl.inference.posterior_predictive import predict_rounds
-from mirror_ppl.inference.summary import predictive
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.population.pooling import Population
+from mirror_ppl.inference.results.posterior_predictive import predict_rounds
+from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate
+from mirror_ppl.training.guide_file import network_for
 
 TRAINING = 20
 """Rounds that there are to learn from, the first ones."""

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, every_message
-from mirror_ppl.distinct import distinct_rows
 from mirror_ppl.domains.base import Observation, map_state, total_reward
 from mirror_ppl.domains.driving import Driving, DrivingState
 from mirror_ppl.people.driving import Drivers, Memory, remember
+from mirror_ppl.row_hashing import distinct_rows
 
 CHUNK = 2000
 """Decisions of the person that are worked out at once; bounds memory."""

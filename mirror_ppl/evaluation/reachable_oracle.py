@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels
-from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.people.base import SimulatedPeople
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
 
 MOST_ITEMS = 2
 """Items of the largest messages that are looked at: there is always another step to say more."""

@@ -2,7 +2,7 @@
 
 In full view the yardstick is the exact planner that knows everything. In partial view it is the
 exact planner of the world as somebody with that view believes it to be who remembers everything
-and makes every assumption (see `mirror_ppl.models.training_views`). Where these leave something
+and makes every assumption (see `mirror_ppl.training.views`). Where these leave something
 open, the return of somebody who assumes nothing is all there is to compare.
 """
 
@@ -14,16 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, map_state, total_reward
-from mirror_ppl.inference.experience import (
-    drive,
-    experience,
-    follow,
-    roll_out,
-    supposed,
-)
+from mirror_ppl.domains.base import Domain, map_state, roll_out, total_reward
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.training_views import ViewPlan
+from mirror_ppl.training.experience import drive, experience, follow, supposed
+from mirror_ppl.training.views import ViewPlan
 
 CLEAR_DECISION = 0.2
 """Difference of action values, in units of reward, above which a decision counts as clear."""

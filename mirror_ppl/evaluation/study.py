@@ -27,10 +27,11 @@ from mirror_ppl.evaluation.learners import (
     learn,
 )
 from mirror_ppl.evaluation.sweep import Rows
-from mirror_ppl.inference.guide_file import shipped_guide
-from mirror_ppl.inference.summary import score
-from mirror_ppl.models.loading import check_contract, file_of, load_human_model
+from mirror_ppl.inference.results.summary import score
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
+from mirror_ppl.training.guide_file import shipped_guide
 
 CODE = (
     *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
@@ -38,7 +39,7 @@ CODE = (
     *(f"evaluation/{name}.py" for name in ("assistance", "learners", "oracle", "study")),
     "evaluation/reachable_oracle.py",
     "cross_entropy.py",
-    "distinct.py",
+    "row_hashing.py",
     "data/assets/*guide*.safetensors",
 )
 """Files whose change makes earlier results worthless."""

@@ -12,7 +12,7 @@ and a new round is one more term. From it the network proposes how this person d
 and importance weights take care of what it gets wrong (:mod:`mirror_ppl.inference.importance`).
 
 The network is trained on people drawn from the prior and simulated in the true domain (inference
-compilation: Le, Baydin and Wood, 2017), see :mod:`mirror_ppl.inference.guide_training`.
+compilation: Le, Baydin and Wood, 2017), see :mod:`mirror_ppl.training.guide`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ import torch
 from torch import Tensor, nn
 
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.alike import Alike
 from mirror_ppl.inference.sampler import Sampler, Weighted, places, scalar_sites
-from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.likelihood.combination_sets import Alike
+from mirror_ppl.likelihood.view_table import ViewTable
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import layers
-from mirror_ppl.models.view_table import ViewTable
 
 WAYS = 64
 COMPONENTS = 4
@@ -67,19 +67,19 @@ class Evidence:
     steps: int
 
 
-def log_evidence(sightings: Sightings) -> Tensor:
+def log_evidence(builder: ViewTableBuilder) -> Tensor:
     """Log-evidence ``[W]`` of a person's rounds so far under each way to decide."""
-    alive = sightings.alive
-    return (sightings.score[:, alive] + sightings.log_prior[:, alive]).logsumexp(-1)
+    alive = builder.alive
+    return (builder.score[:, alive] + builder.log_prior[:, alive]).logsumexp(-1)
 
 
-def evidence_of(sightings: Sightings) -> Evidence:
+def evidence_of(builder: ViewTableBuilder) -> Evidence:
     """What a person's rounds so far say."""
-    table = sightings.table()
-    alike = Alike.of(table, sightings.fixed_prior)
-    prior = alike.log_prior if alike.fixed else sightings.log_prior[:, alike.first]
-    joint = sightings.score[:, alike.first] + prior
-    ways = {name: way for name, way in sightings.ways.items() if name not in table.sites}
+    table = builder.table()
+    alike = Alike.of(table, builder.fixed_prior)
+    prior = alike.log_prior if alike.fixed else builder.log_prior[:, alike.first]
+    joint = builder.score[:, alike.first] + prior
+    ways = {name: way for name, way in builder.ways.items() if name not in table.sites}
     return Evidence(joint.logsumexp(-1), alike, joint, ways, table, int(table.steps.sum()))
 
 
@@ -113,7 +113,7 @@ class AmortizedGuide(nn.Module):
         """What the network reads ``[..., F]`` of evidence ``[..., W]`` of so many steps ``[...]``.
 
         Besides the evidence itself: what importance sampling from the prior would give for mean
-        and spread, also with evidence toned down, where few ways have all the weight.
+        and spread, also with evidence tempered, where few ways have all the weight.
         """
         relative = log_evidence - log_evidence.amax(-1, keepdim=True)
         parts = [relative.clamp(min=LEAST_EVIDENCE) / 10.0]
@@ -164,8 +164,8 @@ class AmortizedGuide(nn.Module):
 
 def reference_places(human: HumanModel) -> Tensor:
     """Places ``[W, D]`` of the ways that evidence is about; always the same of a human model."""
-    sightings = Sightings(human, guide_screening())
-    return places(scalar_sites(human), sightings.draw_ways())
+    builder = ViewTableBuilder(human, guide_screening())
+    return places(scalar_sites(human), builder.draw_ways())
 
 
 def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:
@@ -189,7 +189,7 @@ def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:
 def sample_amortized(
     human: HumanModel,
     guide: AmortizedGuide,
-    sightings: Sightings,
+    builder: ViewTableBuilder,
     enough: float = 400.0,
     proposals: int = 64,
     stages: int = 16,
@@ -201,7 +201,7 @@ def sample_amortized(
     Args:
         human: the model of people that the guide was trained for.
         guide: the trained network.
-        sightings: the person's rounds so far.
+        builder: the person's rounds so far.
         enough: effective draws at which no stage is added.
         proposals: draws from the guide of a stage.
         stages: the largest number of stages.
@@ -210,9 +210,9 @@ def sample_amortized(
     """
     if stages < 1:
         raise ValueError(f"stages must be at least 1, not {stages}")
-    evidence = evidence_of(sightings)
+    evidence = evidence_of(builder)
     sampler = Sampler(human, evidence.table, evidence.alike, sites)
-    sampler.take(evidence.ways, evidence.joint)
+    sampler.add_prior_draws(evidence.ways, evidence.joint)
     sampler.prune(prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
     density = guide.density(evidence.log_evidence, steps)

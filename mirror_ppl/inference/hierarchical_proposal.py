@@ -19,8 +19,8 @@ from pyro.distributions import TorchDistribution
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-from mirror_ppl.inference.prior import sample_sites, values_of
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import sample_sites, values_of
 
 TRIED = 64
 """Draws from the prior by which it is found what hangs on others."""

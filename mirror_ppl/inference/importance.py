@@ -15,15 +15,15 @@ from torch import Tensor
 
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
 from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted, places
+from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import ViewTable
 
 PLAIN_STAGES = 2
 """Stages after which the residual is proposed, too, where it hardly matters."""
 LEARNED_FROM = 64.0
 """Effective draws from which it is learned what to propose, at least: moments of fewer say little,
 and what is proposed by them might never get to where else somebody could be. If there are not so
-many, weights are toned down until there are."""
+many, weights are tempered until there are."""
 FEW = 16.0
 """Effective draws, or fewer, with which the residual is proposed at once."""
 TAILS = 8.0
@@ -60,7 +60,7 @@ class ImportanceOptions:
 
 
 @torch.no_grad()
-def sample_exactly(
+def sample_importance(
     human: HumanModel,
     table: ViewTable,
     options: ImportanceOptions,
@@ -72,7 +72,7 @@ def sample_exactly(
     distribution, in unconstrained space, that has the moments of the weighted draws so far, and
     discrete sites of the policy by how probable they are so far. Where that is not enough, stages
     propose the residual of the policy, too. As long as few draws have all the weight, weights are
-    toned down before anything is learned from them (Koblents and Miguez, *A population Monte Carlo
+    tempered before anything is learned from them (Koblents and Miguez, *A population Monte Carlo
     scheme with transformed weights*, 2015).
 
     Args:
@@ -100,7 +100,7 @@ def sample_exactly(
     sampler.prune(options.prune_margin)
     if near is not None and sampler.sites:
         found = places(sampler.sites, near.policy)
-        near = near.toned_down(LEARNED_FROM)
+        near = near.tempered(LEARNED_FROM)
         sampler.propose(near_to(found, near.log_weights), options.proposals)
     elif options.proposals > few:
         sampler.draw(options.proposals - few)
@@ -109,7 +109,7 @@ def sample_exactly(
         if found.effective >= options.enough:
             return found
         few = found.effective <= FEW
-        found = found.toned_down(LEARNED_FROM)
+        found = found.tempered(LEARNED_FROM)
         if not sampler.proposes_residual and (few or stage >= PLAIN_STAGES):
             sampler.learn_residual(found)
         sampler.learn_discrete(found)

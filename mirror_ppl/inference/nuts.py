@@ -7,12 +7,16 @@ import torch
 from pyro.infer import MCMC, NUTS
 from pyro.infer.autoguide import init_to_median
 
-from mirror_ppl.inference.exact import draw_combinations, log_joints, require_acting_on_beliefs
-from mirror_ppl.inference.prior import Draws, sample_sites
 from mirror_ppl.inference.svi import PLATES, Report, silent
+from mirror_ppl.likelihood.enumeration import (
+    draw_combinations,
+    log_joints,
+    require_acting_on_beliefs,
+)
 from mirror_ppl.likelihood.table_program import TableProgram
+from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import ViewTable
+from mirror_ppl.models.prior import Draws, sample_sites
 
 WARMUP = 200
 

@@ -17,15 +17,15 @@ from mirror_ppl.inference.amortized import (
     require_network_of,
     sample_amortized,
 )
-from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
-from mirror_ppl.inference.prior import Draws, sample_sites
-from mirror_ppl.inference.recorded import check_rounds
+from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.sampler import Weighted, scalar_sites
-from mirror_ppl.inference.second_look import Round, looks_twice, rough, second_look
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.inference.second_look import Round, coarse, looks_twice, second_look
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import Draws, sample_sites
+from mirror_ppl.models.recorded import check_rounds
 
 ENOUGH = 64.0
 """Effective draws at which a guide proposes no more: enough for an answer that cannot wait."""
@@ -36,7 +36,7 @@ class OnlinePosterior:
 
     Args:
         human: the model of people.
-        network: a trained guide (see :func:`mirror_ppl.inference.guide_file.load_guide`); without,
+        network: a trained guide (see :func:`mirror_ppl.training.guide_file.load_guide`); without,
             draws are those of ``exact``, which takes longer at each asking.
         seed: of everything random. The same rounds in the same order give the same draws.
         allow_contradictions: share of the steps that are added at once, from 0 to 1, that may
@@ -72,7 +72,7 @@ class OnlinePosterior:
         self.pareto_k = float("nan")
         self.seconds = 0.0, 0.0
         self._screening = Screening() if network is None else guide_screening()
-        self._sightings = Sightings(human, self._screening)
+        self._sightings = ViewTableBuilder(human, self._screening)
         self._sites = scalar_sites(human)
         with torch.random.fork_rng(devices=[]):
             self._order = tuple(sample_sites(human, 1))
@@ -111,7 +111,7 @@ class OnlinePosterior:
 
         Raises:
             InputError: the number is none, or there was no round yet; see
-                :func:`mirror_ppl.inference.prior.draw_prior`.
+                :func:`mirror_ppl.models.prior.draw_prior`.
         """
         number = whole_number(number, "number", *LIMITS["draws"])
         if not self.rounds:
@@ -130,8 +130,8 @@ class OnlinePosterior:
     def _weighted(self) -> Weighted:
         human, options = self.human, ImportanceOptions()
         if self.network is None:
-            first = rough(options) if looks_twice(human) else options
-            found = sample_exactly(human, self._sightings.table(), first)
+            first = coarse(options) if looks_twice(human) else options
+            found = sample_importance(human, self._sightings.table(), first)
         else:
             # What the first asking has checked need not be checked again.
             sites = None if math.isnan(self.pareto_k) else self._sites

@@ -21,10 +21,10 @@ from pyro import poutine
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from mirror_ppl.inference.exact import conditioned
+from mirror_ppl.likelihood.enumeration import conditioned
+from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import ViewTable
 
 SITE = "residual_out"
 NEWTON_STEPS, CURVATURES = 4, 2

@@ -22,22 +22,22 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal, biject_to
 
-from mirror_ppl.inference.alike import Alike, fixed_prior
-from mirror_ppl.inference.combinations import discrete_sites
-from mirror_ppl.inference.exact import (
+from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
+from mirror_ppl.likelihood.combination_sets import Alike, fixed_prior
+from mirror_ppl.likelihood.combinations import discrete_sites
+from mirror_ppl.likelihood.densities import log_correction
+from mirror_ppl.likelihood.enumeration import (
     combination_values,
     expected_counts,
     log_joints,
     require_acting_on_beliefs,
 )
-from mirror_ppl.inference.prior import Draws, sample_sites, values_of
-from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
-from mirror_ppl.inference.views import restricted
-from mirror_ppl.likelihood.densities import log_correction
+from mirror_ppl.likelihood.tables import restricted
+from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import ViewTable
+from mirror_ppl.models.prior import Draws, sample_sites, values_of
 
-ANYHOW = 0.1
+DEFENSIVE_SHARE = 0.1
 """Share of what is proposed that is not by what was learned, of the residual and of discrete sites.
 """
 RESIDUAL_DRAWS = 64
@@ -70,7 +70,7 @@ class Weighted:
         """Effective number of draws."""
         return float(1 / self.log_weights.exp().square().sum())
 
-    def toned_down(self, effective: float) -> Weighted:
+    def tempered(self, effective: float) -> Weighted:
         """The same with weights to a power, 1 if possible, at which so many draws are effective.
 
         But at most a quarter of all draws.
@@ -201,9 +201,9 @@ class Sampler:
     def draw(self, number: int) -> None:
         """Draw from the prior."""
         policy, _ = complete(self.human, self.table, {}, number)
-        self.take(policy, self._joint(policy, number))
+        self.add_prior_draws(policy, self._joint(policy, number))
 
-    def take(self, policy: Draws, joint: Tensor) -> None:
+    def add_prior_draws(self, policy: Draws, joint: Tensor) -> None:
         """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
         place = places(self.sites, policy, len(joint))
         # All of it is given: priors may hang on any of these sites.
@@ -231,7 +231,8 @@ class Sampler:
     def learn_residual(self, found: Weighted) -> None:
         """From now on propose the residual, too, by these weights of all draws so far.
 
-        A share of :data:`ANYHOW` of what is proposed has a residual from the prior all the same.
+        A share of :data:`DEFENSIVE_SHARE` of what is proposed has a residual from the prior all
+        the same.
         """
         if SITE not in found.policy or not self.table.real.any():
             return
@@ -252,15 +253,17 @@ class Sampler:
     def learn_discrete(self, found: Weighted) -> None:
         """From now on propose discrete sites of the policy, too, by what is known so far.
 
-        Each by itself; a share of :data:`ANYHOW` is as often as in the first draws, which are from
-        the prior, or any value alike.
+        Each by itself; a share of :data:`DEFENSIVE_SHARE` is as often as in the first draws, which
+        are from the prior, or any value alike.
         """
         for name, support in self.supports.items():
             own = found.policy[name].flatten()[:, None] == support
             anybody = own[: self._stages[0].number].double().mean(0)
             likely = found.log_weights.exp().double() @ own.double()
             anyhow = (anybody + 1 / len(support)) / 2  # in few draws the prior may miss some
-            self._log_chances[name] = (ANYHOW * anyhow + (1 - ANYHOW) * likely).log()
+            self._log_chances[name] = (
+                DEFENSIVE_SHARE * anyhow + (1 - DEFENSIVE_SHARE) * likely
+            ).log()
 
     def _residual_densities(self, policy: Draws, gaussian: MultivariateNormal) -> Tensor:
         """Log densities ``[2, S]`` of residuals, by the prior and as proposed."""
@@ -284,7 +287,7 @@ class Sampler:
             gaussian = self._residual.gaussian(policy)
             own = policy[SITE]
             drawn = gaussian.sample().view(own.shape)
-            anyhow = torch.arange(number, device=own.device) < ANYHOW * number
+            anyhow = torch.arange(number, device=own.device) < DEFENSIVE_SHARE * number
             policy[SITE] = torch.where(anyhow.view(number, *(1,) * (own.dim() - 1)), own, drawn)
             found = self._residual_densities(policy, gaussian)
             self._log_residual = torch.cat([self._log_residual, found], 1)
@@ -304,7 +307,7 @@ class Sampler:
         for names in (self.sites, self.supports):
             own = [log_priors[name] for name in names]
             groups.append(torch.stack(own).sum(0) if own else place.new_zeros(len(joint)))
-        groups[0] = groups[0] + _stretch(self.sites, place)
+        groups[0] = groups[0] + _log_abs_det(self.sites, place)
         self._log_prior = torch.cat([self._log_prior, torch.stack(groups)], 1)
 
     def weighted(self) -> Weighted:
@@ -317,7 +320,9 @@ class Sampler:
         prior = either = torch.zeros_like(of_scalars)
         if self._residual is not None:
             prior, proposed = self._log_residual
-            either = torch.logaddexp(prior + math.log(ANYHOW), proposed + math.log1p(-ANYHOW))
+            either = torch.logaddexp(
+                prior + math.log(DEFENSIVE_SHARE), proposed + math.log1p(-DEFENSIVE_SHARE)
+            )
         places_in = {
             name: (policy[name].flatten()[:, None] == support).long().argmax(-1)
             for name, support in self.supports.items()
@@ -405,7 +410,7 @@ def places(sites: Mapping[str, Any], policy: Mapping[str, Tensor], number: int =
     return torch.stack([site.inv(policy[name].flatten()) for name, site in sites.items()], -1)
 
 
-def _stretch(sites: Mapping[str, Any], place: Tensor) -> Tensor:
+def _log_abs_det(sites: Mapping[str, Any], place: Tensor) -> Tensor:
     """Log of by how much space is stretched on the way from unconstrained space, ``[S]``."""
     total = place.new_zeros(len(place))
     for column, site in enumerate(sites.values()):
@@ -418,7 +423,7 @@ def _smoothed(raw: Tensor) -> tuple[Tensor, float]:
     raw = raw.double()
     if float(raw.max() - raw.min()) < 1e-9:
         return torch.log_softmax(raw, 0), -math.inf
-    from mirror_ppl.inference.export import az
+    from mirror_ppl.arviz import az
 
     smooth, pareto_k = az.psislw(raw.cpu().numpy())
     return torch.log_softmax(torch.as_tensor(smooth, device=raw.device), 0), float(pareto_k)

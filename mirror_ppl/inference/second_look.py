@@ -1,8 +1,8 @@
 """Going through a person's rounds twice, where what they attend to differs from round to round.
 
 What stands for all that they may have attended to is chosen by who they are
-(:mod:`mirror_ppl.models.attention`), which is not known when their rounds are seen for the first
-time. The first look tells roughly; the second chooses by that.
+(:mod:`mirror_ppl.likelihood.attention`), which is not known when their rounds are seen for the
+first time. The first look tells roughly; the second chooses by that.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from dataclasses import replace
 from torch import Tensor
 
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.sampler import Weighted
-from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 
-LIKELY_DRAWS, ROUGH_DRAWS = 64, 256
+LIKELY_DRAWS, COARSE_DRAWS = 64, 256
 """Draws of the person by which attention is chosen, and proposals of a stage of the first look."""
 
 Round = tuple[Observation, Visibility, Tensor, Tensor]
-"""What :meth:`Sightings.add` takes."""
+"""What :meth:`ViewTableBuilder.add` takes."""
 
 
 def looks_twice(human: HumanModel) -> bool:
@@ -30,11 +30,11 @@ def looks_twice(human: HumanModel) -> bool:
     return human.has_round_latents and not human.chained
 
 
-def rough(options: ImportanceOptions) -> ImportanceOptions:
+def coarse(options: ImportanceOptions) -> ImportanceOptions:
     """Settings under which one learns roughly who somebody is."""
     return replace(
         options,
-        proposals=min(ROUGH_DRAWS, options.proposals),
+        proposals=min(COARSE_DRAWS, options.proposals),
         enough=min(LIKELY_DRAWS, options.enough),
     )
 
@@ -44,9 +44,9 @@ def second_look(
     rounds: Sequence[Round],
     screening: Screening | None,
     options: ImportanceOptions,
-    sightings: Sightings,
+    builder: ViewTableBuilder,
     found: Weighted,
-) -> tuple[Sightings, Weighted]:
+) -> tuple[ViewTableBuilder, Weighted]:
     """Weighted draws of one person, from the global random state.
 
     Args:
@@ -54,14 +54,14 @@ def second_look(
         rounds: all that is recorded of the person.
         screening: when to give up combinations of discrete sites.
         options: settings of the second time.
-        sightings: of the first time.
+        builder: of the first time.
         found: of the first time.
 
     Returns:
         The rounds as seen the second time, and what they say.
     """
-    likely = found.sample(LIKELY_DRAWS, sightings.grid)
-    again = Sightings(human, screening, likely=likely)
+    likely = found.sample(LIKELY_DRAWS, builder.grid)
+    again = ViewTableBuilder(human, screening, likely=likely)
     for one_round in rounds:
         again.add(*one_round)
-    return again, sample_exactly(human, again.table(), options, found)
+    return again, sample_importance(human, again.table(), options, found)

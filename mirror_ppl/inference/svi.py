@@ -25,15 +25,15 @@ from torch.distributions import biject_to
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.checks import real_number, whole_number
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.combinations import discrete_sites
-from mirror_ppl.inference.exact import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.inference.marginal_elbo import PLATES, marginal_elbo
-from mirror_ppl.inference.prior import Draws, sample_sites, values_of
-from mirror_ppl.inference.views import combination_scores, restricted
+from mirror_ppl.likelihood.combinations import discrete_sites
+from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
+from mirror_ppl.likelihood.tables import combination_scores, restricted
+from mirror_ppl.likelihood.view_table import NO_VIEW, ViewTable
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import Draws, sample_sites, values_of
 from mirror_ppl.models.sites import discrete_names, latent_sites
-from mirror_ppl.models.view_table import NO_VIEW, ViewTable
 
 Report = Callable[[str, int, int, str], None]
 """Told of long work: what it is, how many steps are done, of how many, and a message."""

@@ -8,8 +8,8 @@ import pyro
 from torch import Tensor
 
 from mirror_ppl.likelihood.densities import choices
+from mirror_ppl.likelihood.view_table import RecordedActions, ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import RecordedActions, ViewTable
 
 
 def log_likelihoods(human: HumanModel, implants: Mapping[str, Tensor], table: ViewTable) -> Tensor:

@@ -138,7 +138,7 @@ class HumanModel(nn.Module):
         those read throughout come first. Their distributions do not depend on each other's values.
         Nothing is known unless this is overridden, nor where a class that derives from the one that
         does overrides ``round_latents``, ``sees`` or ``perceive`` and not this: then values are
-        drawn that stand for all there could be (:mod:`mirror_ppl.models.attention`).
+        drawn that stand for all there could be (:mod:`mirror_ppl.likelihood.attention`).
 
         Args:
             observation: of one round, as far as it went, ``[t, K, F]``; t is 0 of padding.

@@ -5,38 +5,19 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
-
-import pyro
-import torch
-from pyro import poutine
-from pyro.poutine.util import site_is_subsample
-from torch import Tensor
 
 from mirror_ppl.checks import require_kind
-from mirror_ppl.domains import Domain
-from mirror_ppl.errors import HumanModelError, MirrorError
-from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.searcher_variants import KnowingRobot, KnowingSearcher, PerceptualSearcher
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
-from mirror_ppl.models.span_contract import check_spans_hold
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.user_code import describe, remember_file
 
-AXES = (
-    *("chain", "draw", "person", "round", "test_round", "step", "time", "direction", "sample"),
-    *("action", "action_name", "action_probability", "action_entropy", "observed_action", "ego"),
-    *("ego_feature", "site", "scenario", "residual_input", "residual_unit"),
-    "residual_unit_and_bias",
-)
-"""Names of dimensions and other variables in posterior files."""
-PREFIXES = ("told_", "truth_")
-"""With which names of variables of recordings begin."""
 MIRROR = "mirror"
 """The package's own model; which it is depends on the domain."""
 OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
@@ -124,165 +105,3 @@ def load_human_model(
         return chosen(self_model)
     except (Exception, SystemExit) as error:
         raise HumanModelError(f"{name} cannot be made: {describe(error, path)}") from error
-
-
-@torch.no_grad()
-def check_contract(human: HumanModel) -> None:
-    """Try a human model on a made-up round, so that faults are found before long work.
-
-    Raises:
-        HumanModelError: a method fails or returns the wrong thing; names the method and the line.
-    """
-    require_kind(human, HumanModel, "human")
-    domain = human.domain
-    device = next(human.parameters()).device
-    generator = torch.Generator(device).manual_seed(0)
-    people, steps, actions = 2, 3, len(domain.actions)
-    state, observed = domain.initial(people, generator), []
-    none, done = (torch.full((people,), action, device=device) for action in (actions, 0))
-    for _ in range(steps):
-        observed.append(domain.observe(state))
-        state = domain.transition(state, done)
-    told = {
-        m.name: torch.zeros(people, len(m.items), dtype=torch.bool, device=device)
-        for m in domain.modalities
-    }
-    method = "prior"
-    try:
-        with (
-            torch.random.fork_rng(devices=[]),
-            poutine.block(),
-            poutine.trace() as trace,
-            pyro.plate("person", people, dim=-2),
-        ):
-            torch.manual_seed(0)
-            implants = human.prior()
-            if not isinstance(implants, Mapping):
-                raise HumanModelError(
-                    f"prior returned {type(implants).__name__}, expected a dict of sites by name"
-                )
-            method = "round_latents"
-            latents = _round_latents(human, implants, people)
-            for name in set(latents) & set(latent_sites(trace.trace)):
-                raise HumanModelError(f'"{name}" is a site of prior() and of round_latents()')
-            sampled = latent_values(trace.trace)
-            discrete = {
-                name: sampled[name].flatten()[:people].expand(people)
-                for name in sampled
-                if name in discrete_names(trace.trace)
-            }
-            belief = next(human.parameters()).new_zeros(people, human.belief_size)
-            knowledge: Any = domain.nothing_known(people, device=device)
-            for step, now in enumerate(observed):
-                method = "perceive"
-                readable = Readable(discrete | latents)
-                view, knowledge = human.perceive(readable, knowledge, now, told, step)
-                method = "evidence"
-                evidence = human.evidence(view, now)
-                method = "believe"
-                belief = human.belief_after(
-                    belief, evidence, none if step == 0 else done, view.still
-                )
-                if tuple(belief.shape) != (people, human.belief_size):
-                    raise HumanModelError(
-                        f"believe returned shape {tuple(belief.shape)}, expected "
-                        f"({people}, {human.belief_size}) for {people} beliefs"
-                    )
-                method = "act"
-                _check_act(human, implants, belief)
-        _check_names(domain, [*latent_sites(trace.trace), *latents])
-        method = "spans"
-        if human.chained:
-            check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
-        _check_sites(trace.trace, people)
-    except MirrorError:
-        raise
-    except (Exception, SystemExit) as error:
-        file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
-        where = describe(error, None if file is None else Path(file))
-        raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
-
-
-def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
-    """Runs inside the person plate, of people with a round each; of beliefs ``[P, Z]``."""
-    belief = belief[:, None]
-    with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-        found = human.act(implants, belief, human.action_values(belief))
-    for name in latent_sites(trace.trace):
-        raise HumanModelError(f'act samples "{name}" at every step; sample it in prior')
-    _refuse_parameters(trace.trace)
-    expected = (len(belief), 1, len(human.domain.actions))
-    if tuple(found.shape[-3:]) != expected:
-        raise HumanModelError(
-            f"act returned shape {tuple(found.shape)}, expected {expected} for (people, rounds, "
-            "actions)"
-        )
-    total = found.exp().sum(-1)
-    if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
-        raise HumanModelError("act has to return log-probabilities: they do not sum to 1")
-
-
-def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[str, Tensor]:
-    """What differs from round to round, in one round of each ``[people]``."""
-    with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-        returned = human.round_latents(implants)
-    sites = latent_sites(trace.trace)
-    if not isinstance(returned, Mapping) or set(returned) != set(sites):
-        raise HumanModelError(
-            "round_latents has to return a dict of the sites that it samples, by name"
-        )
-    for name, site in trace.trace.nodes.items():
-        if not sites and site["type"] == "sample" and not site_is_subsample(site):
-            raise HumanModelError(
-                f'round_latents has "{name}", but no site that differs from round to round: put it '
-                "into prior"
-            )
-    _refuse_parameters(trace.trace)
-    for name, site in sites.items():
-        if not site["fn"].support.is_discrete:
-            raise HumanModelError(f'"{name}" of round_latents is not discrete')
-        shape, event = tuple(site["fn"].batch_shape), tuple(site["fn"].event_shape)
-        if event or torch.broadcast_shapes(shape, (people, 1)) != (people, 1):
-            raise HumanModelError(
-                f'"{name}" of round_latents has shape {shape} and event shape {event}, expected '
-                f"({people}, 1) and () for {people} people with one round"
-            )
-        if not site["fn"].has_enumerate_support:
-            raise HumanModelError(f'"{name}" of round_latents has no finite support')
-    return {name: site["value"].flatten()[:people].expand(people) for name, site in sites.items()}
-
-
-def _check_names(domain: Domain, sites: Iterable[str]) -> None:
-    """Refuse names of sites that posterior files have for something else, or cannot have."""
-    taken = {*AXES, *(f"{m.name}_item" for m in domain.modalities)}
-    taken |= {part for m in domain.modalities for part in (m.name, f"{m.name}_feature")}
-    for name in sites:
-        if not name.isprintable() or name != name.strip() or set(name) & {"/"}:
-            raise HumanModelError(f'"{name}" cannot be the name of a site: use plain words')
-        if name in taken or name.startswith(PREFIXES):
-            raise HumanModelError(
-                f'"{name}" cannot be the name of a site: posterior files call something else so'
-            )
-
-
-def _refuse_parameters(trace: poutine.Trace) -> None:
-    for name, site in trace.nodes.items():
-        if site["type"] == "param":
-            raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
-
-
-def _check_sites(trace: poutine.Trace, people: int) -> None:
-    """Refuse what could be sampled, but not inferred."""
-    _refuse_parameters(trace)
-    for name, site in latent_sites(trace).items():
-        fn = site["fn"]
-        if fn.support.is_discrete and not fn.has_enumerate_support:
-            raise HumanModelError(
-                f'"{name}" is discrete without finite support; it can be neither enumerated nor '
-                "approximated"
-            )
-        if tuple(fn.batch_shape) != (people, 1):
-            raise HumanModelError(
-                f'"{name}" has batch shape {tuple(fn.batch_shape)}, expected ({people}, 1) for '
-                f"{people} people; use .to_event() for several numbers a person"
-            )

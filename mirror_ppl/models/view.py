@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from mirror_ppl.distinct import as_whole_numbers, random_keys
 from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.row_hashing import as_whole_numbers, random_keys
 
 
 @dataclass(frozen=True)

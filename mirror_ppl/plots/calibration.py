@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import binom
 
-from mirror_ppl.inference.ranks import LEVELS, Calibration
-from mirror_ppl.inference.uniformity import ecdf_band, rank_edges
+from mirror_ppl.inference.calibration.ranks import LEVELS, Calibration
+from mirror_ppl.inference.calibration.uniformity import ecdf_band, rank_edges
 from mirror_ppl.plots.implants import TITLES
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE, PURPLE
@@ -32,8 +32,9 @@ def plot_ranks(calibration: Calibration) -> Picture:
 
     Right posteriors give a flat histogram, 99.9% of whose bars end inside of the grey band. Those
     that are too narrow give one that is high at both ends, too wide ones a hill, and shifted ones a
-    slope. The bars are those of :func:`mirror_ppl.inference.uniformity.histogram_p_value`, relative
-    to what is expected.
+    slope. The bars are those of
+    :func:`mirror_ppl.inference.calibration.uniformity.histogram_p_value`, relative to what is
+    expected.
     """
     edges = rank_edges(calibration.people, calibration.draws)
     expected = calibration.people * np.diff(edges) / edges[-1]

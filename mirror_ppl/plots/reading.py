@@ -1,4 +1,4 @@
-"""What figures read of an ``InferenceData`` that :mod:`mirror_ppl.inference.export` made."""
+"""What figures read of an ``InferenceData`` of :mod:`mirror_ppl.inference.results.export`."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def plot_round(
     predictive probability of switching lanes, and what the person did.
 
     Args:
-        data: with the groups of :mod:`mirror_ppl.inference.export`.
+        data: with the groups of :mod:`mirror_ppl.inference.results.export`.
         person: id of the person.
         round: number of the round, counted from 0.
         held_out: count the held-out rounds, not those that were learned from.

@@ -12,6 +12,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.likelihood.attention import attention_nodes, attention_sites
 from mirror_ppl.likelihood.densities import (
     BATCH,
     check_plates,
@@ -19,7 +20,6 @@ from mirror_ppl.likelihood.densities import (
     log_prob,
     prior_nodes,
 )
-from mirror_ppl.models.attention import attention_nodes, attention_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 

@@ -35,17 +35,17 @@ from mirror_ppl.inference.amortized import (
     require_network_of,
     sample_amortized,
 )
-from mirror_ppl.inference.importance import ImportanceOptions, sample_exactly
+from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.nuts import sample_nuts
-from mirror_ppl.inference.pooling import POOLINGS, Pooling, Population
-from mirror_ppl.inference.prior import Draws, sample_sites
-from mirror_ppl.inference.recorded import check_rounds
-from mirror_ppl.inference.second_look import LIKELY_DRAWS, looks_twice, rough, second_look
-from mirror_ppl.inference.sightings import Screening, Sightings
+from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
+from mirror_ppl.inference.second_look import LIKELY_DRAWS, coarse, looks_twice, second_look
 from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
-from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.likelihood.tables import build_view_table, rounds_of
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import Draws, sample_sites
+from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
@@ -89,7 +89,7 @@ class InferenceOptions:
         screening: when to give up combinations of discrete sites; ``None`` for never. That of the
             amortized guide is its own.
         pooling: ``none``, or ``partial`` to infer with the people the population that they are
-            from (:mod:`mirror_ppl.inference.pooling`).
+            from (:mod:`mirror_ppl.inference.population.pooling`).
         refine: gradient steps of ``svi`` that start at what ``amortized`` or ``exact`` found.
         allow_contradictions: share of recorded steps, from 0 to 1, that may contradict the next
             observation.
@@ -261,7 +261,7 @@ def _likely(
     """Roughly who people are, where what stands for all they may attend to hangs on that."""
     if not looks_twice(human):
         return None
-    roughly = replace(options, guide="exact", draws=LIKELY_DRAWS, exact=rough(options.exact))
+    roughly = replace(options, guide="exact", draws=LIKELY_DRAWS, exact=coarse(options.exact))
     return dict(_by_importance(human, demonstrations, roughly, seed, None, report, None).draws)
 
 
@@ -281,21 +281,24 @@ def _by_importance(
     with torch.random.fork_rng(devices=[]):
         for person in range(len(done), people):
             report("infer", person, people, "people")
-            sightings, rounds = Sightings(human, screening), list(rounds_of(demonstrations, person))
+            builder, rounds = (
+                ViewTableBuilder(human, screening),
+                list(rounds_of(demonstrations, person)),
+            )
             for one_round in rounds:
-                sightings.add(*one_round)
+                builder.add(*one_round)
             # Whatever the number of draws that others took.
             torch.manual_seed((seed + 1) * 1_000_003 + person)
             if network is None:
-                first = rough(options.exact) if looks_twice(human) else options.exact
-                found = sample_exactly(human, sightings.table(), first)
+                first = coarse(options.exact) if looks_twice(human) else options.exact
+                found = sample_importance(human, builder.table(), first)
             else:
-                found = sample_amortized(human, network, sightings)
+                found = sample_amortized(human, network, builder)
             if looks_twice(human):
-                sightings, found = second_look(
-                    human, rounds, screening, options.exact, sightings, found
+                builder, found = second_look(
+                    human, rounds, screening, options.exact, builder, found
                 )
-            done.draws.append(found.sample(options.draws, sightings.grid))
+            done.draws.append(found.sample(options.draws, builder.grid))
             done.pareto_k.append(found.pareto_k)
             if checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
                 done.save(*checkpoint)

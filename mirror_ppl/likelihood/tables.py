@@ -11,11 +11,11 @@ from torch.nn.functional import pad
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.sightings import RoundViews, Screening, Sightings
-from mirror_ppl.models.attention import VALUES
-from mirror_ppl.models.chain import Chain
+from mirror_ppl.likelihood.attention import VALUES
+from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
+from mirror_ppl.likelihood.view_table_builder import RoundViews, Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
 
 
 def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
@@ -138,7 +138,7 @@ def build_view_table(
             :meth:`ViewTable.combination`); all of them unless given.
         screening: when to give up combinations on the way; never unless given.
         report: called with the number of people done.
-        likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`Sightings`.
+        likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`ViewTableBuilder`.
         values: of attention that stand for all in a round, see there.
 
     Raises:
@@ -151,10 +151,10 @@ def build_view_table(
         if likely is not None:
             own = {name: value[:, person : person + 1] for name, value in likely.items()}
         some = None if candidates is None else candidates[person]
-        sightings = Sightings(human, screening, some, own, values)
+        builder = ViewTableBuilder(human, screening, some, own, values)
         for one_round in rounds_of(demonstrations, person):
-            sightings.add(*one_round)
-        tables.append(sightings.table())
+            builder.add(*one_round)
+        tables.append(builder.table())
         report(person + 1)
     return _joined(tables, demonstrations)
 
@@ -204,7 +204,7 @@ def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> View
 def rounds_of(
     demonstrations: Demonstrations, person: int
 ) -> Iterator[tuple[Observation, Visibility, Tensor, Tensor]]:
-    """A person's rounds, as :meth:`Sightings.add` takes them.
+    """A person's rounds, as :meth:`ViewTableBuilder.add` takes them.
 
     Of somebody without rounds there is one of padding, so that there is something to look up.
     """

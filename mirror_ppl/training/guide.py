@@ -27,15 +27,15 @@ from mirror_ppl.inference.amortized import (
     log_evidence,
     reference_places,
 )
-from mirror_ppl.inference.calibration import prior_people
-from mirror_ppl.inference.guides import run_identity
-from mirror_ppl.inference.prior import sample_sites
+from mirror_ppl.inference.calibration.study import prior_people
+from mirror_ppl.inference.engines import run_identity
 from mirror_ppl.inference.sampler import places, scalar_sites
-from mirror_ppl.inference.sightings import Sightings
-from mirror_ppl.inference.simulation import play_rounds
 from mirror_ppl.inference.svi import Report, silent
-from mirror_ppl.inference.views import rounds_of
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.models.simulation import play_rounds
 
 
 @dataclass(frozen=True)
@@ -151,13 +151,13 @@ def simulate_examples(
 def _evidence(
     human: HumanModel, recordings: Demonstrations, person: int, options: GuideOptions
 ) -> tuple[Tensor, Tensor]:
-    sightings = Sightings(human, guide_screening())
+    builder = ViewTableBuilder(human, guide_screening())
     evidence, steps, total = [], [], 0
     for number, one_round in enumerate(rounds_of(recordings, person), 1):
-        sightings.add(*one_round)
+        builder.add(*one_round)
         total += int(one_round[-1].sum())
         if number in options.rounds:
-            evidence.append(log_evidence(sightings))
+            evidence.append(log_evidence(builder))
             steps.append(total)
     return torch.stack(evidence), torch.tensor(steps)
 

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mirror_ppl.distinct import distinct_rows
 from mirror_ppl.domains import Observation
-from mirror_ppl.inference.courses import beliefs_and_values
-from mirror_ppl.models.chain import Chain
+from mirror_ppl.likelihood.belief_nodes import beliefs_and_values
+from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view import View
-from mirror_ppl.models.view_table import NO_VIEW
+from mirror_ppl.row_hashing import distinct_rows
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ with simulation-based calibration*, 2018) for human models, whatever makes the p
     psi_p^s  ~ infer(rounds_p),   s = 1 .. S           draws from the posterior to be tested
 
 Where inference is right, the rank of psi_p among its S draws is uniform over 0 .. S, whatever the
-model. :mod:`mirror_ppl.inference.ranks` looks at the ranks; here they are made.
+model. :mod:`mirror_ppl.inference.calibration.ranks` looks at the ranks; here they are made.
 
 Departures from the paper: ties, of which discrete sites have many, are broken at random; uniformity
-is tested, in two ways (:mod:`mirror_ppl.inference.uniformity`).
+is tested, in two ways (:mod:`mirror_ppl.inference.calibration.uniformity`).
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.guides import Inferred
-from mirror_ppl.inference.prior import Draws, sample_sites
-from mirror_ppl.inference.ranks import Calibration, collect, judge
-from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.calibration.ranks import Calibration, collect, judge
+from mirror_ppl.inference.engines import Inferred
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import Draws, sample_sites
+from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.netcdf import read_netcdf
 from mirror_ppl.workers import run_tasks

@@ -12,9 +12,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, total_reward
+from mirror_ppl.domains.base import (
+    Domain,
+    Observation,
+    Visibility,
+    map_state,
+    roll_out,
+    total_reward,
+)
 from mirror_ppl.models.self_model import Rounds, SelfModel
-from mirror_ppl.models.training_views import ViewPlan
+from mirror_ppl.training.views import ViewPlan
 
 
 @dataclass(frozen=True)
@@ -60,14 +67,6 @@ class Experience:
     def steps(self) -> slice:
         """At which steps of the rounds there are outcomes."""
         return slice(self.first, None, self.stride)
-
-
-def roll_out(domain: Domain, start: Any, actions: Tensor) -> Any:
-    """States ``[B, T + 1]`` of rounds from ``start`` ``[B]`` under ``actions`` ``[B, T]``."""
-    states = [start]
-    for action in actions.unbind(1):
-        states.append(domain.transition(states[-1], action))
-    return map_state(lambda *parts: torch.stack(parts, 1), *states)
 
 
 def experience(

@@ -10,8 +10,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains.base import Observation, Visibility, map_state, total_reward
-from mirror_ppl.inference.experience import roll_out
+from mirror_ppl.domains.base import Observation, Visibility, map_state, roll_out, total_reward
 from mirror_ppl.models.human import HumanModel, Implants, messages_at
 
 

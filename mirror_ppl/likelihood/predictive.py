@@ -14,12 +14,12 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from mirror_ppl.inference.exact import conditioned
 from mirror_ppl.inference.marginal_elbo import PLATES
+from mirror_ppl.likelihood.chain import NEVER, NO_VALUE, Chain
 from mirror_ppl.likelihood.densities import choices, log_weighted_latents
-from mirror_ppl.models.chain import NEVER, NO_VALUE, Chain
+from mirror_ppl.likelihood.enumeration import conditioned
+from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable
 
 DRAWS = 50
 """Draws for which attention is summed out at once; bounds memory."""

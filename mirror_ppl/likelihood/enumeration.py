@@ -15,12 +15,12 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.combinations import discrete_sites, grid_of, log_priors
-from mirror_ppl.inference.views import combination_scores
+from mirror_ppl.likelihood.combinations import discrete_sites, grid_of, log_priors
 from mirror_ppl.likelihood.densities import choices
 from mirror_ppl.likelihood.table_program import log_likelihoods, of_moments
+from mirror_ppl.likelihood.tables import combination_scores
+from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import ViewTable
 
 CHUNK = 2**21
 """Steps of views, of all draws together, that are worked out at once; bounds memory."""

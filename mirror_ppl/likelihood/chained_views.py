@@ -2,7 +2,7 @@
 
 A state is what is left of all that a person may have attended to so far: a belief, what the domain
 says they know, and the values that are read throughout the round. States that are the same in that
-are one (:mod:`mirror_ppl.models.chain`). n stands for states with a value each.
+are one (:mod:`mirror_ppl.likelihood.chain`). n stands for states with a value each.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.models.attention import attention_sites
-from mirror_ppl.models.chain import Chain, Level
+from mirror_ppl.likelihood.attention import attention_sites
+from mirror_ppl.likelihood.chain import Chain, Level
+from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.spans import check_spans
 from mirror_ppl.models.view import View
-from mirror_ppl.models.view_table import NO_VIEW
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ human model's own prior. So with S draws of those posteriors, up to a constant::
     p(actions_p | population) = mean over s of  p(psi_p^s | population) / p(psi_p^s | own prior)
 
 (Hogg, Myers and Bovy, *Inferring the eccentricity distribution*, 2010). The population is inferred
-by Gibbs sampling (:mod:`mirror_ppl.inference.population_sampler`), and people are drawn anew by the
+by Gibbs sampling (:mod:`mirror_ppl.inference.population.sampler`), and people are drawn anew by the
 same weights. Somebody without rounds has draws of the prior, weights that only tell of the
 population, and so its predictive: round zero.
 """
@@ -35,15 +35,15 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from mirror_ppl.inference.population_sampler import (
+from mirror_ppl.inference.population.sampler import (
     HyperPriors,
     PeoplesDraws,
     sample_population,
 )
-from mirror_ppl.inference.prior import Draws, sample_sites, values_of
 from mirror_ppl.inference.sampler import places, scalar_sites
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import Draws, sample_sites, values_of
 
 POOLINGS = ("none", "partial")
 MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100

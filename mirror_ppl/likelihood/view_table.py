@@ -16,8 +16,8 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
+from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.densities import log_weighted_latents
-from mirror_ppl.models.chain import Chain
 from mirror_ppl.models.human import HumanModel, Implants
 
 NO_VIEW = -1

@@ -19,33 +19,33 @@ from pyro import poutine
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mirror_ppl.distinct import as_whole_numbers, distinct_rows, random_keys
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.alike import fixed_prior
-from mirror_ppl.inference.chained_views import chained_views
-from mirror_ppl.inference.combinations import (
+from mirror_ppl.likelihood.attention import KEPT, VALUES, AttentionValues, Proposal
+from mirror_ppl.likelihood.belief_nodes import CHUNK
+from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.chained_views import chained_views
+from mirror_ppl.likelihood.combination_sets import fixed_prior
+from mirror_ppl.likelihood.combinations import (
     grid_of,
     log_priors,
     perceived_sites,
     require_own_attention,
 )
-from mirror_ppl.inference.courses import CHUNK
-from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.round_views import RoundViews, round_views
 from mirror_ppl.likelihood.densities import (
     choices,
     log_weighted_latents,
     require_compilable,
 )
-from mirror_ppl.models.attention import KEPT, VALUES, AttentionValues, Proposal
-from mirror_ppl.models.chain import Chain
+from mirror_ppl.likelihood.round_views import RoundViews, round_views
+from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable, along_views
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import NO_VIEW, Attention, ViewTable, along_views
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
 
 PROPOSING_WAYS = 64
 """Draws from the prior by which attention is proposed where nothing is screened."""
-TONED_DOWN = 4.0
+TEMPERATURE = 4.0
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Screening:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
 
 
-class Sightings:
+class ViewTableBuilder:
     """What a person may have seen in their rounds so far.
 
     Args:
@@ -293,7 +293,7 @@ class Sightings:
             return torch.full((number,), 1 / number, device=self.alive.device)
         joint = (self.score + self.log_prior)[:, self.alive].logsumexp(-1)
         # Toned down: few ways would have all the weight, and none of them is the person.
-        return torch.softmax(joint / TONED_DOWN, 0)
+        return torch.softmax(joint / TEMPERATURE, 0)
 
     def _padded_to(self, steps: int, which: int) -> Tensor:
         """Recorded actions (0) or real steps (1) of all rounds, ``[B, T]``."""

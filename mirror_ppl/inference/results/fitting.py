@@ -15,14 +15,14 @@ from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.amortized import AmortizedGuide
-from mirror_ppl.inference.guides import InferenceOptions, Inferred, infer, run_identity
-from mirror_ppl.inference.pooling import Pooling, Population
-from mirror_ppl.inference.posterior_predictive import predict_people
-from mirror_ppl.inference.prior import draw_prior
-from mirror_ppl.inference.recorded import check_rounds
-from mirror_ppl.inference.summary import summarize, summarize_newcomer
+from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
+from mirror_ppl.inference.population.pooling import Pooling, Population
+from mirror_ppl.inference.results.posterior_predictive import predict_people
+from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 
 if TYPE_CHECKING:
@@ -142,8 +142,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         {name: value.cpu() for name, value in draws.items()} for draws in (posterior.draws, prior)
     )
 
-    from mirror_ppl.inference.export import in_units, to_inference_data
-    from mirror_ppl.inference.population_file import add_population
+    from mirror_ppl.inference.results.export import in_units, to_inference_data
+    from mirror_ppl.inference.results.population_file import add_population
 
     pooling = options.pooling if population is None else "known population"
     attributes = _attributes(human, train, options, pooling, seed)

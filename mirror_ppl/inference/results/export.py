@@ -15,7 +15,6 @@ but for those of the guide ``nuts`` and of pooled people, which follow a chain.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,18 +24,14 @@ import torch
 import xarray as xr
 from torch import Tensor
 
+from mirror_ppl.arviz import az
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.files import write_whole
-from mirror_ppl.inference.identifiability import Identifiability
-from mirror_ppl.inference.posterior_predictive import Predictions
+from mirror_ppl.inference.results.identifiability import Identifiability
+from mirror_ppl.inference.results.posterior_predictive import Predictions
 from mirror_ppl.models.implants import SIGHT
-
-with warnings.catch_warnings():
-    # ArviZ announces its next major version at the first import of each day.
-    warnings.simplefilter("ignore", FutureWarning)
-    import arviz as az
 
 
 def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:

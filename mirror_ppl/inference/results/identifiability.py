@@ -28,16 +28,16 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.inference.combinations import perceived_sites
-from mirror_ppl.inference.exact import acts_on_beliefs, combination_values, log_joints
-from mirror_ppl.inference.pooling import Pooling, Population
-from mirror_ppl.inference.sightings import Screening, Sightings
-from mirror_ppl.inference.simulation import play_rounds
+from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.svi import Report, silent
-from mirror_ppl.inference.views import build_view_table, rounds_of
+from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.enumeration import acts_on_beliefs, combination_values, log_joints
 from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import build_view_table, rounds_of
+from mirror_ppl.likelihood.view_table import combination_number
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import combination_number
+from mirror_ppl.models.simulation import play_rounds
 
 NEGLIGIBLE = 0.005
 """Nats below which nothing is open; they are told as 0.00."""
@@ -257,11 +257,11 @@ def _information(
     implants |= {site: value[which][:, None] for site, value in grid.items()}
     scenario = torch.arange(number, device=pairs.device).repeat_interleave(rounds)
     played = play_rounds(human, implants, 1, setting, generator, scenario)
-    sightings = Sightings(human, None, candidates, policy, VALUES)
+    builder = ViewTableBuilder(human, None, candidates, policy, VALUES)
     for player in range(len(players)):
         for one_round in rounds_of(played, player):
-            sightings.add(*one_round)
-    table = sightings.table()
+            builder.add(*one_round)
+    table = builder.table()
     with (
         poutine.block(),
         poutine.condition(data=dict(policy)),

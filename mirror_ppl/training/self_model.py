@@ -24,11 +24,11 @@ from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
-from mirror_ppl.inference.experience import Experience, drive, experience
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
-from mirror_ppl.models.training_views import KIND_PROBABILITIES, KINDS, draw_views
+from mirror_ppl.training.experience import Experience, drive, experience
+from mirror_ppl.training.views import KIND_PROBABILITIES, KINDS, draw_views
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class SelfModelOptions:
         difference_weight: how often errors count by which actions differ, besides the errors
             themselves. What people choose hangs on differences alone.
         kinds: share of rounds that are seen in full, with items dropped, and by limited sight; see
-            `mirror_ppl.models.training_views`.
+            `mirror_ppl.training.views`.
         exact: whether somebody who knows all that counts learns the exact planner's values, and
             not what a step leads to.
     """

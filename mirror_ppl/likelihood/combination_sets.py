@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mirror_ppl.distinct import distinct_rows
-from mirror_ppl.inference.combinations import log_priors
-from mirror_ppl.inference.prior import sample_sites, values_of
+from mirror_ppl.likelihood.combinations import log_priors
+from mirror_ppl.likelihood.view_table import NO_VIEW, ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view_table import NO_VIEW, ViewTable
+from mirror_ppl.models.prior import sample_sites, values_of
+from mirror_ppl.row_hashing import distinct_rows
 
 TRIED = 64
 """Draws of the other implants under which priors of combinations are compared."""

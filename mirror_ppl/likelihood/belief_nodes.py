@@ -9,10 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mirror_ppl.distinct import distinct_rows, random_keys
 from mirror_ppl.domains import Observation
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.view import View
+from mirror_ppl.row_hashing import distinct_rows, random_keys
 
 CHUNK = 4096
 """What is computed at once; bounds memory."""

@@ -1,0 +1,10 @@
+"""ArviZ without its announcement."""
+
+import warnings
+
+with warnings.catch_warnings():
+    # ArviZ announces its next major version at the first import of each day.
+    warnings.simplefilter("ignore", FutureWarning)
+    import arviz as az
+
+__all__ = ["az"]

@@ -1,0 +1,1 @@
+"""Simulation-based calibration: are posteriors as sure as they may be?"""

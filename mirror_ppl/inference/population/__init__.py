@@ -1,0 +1,1 @@
+"""Partial pooling: the population that people are from, inferred with them."""
