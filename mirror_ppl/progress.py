@@ -1,6 +1,7 @@
 """Progress of long work, shown on stderr."""
 
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from time import monotonic
 from types import TracebackType
@@ -8,6 +9,14 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+Report = Callable[[str, int, int, str], None]
+"""Told of long work: what it is, how many steps are done, of how many, and a message."""
+
+
+def silent(name: str, done: int, total: int, message: str) -> None:
+    """Report nothing."""
 
 
 class Progress:

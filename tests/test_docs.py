@@ -25,8 +25,9 @@ from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.engines import InferenceOptions
 from mirror_ppl.inference.importance import PRUNING_DRAWS, ImportanceOptions
 from mirror_ppl.inference.results.fitting import fit_people
-from mirror_ppl.inference.svi import PLATES, FitOptions, continuous_guide
+from mirror_ppl.inference.svi import FitOptions, continuous_guide
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.likelihood.tables import Screening, build_view_table
 from mirror_ppl.models import HumanModel

@@ -28,13 +28,14 @@ from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.importance import ImportanceOptions
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.sampler import Sampler, places, scalar_sites
+from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.inference.svi import FitOptions
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.prior import scalar_sites, unconstrained
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import RATES, ToyHuman, toy_posterior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -321,7 +322,7 @@ def test_the_guide_is_a_program_with_the_density_it_says(toy, recordings, networ
     sites = scalar_sites(toy)
     trace = pyro.poutine.trace(network).get_trace(sites, log_evidence, steps)
     values = {site: trace.nodes[site]["value"] for site in RATES}
-    place = places(sites, {site: value[None] for site, value in values.items()})
+    place = unconstrained(sites, {site: value[None] for site, value in values.items()})
     expected = network.density(evidence.log_evidence, steps[0]).log_prob(place)
     for column, site in enumerate(sites.values()):
         value = site(place[:, column])

@@ -14,10 +14,10 @@ from mirror_ppl.inference import importance
 from mirror_ppl.inference import sampler as sampler_module
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
 from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
-from mirror_ppl.inference.sampler import Sampler, Weighted, places, scalar_sites
+from mirror_ppl.inference.sampler import Sampler, Weighted
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.prior import draw_prior, scalar_sites, unconstrained
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.toy import RATES, ToyHuman
 from mirror_ppl.people import simulate
@@ -180,7 +180,7 @@ def test_a_relative_gaussian_is_the_density_of_what_it_draws(toy):
     """Of the logit of a rate given ``evenness``: a Gaussian with the prior's first two moments."""
     sites = scalar_sites(toy)
     drawn = draw_prior(toy, 1, 400, 0)
-    place = places(sites, drawn)
+    place = unconstrained(sites, drawn)
     torch.manual_seed(0)
     proposal = RelativeProposal(
         toy,

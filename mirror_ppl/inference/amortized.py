@@ -27,12 +27,13 @@ import torch
 from torch import Tensor, nn
 
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.sampler import Sampler, Weighted, places, scalar_sites
+from mirror_ppl.inference.sampler import Sampler, Weighted
 from mirror_ppl.likelihood.combination_sets import Alike
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import layers
+from mirror_ppl.models.prior import scalar_sites, unconstrained
 
 WAYS = 64
 COMPONENTS = 4
@@ -165,7 +166,7 @@ class AmortizedGuide(nn.Module):
 def reference_places(human: HumanModel) -> Tensor:
     """Places ``[W, D]`` of the ways that evidence is about; always the same of a human model."""
     builder = ViewTableBuilder(human, guide_screening())
-    return places(scalar_sites(human), builder.draw_ways())
+    return unconstrained(scalar_sites(human), builder.draw_ways())
 
 
 def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:

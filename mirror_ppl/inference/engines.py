@@ -39,7 +39,7 @@ from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.nuts import sample_nuts
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.inference.second_look import LIKELY_DRAWS, coarse, looks_twice, second_look
-from mirror_ppl.inference.svi import FitOptions, Report, fit_implants, silent
+from mirror_ppl.inference.svi import FitOptions, fit_implants
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.limits import LIMITS
@@ -47,6 +47,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.progress import Report, silent
 
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
 PEOPLE_AT_ONCE = 50

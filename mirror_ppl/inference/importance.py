@@ -14,9 +14,10 @@ from pyro.distributions import MultivariateStudentT
 from torch import Tensor
 
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
-from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted, places
+from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import unconstrained
 
 PLAIN_STAGES = 2
 """Stages after which the residual is proposed, too, where it hardly matters."""
@@ -99,7 +100,7 @@ def sample_importance(
     sampler.draw(few)
     sampler.prune(options.prune_margin)
     if near is not None and sampler.sites:
-        found = places(sampler.sites, near.policy)
+        found = unconstrained(sampler.sites, near.policy)
         near = near.tempered(LEARNED_FROM)
         sampler.propose(near_to(found, near.log_weights), options.proposals)
     elif options.proposals > few:

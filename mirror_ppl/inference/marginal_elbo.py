@@ -15,13 +15,11 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
+from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.table_program import TableProgram
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
-
-PLATES = 2
-"""People and their rounds; what is summed over goes to the left of them."""
 
 
 def marginal_elbo(

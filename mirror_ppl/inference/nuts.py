@@ -7,7 +7,7 @@ import torch
 from pyro.infer import MCMC, NUTS
 from pyro.infer.autoguide import init_to_median
 
-from mirror_ppl.inference.svi import PLATES, Report, silent
+from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.likelihood.enumeration import (
     draw_combinations,
     log_joints,
@@ -17,6 +17,7 @@ from mirror_ppl.likelihood.table_program import TableProgram
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
+from mirror_ppl.progress import Report, silent
 
 WARMUP = 200
 

@@ -18,13 +18,13 @@ from mirror_ppl.inference.amortized import (
     sample_amortized,
 )
 from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
-from mirror_ppl.inference.sampler import Weighted, scalar_sites
+from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import Round, coarse, looks_twice, second_look
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import Draws, sample_sites
+from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites
 from mirror_ppl.models.recorded import check_rounds
 
 ENOUGH = 64.0

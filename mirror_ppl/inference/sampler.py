@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal, biject_to
+from torch.distributions import MultivariateNormal
 
 from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
 from mirror_ppl.likelihood.combination_sets import Alike, fixed_prior
@@ -35,7 +35,7 @@ from mirror_ppl.likelihood.enumeration import (
 from mirror_ppl.likelihood.tables import restricted
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import Draws, sample_sites, values_of
+from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
 
 DEFENSIVE_SHARE = 0.1
 """Share of what is proposed that is not by what was learned, of the residual and of discrete sites.
@@ -205,7 +205,7 @@ class Sampler:
 
     def add_prior_draws(self, policy: Draws, joint: Tensor) -> None:
         """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
-        place = places(self.sites, policy, len(joint))
+        place = unconstrained(self.sites, policy, len(joint))
         # All of it is given: priors may hang on any of these sites.
         own = (*self.sites, *self.supports)
         _, log_priors = _completed(self.human, self.table, policy, len(joint), own)
@@ -391,23 +391,6 @@ def _policy_supports(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
             and node["fn"].event_dim == 0
             and name not in table.sites
         }
-
-
-def scalar_sites(human: HumanModel) -> dict[str, Any]:
-    """Continuous sites of one number a person, with the map from unconstrained space."""
-    with torch.random.fork_rng(devices=[]):
-        return {
-            name: biject_to(node["fn"].support)
-            for name, node in sample_sites(human, 1).items()
-            if not node["fn"].has_enumerate_support and node["fn"].event_dim == 0
-        }
-
-
-def places(sites: Mapping[str, Any], policy: Mapping[str, Tensor], number: int = 0) -> Tensor:
-    """The scalar sites of draws in unconstrained space, ``[S, D]``; S is given if D is 0."""
-    if not sites:
-        return torch.zeros(number, 0)
-    return torch.stack([site.inv(policy[name].flatten()) for name, site in sites.items()], -1)
 
 
 def _log_abs_det(sites: Mapping[str, Any], place: Tensor) -> Tensor:

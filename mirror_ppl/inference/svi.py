@@ -25,8 +25,9 @@ from torch.distributions import biject_to
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.checks import real_number, whole_number
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.marginal_elbo import PLATES, marginal_elbo
+from mirror_ppl.inference.marginal_elbo import marginal_elbo
 from mirror_ppl.likelihood.combinations import discrete_sites
+from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joint
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.likelihood.tables import combination_scores, restricted
@@ -34,14 +35,7 @@ from mirror_ppl.likelihood.view_table import NO_VIEW, ViewTable
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, values_of
 from mirror_ppl.models.sites import discrete_names, latent_sites
-
-Report = Callable[[str, int, int, str], None]
-"""Told of long work: what it is, how many steps are done, of how many, and a message."""
-
-
-def silent(name: str, done: int, total: int, message: str) -> None:
-    """Report nothing."""
-
+from mirror_ppl.progress import Report, silent
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100

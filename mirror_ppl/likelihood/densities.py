@@ -24,6 +24,8 @@ from mirror_ppl.models.human import ACTION, HumanModel
 
 BATCH = 3
 """Dimensions of draws, people and their rounds; combinations of discrete values go before them."""
+PLATES = 2
+"""People and their rounds; what is summed over goes to the left of them."""
 SPARE = 6
 """Dimensions that draws and enumeration may take to the left of people and rounds."""
 

@@ -14,9 +14,8 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from mirror_ppl.inference.marginal_elbo import PLATES
 from mirror_ppl.likelihood.chain import NEVER, NO_VALUE, Chain
-from mirror_ppl.likelihood.densities import choices, log_weighted_latents
+from mirror_ppl.likelihood.densities import PLATES, choices, log_weighted_latents
 from mirror_ppl.likelihood.enumeration import conditioned
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.human import HumanModel

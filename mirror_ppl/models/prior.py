@@ -10,6 +10,7 @@ import pyro
 import torch
 from pyro import poutine
 from torch import Tensor
+from torch.distributions import biject_to
 from torch.distributions.constraints import Constraint
 
 from mirror_ppl.checks import as_tensor, require_kind, seed_number, whole_number
@@ -149,3 +150,22 @@ def _possible(support: Constraint, value: Tensor) -> Tensor:
         for limit in (torch.inf, -torch.inf):
             possible = possible | support.check(value.nextafter(torch.full_like(value, limit)))
     return possible
+
+
+def scalar_sites(human: HumanModel) -> dict[str, Any]:
+    """Continuous sites of one number a person, with the map from unconstrained space."""
+    with torch.random.fork_rng(devices=[]):
+        return {
+            name: biject_to(node["fn"].support)
+            for name, node in sample_sites(human, 1).items()
+            if not node["fn"].has_enumerate_support and node["fn"].event_dim == 0
+        }
+
+
+def unconstrained(
+    sites: Mapping[str, Any], policy: Mapping[str, Tensor], number: int = 0
+) -> Tensor:
+    """The scalar sites of draws in unconstrained space, ``[S, D]``; S is given if D is 0."""
+    if not sites:
+        return torch.zeros(number, 0)
+    return torch.stack([site.inv(policy[name].flatten()) for name, site in sites.items()], -1)

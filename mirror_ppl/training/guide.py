@@ -29,13 +29,12 @@ from mirror_ppl.inference.amortized import (
 )
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import run_identity
-from mirror_ppl.inference.sampler import places, scalar_sites
-from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.models.prior import sample_sites, scalar_sites, unconstrained
 from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.progress import Report, silent
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ def simulate_examples(
             *(_evidence(human, recordings, person, options) for person in range(number)),
             strict=True,
         )
-        place = places(scalar_sites(human), implants)
+        place = unconstrained(scalar_sites(human), implants)
         parts.append(Examples(place, torch.stack(evidence), torch.stack(steps)))
         done += number
         if checkpoint is not None:

@@ -36,12 +36,12 @@ from mirror_ppl.errors import PosteriorError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.calibration.ranks import Calibration, collect, judge
 from mirror_ppl.inference.engines import Inferred
-from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.netcdf import read_netcdf
+from mirror_ppl.progress import Report, silent
 from mirror_ppl.workers import run_tasks
 
 PRIOR_PEOPLE = 4000

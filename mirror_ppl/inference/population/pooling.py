@@ -40,10 +40,9 @@ from mirror_ppl.inference.population.sampler import (
     PeoplesDraws,
     sample_population,
 )
-from mirror_ppl.inference.sampler import places, scalar_sites
-from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import Draws, sample_sites, values_of
+from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
+from mirror_ppl.progress import Report, silent
 
 POOLINGS = ("none", "partial")
 MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
@@ -115,7 +114,7 @@ class Pooling:
             if name not in human.of_the_world and not _has_parents(node)
         }
         self.sites = {name: site for name, site in scalar_sites(human).items() if name in nodes}
-        drawn = places(self.sites, values_of(nodes), PRIOR_DRAWS)
+        drawn = unconstrained(self.sites, values_of(nodes), PRIOR_DRAWS)
         self.centre, self.width = drawn.mean(0), drawn.std(0)
         self.supports, self.prior_chances = {}, {}
         for name, node in nodes.items():
@@ -186,7 +185,7 @@ class Pooling:
             value = nodes[name]["value"]
             total = total + nodes[name]["fn"].log_prob(value).expand(number, people, 1)[..., 0]
         # In unconstrained space.
-        place = places(self.sites, draws)
+        place = unconstrained(self.sites, draws)
         stretch = place.new_zeros(len(place))
         for column, site in enumerate(self.sites.values()):
             at = place[:, column]

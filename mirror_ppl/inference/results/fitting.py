@@ -19,11 +19,11 @@ from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.results.posterior_predictive import predict_people
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
-from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.progress import Report, silent
 
 if TYPE_CHECKING:
     import arviz as az

@@ -29,7 +29,6 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.population.pooling import Pooling, Population
-from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, combination_values, log_joints
 from mirror_ppl.likelihood.table_program import log_likelihoods
@@ -38,6 +37,7 @@ from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.progress import Report, silent
 
 NEGLIGIBLE = 0.005
 """Nats below which nothing is open; they are told as 0.00."""

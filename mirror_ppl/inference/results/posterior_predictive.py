@@ -17,7 +17,6 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.results.summary import score
-from mirror_ppl.inference.svi import Report, silent
 from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.tables import build_view_table
@@ -25,6 +24,7 @@ from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.models.recorded import check_rounds
+from mirror_ppl.progress import Report, silent
 
 PEOPLE_AT_ONCE = 16
 """People whose views are in memory together. With a multiple of 16, predictions equal those of all
