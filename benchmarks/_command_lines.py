@@ -80,7 +80,7 @@ NAMES = {
     "domain": ("driving", "search_rescue", "bomb_defusal", "Driving", "drivin"),
     "setting": ("clear", "fog", "smoke", "labelled", "unlabelled", "foggy"),
     "population": ("paper", "diverse", "papers"),
-    "guide": ("exact", "amortized", "svi", "nuts", "exakt"),
+    "guide": ("importance", "exact", "amortized", "svi", "nuts", "exakt"),
     "pooling": ("none", "partial", "full"),
     "device": ("cpu", "cuda", "cuda:0", "cuda:99", "gpu", "meta", "cpu:7", "mps"),
     "human_model": (

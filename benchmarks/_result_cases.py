@@ -32,7 +32,7 @@ from mirror_ppl.training.guide_file import load_guide
 
 Values = Mapping[str, object]
 POOLED = "pooled"
-QUICK = ("--guide", "exact", "--draws", "20", "--train-rounds", "2", "--explore", "0")
+QUICK = ("--guide", "importance", "--draws", "20", "--train-rounds", "2", "--explore", "0")
 GUIDES = {"driving_guide": None, "driving_guide_per_item": "per-item"}
 WHOLE = 5
 """One of six versions of a posterior: with all groups, which is slow to read."""

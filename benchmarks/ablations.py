@@ -198,7 +198,7 @@ def learned(name: str, human: HumanModel, group: Group) -> Posterior:
     train = group.recordings().select_rounds(slice(TRAINING))
     if name in RELAXED:
         return Posterior(human, relaxed_draws(human, train, RELAXED[name], DRAWS, group.seed))
-    guide = "svi" if name == "svi" else "exact"
+    guide = "svi" if name == "svi" else "importance"
     draws = infer(human, train, InferenceOptions(guide, DRAWS), group.seed).draws
     if name == "plug-in":
         each = predict_rounds(human, train, draws)  # [S, P, B, T, A]

@@ -35,8 +35,8 @@ def main() -> None:
     human = HumanModel(load_self_model(shipped_weights("driving"))[0])
     network, _ = load_guide(shipped_guide("driving"), human)
     recordings = load_demonstrations(asset_path(f"driving_fog_{options.population}.nc"))
-    seconds = {"amortized": [], "exact": []}
-    marginals = {"amortized": [], "exact": []}
+    seconds = {"amortized": [], "importance": []}
+    marginals = {"amortized": [], "importance": []}
     worst = dict.fromkeys(seconds, 0.0)
     # The first asking of a process loads libraries.
     warm = OnlinePosterior(human, network)
@@ -44,7 +44,7 @@ def main() -> None:
     warm.draws()
     for person in range(options.people):
         one = recordings.select_people([person])
-        for name, guide in (("amortized", network), ("exact", None)):
+        for name, guide in (("amortized", network), ("importance", None)):
             online, taken = OnlinePosterior(human, guide), []
             for number in range(options.rounds):
                 began = perf_counter()

@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--domain", default="driving")
     parser.add_argument("--setting", default="fog")
     parser.add_argument("--seed", type=int, default=100)
-    parser.add_argument("--guide", default="exact")
+    parser.add_argument("--guide", default="importance")
     options = parser.parse_args()
     print("people  seconds  peak MB  results MB  peak/person  results/person", flush=True)
     before = None

@@ -32,8 +32,9 @@ from mirror_ppl.communication import (
     SimulatorWorld,
 )
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.svi import FitOptions, fit_implants
-from mirror_ppl.likelihood.tables import Screening, build_view_table
+from mirror_ppl.inference.svi import SVIOptions, fit_implants
+from mirror_ppl.likelihood.compiled import compile
+from mirror_ppl.likelihood.view_table_builder import Screening
 from mirror_ppl.models import HumanModel, SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -58,10 +59,9 @@ def main(options: Options) -> None:
     recordings = recordings.select_people([recordings.people[0]])
     self_model, _ = load_self_model(shipped_weights("driving"))
     human = HumanModel(self_model)
-    table = build_view_table(
-        human, recordings.select_rounds(list(range(20))), screening=Screening()
-    )
-    posterior = fit_implants(human, table, FitOptions(draws=options.draws), 0)
+    learned = recordings.select_rounds(list(range(20)))
+    compiled = compile(human, learned, screening=Screening())
+    posterior = fit_implants(compiled, SVIOptions(), options.draws, 0)
     person = Person(human, posterior.draws)
     pasts = moments(recordings, options.decisions)
     channels = Channels(human.domain)

@@ -16,8 +16,10 @@ import torch
 from torch import Tensor
 from torch.distributions import biject_to
 
-from mirror_ppl.inference.svi import continuous_guide, negative_elbo
+from mirror_ppl.inference.marginal_elbo import MarginalELBO
+from mirror_ppl.inference.svi import continuous_guide
 from mirror_ppl.likelihood.combinations import grid_of, log_priors, perceived_sites
+from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.tables import Screening, build_view_table
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
@@ -82,8 +84,13 @@ def main() -> None:
     recordings = simulate("driving", "fog", "paper", options.people, options.rounds, 0)
     table = build_view_table(human, recordings, screening=Screening())
     pyro.set_rng_seed(0)
-    guide = continuous_guide(human, table)
-    elbo = negative_elbo(human, table, guide)
+    compiled = ViewTables(human, table)
+    guide = continuous_guide(compiled)
+
+    def elbo(_: ViewTable) -> Tensor:
+        with pyro.settings.context(module_local_params=True):
+            return MarginalELBO(compiled).differentiable_loss(compiled.program, guide)
+
     by_hand = ByHand(human, table)
     print(f"the same loss: {difference(by_hand, guide, elbo, table):.1e} nats apart")
     steps = {"pyro": (elbo, (table,)), "by hand": (by_hand, None)}
@@ -115,7 +122,7 @@ def difference(by_hand: ByHand, guide, elbo, table: ViewTable) -> float:
     noise = {}
     torch.manual_seed(1)
     with torch.no_grad():
-        drawn = guide(table)
+        drawn = guide()
         for name, fn in by_hand.priors.items():
             loc, scale = guide._get_loc_and_scale(name)
             by_hand.loc[name].copy_(loc)

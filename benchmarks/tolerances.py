@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains import get_domain
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.engines import InferenceOptions
-from mirror_ppl.inference.importance import ImportanceOptions
 from mirror_ppl.inference.results.fitting import Fit, fit_people
 from mirror_ppl.likelihood.tables import Screening
 from mirror_ppl.models.human import HumanModel
@@ -43,7 +43,7 @@ def main() -> None:
     usual = InferenceOptions(draws=800)
     careful = InferenceOptions(
         draws=800,
-        exact=ImportanceOptions(prune_margin=40.0),
+        settings=ImportanceOptions(prune_margin=40.0),
         screening=Screening(margin=40.0, resolution=0.0),
     )
     for population in options.populations:

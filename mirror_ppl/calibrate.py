@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -9,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mirror_ppl.console import console_for_tables, run
-from mirror_ppl.errors import OptionError, UnknownNameError
+from mirror_ppl.errors import OptionError
+from mirror_ppl.inference.names import current_name
 from mirror_ppl.limits import check_numbers
 from mirror_ppl.progress import Progress
 
@@ -41,8 +43,8 @@ class Options:
     setting: str | None = None
     """The setting under which rounds are recorded; what people see is up to their implants.
     Default: the one in which people see less."""
-    guide: str = "exact"
-    """What to test: amortized, exact, svi or nuts."""
+    guide: str = "importance"
+    """What to test: importance, amortized, svi or nuts."""
     guide_file: Path | None = None
     """Network of the guide amortized (see `python -m mirror_ppl.train --what guide`)."""
     people: int = 500
@@ -88,15 +90,17 @@ def main(options: Options) -> int:
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.files import output_folder, write_together
     from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
-    from mirror_ppl.inference.engines import GUIDES, InferenceOptions, run_identity
+    from mirror_ppl.inference.engines import InferenceOptions, run_identity
     from mirror_ppl.likelihood.contract import check_contract
     from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
     from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
     from mirror_ppl.training.guide_file import network_for
 
-    if options.guide not in GUIDES:
-        raise UnknownNameError.of("guide", options.guide, GUIDES)
+    guide, note = current_name(options.guide)
+    if note is not None:
+        print(f"--guide: {note}", file=sys.stderr)
+    settings = InferenceOptions(guide, options.draws)
     known = get_domain(options.domain).settings
     setting = require_known(options.setting or known[-1], "setting", known, options.domain)
     weights = options.self_model or shipped_weights(options.domain)
@@ -106,8 +110,7 @@ def main(options: Options) -> int:
     # What is so for everybody is learned first, as by a fit: people are drawn from what is open.
     name = f"{options.domain}_{setting}_paper.nc"
     human.learn_world(load_demonstrations(asset_path(name)))
-    network = network_for(options.guide, options.guide_file, human)
-    settings = InferenceOptions(options.guide, options.draws)
+    network = network_for(guide, options.guide_file, human)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     what = [settings, setting, options.seed, trial]
     identity = run_identity(human, network, what)
@@ -131,7 +134,7 @@ def main(options: Options) -> int:
             file.unlink()
         with suppress(OSError):  # something else is in it
             parts.rmdir()
-    _show(calibration, options.guide)
+    _show(calibration, guide)
     print(f"{folder / 'calibration.nc'}: ranks of every person")
     for path in drawn:
         print(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from mirror_ppl.console import run, usable_device
 from mirror_ppl.errors import OptionError
+from mirror_ppl.inference.names import current_name
 from mirror_ppl.limits import check_numbers, require_memory, share
 from mirror_ppl.progress import Stages
 
@@ -55,10 +57,10 @@ class Options:
     one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
-    guide: str = "exact"
-    """How to infer: exact (what people see marginalized, how they decide by importance sampling),
-    amortized (the same, proposed at once by a trained network), svi (variational) or nuts
-    (Hamiltonian Monte Carlo, slow)."""
+    guide: str = "importance"
+    """How to infer: importance (what people see summed out exactly, how they decide by importance
+    sampling), amortized (the same, proposed at once by a trained network), svi (variational) or
+    nuts (Hamiltonian Monte Carlo, slow)."""
     guide_file: Path | None = None
     """Network of the guide amortized (see `python -m mirror_ppl.train --what guide`)."""
     pooling: str = "none"
@@ -75,7 +77,7 @@ class Options:
     steps: int = 300
     """Gradient steps of svi."""
     refine: int = 0
-    """Gradient steps of svi that start at what amortized or exact found; none unless given."""
+    """Gradient steps of svi that start at what amortized or importance found; none unless given."""
     draws: int = 200
     """Posterior draws."""
     seed: int = 0
@@ -88,8 +90,8 @@ class Options:
             raise OptionError("--guide-file is for --guide amortized")
         if self.prior_from is not None and self.pooling != "none":
             raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
-        if self.refine and self.guide not in ("amortized", "exact"):
-            raise OptionError("--refine is for --guide amortized and exact")
+        if self.refine and current_name(self.guide)[0] not in ("amortized", "importance"):
+            raise OptionError("--refine is for --guide amortized and importance")
         check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed")
         share(self.allow_contradictions, "--allow-contradictions")
 
@@ -111,7 +113,7 @@ def main(options: Options) -> None:
     from mirror_ppl.inference.results.fitting import fit_people
     from mirror_ppl.inference.results.identifiability import identify
     from mirror_ppl.inference.results.population_file import load_population
-    from mirror_ppl.inference.svi import FitOptions
+    from mirror_ppl.inference.svi import SVIOptions
     from mirror_ppl.likelihood.contract import check_contract
     from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -120,11 +122,13 @@ def main(options: Options) -> None:
     from mirror_ppl.training.guide_file import network_for
 
     device = usable_device(options.device)
-    svi = FitOptions(steps=options.steps)
+    guide, note = current_name(options.guide)
+    if note is not None:
+        print(f"--guide: {note}", file=sys.stderr)
     settings = InferenceOptions(
-        options.guide,
+        guide,
         options.draws,
-        svi,
+        SVIOptions(steps=options.steps) if guide == "svi" else None,
         pooling=options.pooling,
         refine=options.refine,
         allow_contradictions=share(options.allow_contradictions, "--allow-contradictions"),
@@ -133,7 +137,7 @@ def main(options: Options) -> None:
     self_model, _ = load_self_model(weights, demonstrations.domain)
     human = load_human_model(options.human_model, self_model.to(device))
     check_contract(human)
-    network = network_for(options.guide, options.guide_file, human)
+    network = network_for(guide, options.guide_file, human)
     population = None
     if options.prior_from is not None:
         pooling = Pooling(human)

@@ -41,7 +41,7 @@ warnings.filterwarnings("ignore", message="IProgress not found")
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.engines import InferenceOptions, infer
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -76,9 +76,9 @@ train = recordings.select_rounds(range(rounds))
 person = "person-04"
 one = train.select_people([person])
 options = {
-    "exact": InferenceOptions("exact", 400),
+    "importance": InferenceOptions("importance", 400),
     "amortized": InferenceOptions("amortized", 400),
-    "svi": InferenceOptions("svi", 400, FitOptions(steps=10 if quick else 300)),
+    "svi": InferenceOptions("svi", 400, SVIOptions(steps=10 if quick else 300)),
 }
 posteriors, seconds = {}, {}
 for name, settings in options.items():

@@ -16,11 +16,11 @@ from mirror_ppl.communication.worlds import SelfModelWorld
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import InferenceOptions, infer
-from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.online import OnlinePosterior
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.attention import KEPT, VALUES, choose_values, site_probabilities
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.densities import log_weighted_latents
@@ -399,11 +399,11 @@ def test_other_guides_agree_with_importance_sampling(self_model, guide):
     truth = {NOTICES[0]: torch.tensor([[0.1]])}
     rounds = play_rounds(human, truth, 6, "fog", torch.Generator().manual_seed(1))
     found = {}
-    for name in ("exact", guide):
-        options = InferenceOptions(name, 100, svi=FitOptions(steps=150))
+    for name in ("importance", guide):
+        options = InferenceOptions(name, 100, settings=SVIOptions(steps=150))
         found[name] = infer(human, rounds, options, 0).draws[NOTICES[0]].flatten()
-    assert abs(found[guide].mean() - found["exact"].mean()) < 0.15
-    assert 0.5 < found[guide].std() / found["exact"].std() < 2
+    assert abs(found[guide].mean() - found["importance"].mean()) < 0.15
+    assert 0.5 < found[guide].std() / found["importance"].std() < 2
 
 
 def test_rounds_that_come_in_are_those_that_were_there(self_model, recordings):

@@ -22,13 +22,14 @@ from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
+from mirror_ppl.inference.adaptive_importance import PRUNING_DRAWS, ImportanceOptions
 from mirror_ppl.inference.engines import InferenceOptions
-from mirror_ppl.inference.importance import PRUNING_DRAWS, ImportanceOptions
 from mirror_ppl.inference.results.fitting import fit_people
-from mirror_ppl.inference.svi import FitOptions, continuous_guide
+from mirror_ppl.inference.svi import SVIOptions, continuous_guide
+from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.densities import PLATES
-from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
+from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import Screening, build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
@@ -165,7 +166,7 @@ def test_every_page_is_listed_in_the_readme():
     ("name", "heading", "options"),
     [
         ("docs/self_model.md", "Setting", SelfModelOptions()),
-        ("docs/human_model.md", "Setting of `svi` (`FitOptions`)", FitOptions()),
+        ("docs/human_model.md", "Setting of `svi` (`SVIOptions`)", SVIOptions()),
         ("docs/human_model.md", "Setting of `exact` (`ImportanceOptions`)", ImportanceOptions()),
     ],
 )
@@ -234,8 +235,8 @@ def test_shortcuts_are_told_with_their_tolerances():
     assert f"of {Screening().ways} ways" in text
     assert f"under each of {Screening().alike} of those ways" in text
     assert f"a grid of {Screening().resolution} nats" in text
-    assert f"the same at {FitOptions().prune_margin:.0f} nats" in text
-    assert FitOptions().prune_margin == ImportanceOptions().prune_margin
+    assert f"the same at {SVIOptions().prune_margin:.0f} nats" in text
+    assert SVIOptions().prune_margin == ImportanceOptions().prune_margin
     assert f"under {PRUNING_DRAWS} draws of the prior" in text
 
 
@@ -357,11 +358,11 @@ def test_late_gets_a_gradient_for_each_person(results, self_model):
     human = load_human_model(f"{ROOT}/{EXAMPLE}", self_model)
     check_contract(human)
     recordings = load_demonstrations(results / "runs" / "people.nc").select_rounds(slice(0, 3))
-    table = build_view_table(human, recordings, screening=Screening())
+    compiled = compile(human, recordings, screening=Screening())
     with pyro.settings.context(module_local_params=True):
-        guide = continuous_guide(human, table)
-        model = config_enumerate(TableProgram(human), "parallel")
-        TraceEnum_ELBO(max_plate_nesting=PLATES)(model, guide)(table).backward()
+        guide = continuous_guide(compiled)
+        model = config_enumerate(compiled.program, "parallel")
+        TraceEnum_ELBO(max_plate_nesting=PLATES)(model, guide)().backward()
     gradients = {name: value.grad for name, value in guide.named_parameters()}
     for part in ("locs", "scales"):
         gradient = next(g for name, g in gradients.items() if name.startswith(f"{part}.late"))

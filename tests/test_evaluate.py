@@ -79,14 +79,14 @@ def test_everybody_learns_everywhere(name, domain):
 
 @pytest.mark.parametrize(
     ("name", "guide"),
-    [("mirror", "exact"), ("mirror-amortized", "amortized")]
+    [("mirror", "importance"), ("mirror-amortized", "amortized")]
     + [(f"mirror-{guide}", guide) for guide in ("svi", "nuts")],
 )
 def test_mirror_is_inferred_by_the_guide_of_its_name(name, guide, monkeypatch):
     asked = []
 
     def noted(human, rounds, options, *args, **others):
-        asked.append(options.guide)
+        asked.append(options.engine)
         return Inferred({})
 
     monkeypatch.setattr("mirror_ppl.evaluation.learners.infer", noted)

@@ -16,7 +16,8 @@ from mirror_ppl import calibrate as calibrate_command
 from mirror_ppl import fit, simulate, train
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
-from mirror_ppl.inference import engines
+from mirror_ppl.inference import importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
     evidence_of,
@@ -26,10 +27,9 @@ from mirror_ppl.inference.amortized import (
 )
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
-from mirror_ppl.inference.importance import ImportanceOptions
 from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.sampler import Sampler
-from mirror_ppl.inference.svi import FitOptions
+from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
@@ -69,7 +69,7 @@ def network(toy):
 
 
 def options_of(guide):
-    return InferenceOptions(guide, DRAWS, FitOptions(steps=400))
+    return InferenceOptions(guide, DRAWS, SVIOptions(steps=400))
 
 
 def bound(variance, draws):
@@ -80,7 +80,7 @@ def bound(variance, draws):
 # --- against the exact posterior --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("guide", ["exact", "amortized"])
+@pytest.mark.parametrize("guide", ["importance", "amortized"])
 def test_importance_finds_the_exact_posterior(toy, recordings, network, guide):
     found = infer(toy, recordings, options_of(guide), 1, network)
     exact = toy_posterior(toy, recordings)
@@ -144,7 +144,7 @@ def test_the_exact_posterior_by_hand(toy, recordings):
         torch.testing.assert_close(mean, exact.mean(site)[0], atol=2e-3, rtol=0)
 
 
-@pytest.mark.parametrize("guide", ["exact", "amortized"])
+@pytest.mark.parametrize("guide", ["importance", "amortized"])
 def test_importance_is_calibrated(toy, network, guide):
     options = CalibrationOptions(people=120, rounds=(1, 3), batch=60)
     result = calibrate(toy, Infer(toy, guide, network), options, "fog", seed=5)
@@ -158,7 +158,7 @@ class Infer:
         self.human, self.guide, self.network, self.change = human, guide, network, change
 
     def __call__(self, recordings, seed):
-        options = InferenceOptions(self.guide, 99, exact=ImportanceOptions(256, 100.0))
+        options = InferenceOptions(self.guide, 99, settings=ImportanceOptions(256, 100.0))
         found = infer(self.human, recordings, options, seed, self.network)
         draws = {name: self.change(name, value) for name, value in found.draws.items()}
         return Inferred(draws, found.pareto_k)
@@ -222,10 +222,10 @@ def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
     assert torch.equal(kept, behind <= 0.5)
 
 
-@pytest.mark.parametrize("guide", ["exact", "svi"])
+@pytest.mark.parametrize("guide", ["importance", "svi"])
 def test_models_with_little_to_infer(toy, recordings, guide):
     """Sight alone, and an implant that actions do not depend on."""
-    some, few = recordings.select_people([0]), FitOptions(steps=2)
+    some, few = recordings.select_people([0]), SVIOptions(steps=2)
 
     class OnlySight(ToyHuman):
         def act(self, implants, belief, values):
@@ -241,7 +241,7 @@ def test_models_with_little_to_infer(toy, recordings, guide):
     human = OnlySight(toy.self_model)
     draws = infer(human, some, InferenceOptions(guide, 40, few), 0).draws
     assert draws["reach"].shape == draws["in_sight"].shape == (40, 1, 1)
-    if guide == "exact":  # svi needs a continuous site for its guide
+    if guide == "importance":  # svi needs a continuous site for its guide
         draws = infer(OnlyReach(toy.self_model), some, InferenceOptions(guide, 40), 0).draws
         assert list(draws) == ["reach"] and draws["reach"].shape == (40, 1, 1)
 
@@ -255,14 +255,14 @@ def test_a_prior_that_depends_on_what_is_seen_is_refused(toy, recordings):
             return implants
 
     human = Hierarchical(toy.self_model)
-    for guide in ("exact", "svi"):
+    for guide in ("importance", "svi"):
         with pytest.raises(HumanModelError, match='"depends" depends on a discrete site'):
-            infer(human, recordings, InferenceOptions(guide, 5, FitOptions(steps=1)), 0)
+            infer(human, recordings, InferenceOptions(guide, 5, SVIOptions(steps=1)), 0)
 
 
 def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):
     nobody = ragged(recordings, [[]] * 6)
-    for guide in ("exact", "amortized"):
+    for guide in ("importance", "amortized"):
         found = infer(toy, nobody, options_of(guide), 2, network)
         values = found.draws["otherwise"][..., 0].flatten()
         assert stats.kstest(values.numpy(), stats.beta(1, 4).cdf).pvalue > 1e-4
@@ -360,7 +360,7 @@ def test_training_goes_on_where_it_was(toy, tmp_path):
 
 
 def test_people_do_not_depend_on_who_else_is_there(toy, recordings, network):
-    for guide in ("exact", "amortized"):
+    for guide in ("importance", "amortized"):
         together = infer(toy, recordings.select_people([0, 1]), options_of(guide), 0, network)
         alone = infer(toy, recordings.select_people([0]), options_of(guide), 0, network)
         for name, value in alone.draws.items():
@@ -369,7 +369,7 @@ def test_people_do_not_depend_on_who_else_is_there(toy, recordings, network):
 
 
 def test_inference_goes_on_from_its_checkpoint(toy, recordings, tmp_path, monkeypatch):
-    monkeypatch.setattr(engines, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    monkeypatch.setattr(importance, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     run = (tmp_path / "fit.checkpoint", "this run")
 
     def stop(name, done, total, message):
@@ -377,18 +377,18 @@ def test_inference_goes_on_from_its_checkpoint(toy, recordings, tmp_path, monkey
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        infer(toy, recordings, options_of("exact"), 0, None, stop, run)
+        infer(toy, recordings, options_of("importance"), 0, None, stop, run)
     done = []
     resumed = infer(
-        toy, recordings, options_of("exact"), 0, None, lambda *told: done.append(told[1]), run
+        toy, recordings, options_of("importance"), 0, None, lambda *told: done.append(told[1]), run
     )
     assert done == [4, 5, 6]
-    whole = infer(toy, recordings, options_of("exact"), 0)
+    whole = infer(toy, recordings, options_of("importance"), 0)
     for name, value in whole.draws.items():
         assert torch.equal(resumed.draws[name], value)
     assert torch.equal(resumed.pareto_k, whole.pareto_k)
     with pytest.raises(CheckpointError, match="other options"):
-        infer(toy, recordings, options_of("exact"), 0, checkpoint=(run[0], "another"))
+        infer(toy, recordings, options_of("importance"), 0, checkpoint=(run[0], "another"))
 
 
 class Other(ToyHuman):
@@ -410,10 +410,10 @@ def test_models_whose_views_are_not_enough_are_refused(self_model, recordings):
     table = build_view_table(human, some)
     assert not acts_on_beliefs(human, table)
     assert acts_on_beliefs(ToyHuman(self_model), table)
-    for guide in ("exact", "nuts"):
+    for guide in ("importance", "nuts"):
         with pytest.raises(HumanModelError, match="only the guide svi"):
             infer(human, some, InferenceOptions(guide), 0)
-    draws = infer(human, some, InferenceOptions("svi", 50, FitOptions(steps=2)), 0).draws
+    draws = infer(human, some, InferenceOptions("svi", 50, SVIOptions(steps=2)), 0).draws
     assert draws["reach"].shape == (50, 1, 1)
 
 
@@ -430,7 +430,9 @@ def test_the_package_s_own_model_and_its_prior(self_model):
     human = HumanModel(self_model)
     some = load_demonstrations(asset_path("driving_fog_paper.nc"))
     some = some.select_people([0]).select_rounds([0, 1])
-    found = infer(human, some, InferenceOptions("exact", 50, exact=ImportanceOptions(128, 10.0)), 0)
+    found = infer(
+        human, some, InferenceOptions("importance", 50, settings=ImportanceOptions(128, 10.0)), 0
+    )
     assert list(found.draws)[:4] == [f"sight_{name}" for name in human.domain.directions]
     assert found.draws["residual_in"].shape[:3] == (50, 1, 1)
     guide = AmortizedGuide(reference_places(human))
@@ -449,7 +451,7 @@ def test_a_guide_is_read_as_it_was_written(toy, network, tmp_path):
     assert card == {"quality": {"loss": 1.0}}
     for name, value in network.state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
-    assert network_for("exact", path, toy) is None
+    assert network_for("importance", path, toy) is None
     assert isinstance(network_for("amortized", path, toy), AmortizedGuide)
 
 

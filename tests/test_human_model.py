@@ -14,11 +14,12 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import ROAD_END, DrivingState
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.inference.svi import FitOptions, continuous_guide, fit_implants
+from mirror_ppl.inference.svi import SVIOptions, continuous_guide, fit_implants
+from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.enumeration import log_joint
 from mirror_ppl.likelihood.predictive import predict_actions
-from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
+from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models import HumanModel, View
@@ -464,10 +465,11 @@ def test_every_continuous_implant_gets_a_gradient_from_the_elbo(human, table):
 
     def gradients(table):
         torch.manual_seed(0)
-        guide = continuous_guide(human, table)
+        compiled = ViewTables(human, table)
+        guide = continuous_guide(compiled)
         torch.manual_seed(1)
-        model = config_enumerate(TableProgram(human), "parallel")
-        TraceEnum_ELBO(max_plate_nesting=2)(model, guide)(table).backward()
+        model = config_enumerate(compiled.program, "parallel")
+        TraceEnum_ELBO(max_plate_nesting=2)(model, guide)().backward()
         return {name: value.grad for name, value in guide.named_parameters()}
 
     with pyro.settings.context(module_local_params=True):
@@ -535,7 +537,7 @@ def test_model_with_a_new_site_works_unchanged(tmp_path, human, recordings, code
     one = recordings.select_rounds([0]).select_people([0])
     whole = build_view_table(mine, one, [torch.arange(0, 9604, 100)])
     assert (site in whole.sites) == (site == "every")
-    posterior = fit_implants(mine, whole, FitOptions(steps=2, draws=6), seed=0)
+    posterior = fit_implants(ViewTables(mine, whole), SVIOptions(steps=2), 6, seed=0)
     draws = posterior.draws
     assert set(draws) == {*SIGHTS, *ASSUMED, *policy(human), site}
     assert draws[site].shape == (6, 1, 1)

@@ -16,17 +16,16 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.marginal_elbo import MarginalELBO
 from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.inference.svi import (
-    FitOptions,
-    _draw_by_enumeration,
-    _draw_by_table,
+    SVIOptions,
     _prune,
     continuous_guide,
     draw_implants,
     fit_implants,
-    negative_elbo,
 )
+from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.likelihood.enumeration import draw_combinations, log_joint, log_prior, marginals
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
@@ -36,6 +35,7 @@ from mirror_ppl.models import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.progress import silent
 
 DRIVING = get_domain("driving")
 STEPS = DRIVING.horizon
@@ -229,6 +229,12 @@ def test_people_of_the_model_are_recognized(few, generator):
         assert expected.mean() > 0.5
 
 
+class Enumerated(ViewTables):
+    """Draws discrete sites as programs do that are not compiled."""
+
+    _with_discrete = Compiled._with_discrete
+
+
 # --- draws ------------------------------------------------------------------------------------
 
 
@@ -241,12 +247,12 @@ def test_draws_of_combinations_follow_their_weights(few, table):
         assert_follows(combination[:, person], joint[person].softmax(-1), tests=3)
 
 
-@pytest.mark.parametrize(("method", "calls"), [(_draw_by_table, 400), (_draw_by_enumeration, 250)])
+@pytest.mark.parametrize(("method", "calls"), [(ViewTables, 400), (Enumerated, 250)])
 def test_both_ways_of_drawing_follow_the_exact_posterior(few, rounds, method, calls):
     table = build_view_table(few, rounds.select_people([0, 1]))
     policy = some_policy(few, 2)
-    chunks = [method(few, table, lambda table: policy) for _ in range(calls)]
-    draws = {name: torch.stack([chunk[name] for chunk in chunks]) for name in chunks[0]}
+    given = {name: value.expand(calls, *value.shape) for name, value in policy.items()}
+    draws = method(few, table).sample_discrete(given)
     assert set(draws) == {*SITES, *policy}
     for name, value in policy.items():
         assert torch.equal(draws[name], value.expand(len(draws[name]), *value.shape))
@@ -261,8 +267,9 @@ def test_sites_beyond_perception_are_drawn_with_it(self_model, rounds):
     table = build_view_table(human, rounds.select_people([0]))
     assert table.sites == SITES
     policy = some_policy(human)
-    chunks = [_draw_by_enumeration(human, table, lambda table: policy) for _ in range(300)]
-    draws = {name: torch.stack([chunk[name] for chunk in chunks])[:, 0, 0] for name in chunks[0]}
+    given = {name: value.expand(300, *value.shape) for name, value in policy.items()}
+    draws = ViewTables(human, table).sample_discrete(given)
+    draws = {name: value[:, 0, 0] for name, value in draws.items()}
     weights = torch.zeros(14, 3, 2)
     for mood, chance in enumerate((0.2, 0.5, 0.3)):
         for bold, other in enumerate((0.6, 0.4)):
@@ -275,8 +282,8 @@ def test_sites_beyond_perception_are_drawn_with_it(self_model, rounds):
 
 def test_draws_are_as_many_as_asked_for(few, table):
     with pyro.settings.context(module_local_params=True):
-        guide = continuous_guide(few, table)
-        draws = draw_implants(few, table, guide, 10)
+        compiled = ViewTables(few, table)
+        draws = draw_implants(compiled, continuous_guide(compiled), 10)
     assert {name: value.shape[:3] for name, value in draws.items()} == dict.fromkeys(
         [*SITES, "consistency", "lapse", "residual_in", "residual_out"], (10, 3, 1)
     )
@@ -330,8 +337,12 @@ def test_predictions_agree_with_perceive_believe_act(few, rounds):
 # --- variational ------------------------------------------------------------------------------
 
 
-TINY = FitOptions(steps=6, draws=9, checkpoint_every=2, prune_every=2, prune_margin=1.0)
-TINY_SVI = InferenceOptions("svi", TINY.draws, TINY)
+TINY = SVIOptions(steps=6, checkpoint_every=2, prune_every=2, prune_margin=1.0)
+TINY_SVI = InferenceOptions("svi", 9, TINY)
+
+
+def tiny(few, table, seed=3, report=silent, checkpoint=None):
+    return fit_implants(ViewTables(few, table), TINY, 9, seed, report, checkpoint)
 
 
 def assert_same(one, other):
@@ -351,12 +362,11 @@ def stop_at(step):
 
 @pytest.fixture(scope="module")
 def tiny_fit(few, table):
-    return fit_implants(few, table, TINY, seed=3)
+    return tiny(few, table)
 
 
 def test_guide_starts_as_wide_as_the_prior(few, table):
-    with pyro.settings.context(module_local_params=True):
-        guide = continuous_guide(few, table)
+    guide = continuous_guide(ViewTables(few, table))
     # On the unconstrained scale; the logit of Beta(1, 30) has sqrt(trigamma(1) + trigamma(30)).
     expected = {"consistency": 0.5, "lapse": 1.296, "residual_in": 48**-0.5, "residual_out": 0.1}
     for name, scale in expected.items():
@@ -372,9 +382,9 @@ def test_guide_starts_as_wide_as_the_prior(few, table):
 def test_fit_depends_on_its_seed_alone(few, table, tiny_fit):
     torch.manual_seed(5)
     state = torch.random.get_rng_state()
-    assert_same(fit_implants(few, table, TINY, seed=3), tiny_fit)
+    assert_same(tiny(few, table), tiny_fit)
     assert torch.equal(torch.random.get_rng_state(), state)
-    other = fit_implants(few, table, TINY, seed=4)
+    other = tiny(few, table, seed=4)
     assert other.losses != tiny_fit.losses
     assert len(other.losses) == 6
     assert not list(pyro.get_param_store().keys())
@@ -384,18 +394,18 @@ def test_fit_depends_on_its_seed_alone(few, table, tiny_fit):
 def test_fit_goes_on_from_its_checkpoint_as_if_never_stopped(few, table, tiny_fit, tmp_path, stop):
     checkpoint, steps = (tmp_path / "fit.checkpoint", "this run"), []
     with pytest.raises(KeyboardInterrupt):
-        fit_implants(few, table, TINY, 3, stop_at(stop), checkpoint)
+        tiny(few, table, 3, stop_at(stop), checkpoint)
 
     def report(name, done, total, message):
         if name == "fit":
             steps.append(done)
 
-    resumed = fit_implants(few, table, TINY, 3, report, checkpoint)
+    resumed = tiny(few, table, 3, report, checkpoint)
     assert steps == list(range(2 * ((stop - 1) // 2) + 1, 7))
     assert_same(resumed, tiny_fit)
     # Killed after the last step, before the results were written: only the draws are made again.
     steps.clear()
-    assert_same(fit_implants(few, table, TINY, 3, report, checkpoint), tiny_fit)
+    assert_same(tiny(few, table, 3, report, checkpoint), tiny_fit)
     assert steps == []
 
 
@@ -429,14 +439,16 @@ def test_pruning_gives_up_whoever_is_hopeless(few, table):
     score = combination_scores(table, log_likelihoods(few, policy, table))
     behind = score.amax(-1, keepdim=True) - score
     margin = behind[behind > 0].median().item() + 1e-3
-    pruned = _prune(few, table, lambda table: policy, margin)
+    compiled = ViewTables(few, table)
+    _prune(compiled, lambda: policy, margin)
+    pruned = compiled.table
     alive = (pruned.index != NO_VIEW).any(1)
     assert torch.equal(alive, behind <= margin)
     assert alive[1].all()  # nothing is known of them
     assert 0 < (~alive).sum() < alive.sum()
     # Whoever was given up is never drawn.
-    chunks = [_draw_by_table(few, pruned, lambda table: policy) for _ in range(20)]
-    combination = torch.stack([pruned.combination(draws) for draws in chunks])[..., 0]
+    given = {name: value.expand(20, *value.shape) for name, value in policy.items()}
+    combination = pruned.combination(compiled.sample_discrete(given))[..., 0]
     assert alive[torch.arange(3).expand(combination.shape), combination].all()
 
 
@@ -445,7 +457,7 @@ def test_fit_tells_who_is_consistent_and_how_far_they_see(few, generator):
     known = fixed_policy(2, torch.tensor([[0.5], [6.0]]))
     known |= {"sight_front_own": torch.tensor([[1], [6]]), "assumes_clear": torch.ones(2, 1)}
     table = build_view_table(few, play_rounds(few, known, 8, "fog", generator))
-    posterior = fit_implants(few, table, FitOptions(steps=60, draws=200), seed=0)
+    posterior = fit_implants(ViewTables(few, table), SVIOptions(steps=60), 200, seed=0)
     low, high = posterior.draws["consistency"][..., 0].unbind(1)
     assert low.quantile(0.95) < high.quantile(0.05)
     assert sum(posterior.losses[-10:]) < sum(posterior.losses[:10])
@@ -472,19 +484,19 @@ def test_people_without_discrete_implants_can_be_fitted(self_model, recordings):
 )
 def test_impossible_options_are_refused(name, value, message):
     with pytest.raises(ValueError, match=message):
-        FitOptions(**{name: value})
+        SVIOptions(**{name: value})
 
 
 def test_people_are_fitted_in_batches_that_do_not_depend_on_each_other(
     self_model, tmp_path, monkeypatch
 ):
-    from mirror_ppl.inference import engines
+    from mirror_ppl.inference import batches
 
     human = HumanModel(self_model)
     recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0])
     recordings = recordings.select_people([0, 1, 2])
-    options = InferenceOptions("svi", 6, FitOptions(steps=4, checkpoint_every=2))
-    monkeypatch.setattr(engines, "PEOPLE_AT_ONCE", 2)
+    options = InferenceOptions("svi", 6, SVIOptions(steps=4, checkpoint_every=2))
+    monkeypatch.setattr(batches, "PEOPLE_AT_ONCE", 2)
     found = infer(human, recordings, options, 3)
     first = infer(human, recordings.select_people([0, 1]), options, 3)
     last = infer(human, recordings.select_people([2]), options, 3 + 2)
@@ -523,15 +535,15 @@ def test_the_marginal_elbo_is_that_of_enumeration(self_model):
     alive = torch.zeros(2, 9604, dtype=torch.bool)
     alive[0, ::97] = alive[1, ::53] = True
     for some in (table, restricted(table, alive)):
-        guide = continuous_guide(human, some)
-        enumerated = TraceEnum_ELBO(max_plate_nesting=2, strict_enumeration_warning=False)(
-            config_enumerate(TableProgram(human), "parallel"), guide
-        )
-        found = []
-        for loss in (negative_elbo(human, some, guide), enumerated):
+        compiled = ViewTables(human, some)
+        guide, found = continuous_guide(compiled), []
+        enumerated = TraceEnum_ELBO(max_plate_nesting=2, strict_enumeration_warning=False)
+        for elbo in (MarginalELBO(compiled), enumerated):
             guide.zero_grad()
             torch.manual_seed(3)
-            value = loss(some)
+            with pyro.settings.context(module_local_params=True):
+                program = config_enumerate(compiled.program, "parallel")
+                value = elbo.differentiable_loss(program, guide)
             value.backward()
             found.append([value.detach(), *(p.grad.clone() for p in guide.parameters())])
         for one, other in zip(*found, strict=True):

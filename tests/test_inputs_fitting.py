@@ -18,6 +18,7 @@ from mirror_ppl.inference.results.fitting import fit_people, split_rounds
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
+from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
@@ -95,7 +96,7 @@ def test_wrong_arguments_are_refused(one, change, message):
 def test_a_checkpoint_is_a_file(one, tmp_path):
     refused(lambda: infer(human(), one, FEW, 0, checkpoint=(3, "run")), "path of a file, not 3")
     refused(lambda: fit_people(human(), one, FEW, checkpoint=3), "path of a file, not 3")
-    svi = InferenceOptions("svi", draws=2, svi=FEW.svi.__class__(steps=2, checkpoint_every=1))
+    svi = InferenceOptions("svi", draws=2, settings=SVIOptions(steps=2, checkpoint_every=1))
     infer(human(), one, svi, 0, checkpoint=(str(tmp_path / "checkpoint.pt"), "run"))
     assert (tmp_path / "checkpoint.pt").is_file()
 
@@ -113,7 +114,10 @@ def test_numbers_of_numpy_make_the_same_fit(two):
         (lambda: InferenceOptions(draws=2.5), "draws must be a whole number, not 2.5"),
         (lambda: InferenceOptions(draws=True), "draws must be a whole number, not True"),
         (lambda: InferenceOptions(refine=-1), "refine must be at least 0, not -1"),
-        (lambda: InferenceOptions(guide=3), "unknown guide 3; known: amortized, exact, nuts, svi"),
+        (
+            lambda: InferenceOptions(engine=3),
+            "unknown engine 3; known: amortized, importance, nuts, svi",
+        ),
     ],
 )
 def test_wrong_options_are_refused(make, message):

@@ -35,7 +35,7 @@ def rounds():
     return recordings.select_people([0]).select_rounds(range(4))
 
 
-@pytest.mark.parametrize("guide", ["amortized", "exact"])
+@pytest.mark.parametrize("guide", ["amortized", "importance"])
 def test_round_by_round_is_the_same_as_all_at_once(human, network, rounds, guide):
     given = network if guide == "amortized" else None
     little, whole = OnlinePosterior(human, given), OnlinePosterior(human, given)

@@ -189,8 +189,8 @@ def test_people_who_are_alike_tell_of_each_other(toy, pooling):
         "otherwise": torch.full((8, 1), 0.05),
     }
     recordings = play_rounds(toy, alike, 6, "fog", generator)
-    many = infer(toy, recordings, InferenceOptions("exact", 300), 0).draws
-    one = infer(toy, recordings.select_rounds([0]), InferenceOptions("exact", 300), 0).draws
+    many = infer(toy, recordings, InferenceOptions("importance", 300), 0).draws
+    one = infer(toy, recordings.select_rounds([0]), InferenceOptions("importance", 300), 0).draws
     found = pooling.fit(many, 100, 0)
     pooled = pooling.pooled(one, found, 0).draws
 

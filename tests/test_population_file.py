@@ -127,10 +127,10 @@ def test_a_population_is_a_prior_of_others(inside, capsys):
 
 
 def test_runs_with_and_without_a_population_do_not_continue_each_other(inside, toy, monkeypatch):
-    from mirror_ppl.inference import engines
+    from mirror_ppl.inference import engines, importance
     from mirror_ppl.inference.results.fitting import fit_people
 
-    monkeypatch.setattr(engines, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    monkeypatch.setattr(importance, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
     demonstrations = load_demonstrations(inside / "some.nc")
     options = engines.InferenceOptions(draws=20)
     checkpoint = inside / "some.checkpoint"

@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
-from mirror_ppl.inference import importance, residual_proposal
+from mirror_ppl.inference import adaptive_importance as importance
+from mirror_ppl.inference import residual_proposal
 from mirror_ppl.inference import sampler as sampler_module
-from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.residual_proposal import ResidualProposal, _laplace
 from mirror_ppl.inference.sampler import Sampler, complete
 from mirror_ppl.likelihood.enumeration import expected_counts

@@ -10,10 +10,10 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference import importance
+from mirror_ppl.inference import adaptive_importance as importance
 from mirror_ppl.inference import sampler as sampler_module
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
-from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.sampler import Sampler, Weighted
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel

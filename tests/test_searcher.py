@@ -16,7 +16,7 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.domains.bomb_panel import BUTTONS, OLD_RULES, RULES, read_panel
-from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.results.summary import summarize
 from mirror_ppl.likelihood.attention import Proposal, site_probabilities
 from mirror_ppl.likelihood.contract import check_contract

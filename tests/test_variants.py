@@ -106,7 +106,7 @@ def test_variants_are_special_cases(self_model, rounds):
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("guide", ["exact", "svi"])
+@pytest.mark.parametrize("guide", ["importance", "svi"])
 def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
     """Of the smallest, which has nothing discrete, of one that attends, and of one radius."""
     monkeypatch.chdir(tmp_path)

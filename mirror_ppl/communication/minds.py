@@ -27,7 +27,7 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import AttentionValues, Proposal
 from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.course import perceived
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.models.view import View
@@ -59,6 +59,7 @@ class Person:
 
     def __init__(self, human: HumanModel, draws: Mapping[str, Tensor]) -> None:
         self.human = require_kind(human, HumanModel, "human")
+        require_standard_program(human, "be planned with")
         none = isinstance(draws, Mapping) and not draws
         self.draws = {} if none else checked_draws(human, draws, 1)
         self.number = len(next(iter(self.draws.values()), ()))

@@ -182,14 +182,16 @@ Learn = Callable[[Group, int, int], Learned]
 """Learns of a group from their first rounds, at least 1; and with a seed of everything random."""
 
 
-def _mirror(variant: str | None = None, guide: str = "exact", from_others: bool = False) -> Learn:
+def _mirror(
+    variant: str | None = None, engine: str = "importance", from_others: bool = False
+) -> Learn:
     def learn(group: Group, rounds: int, seed: int) -> Posterior:
         human = load_human_model(variant, group.self_model)
         train = group.recordings().select_rounds(slice(rounds))
         human.learn_world(train)
-        network = network_for(guide, None, human)
+        network = network_for(engine, None, human)
         population = population_of(replace(group, seed=OTHERS)) if from_others else None
-        options = InferenceOptions(guide)
+        options = InferenceOptions(engine)
         found = infer(human, train, options, seed, network, population=population)
         return Posterior(human, found.draws)
 
@@ -247,9 +249,9 @@ def _logistic(group: Group, rounds: int, seed: int) -> Regressed:
 
 LEARNERS: dict[str, Learn] = {
     "mirror": _mirror(),
-    "mirror-amortized": _mirror(guide="amortized"),
-    "mirror-svi": _mirror(guide="svi"),
-    "mirror-nuts": _mirror(guide="nuts"),
+    "mirror-amortized": _mirror(engine="amortized"),
+    "mirror-svi": _mirror(engine="svi"),
+    "mirror-nuts": _mirror(engine="nuts"),
     "mirror-population": _mirror(from_others=True),
     "perceptual-only": _mirror("perceptual-only"),
     "policy-only": _mirror("policy-only"),
@@ -289,7 +291,7 @@ def learn(name: str, group: Group, rounds: int, seed: int) -> Learned:
 
     Args:
         name: in ``LEARNERS``, or ``path/to/file.py:Class``, a human model of somebody's own, with
-            the guide ``exact``.
+            the engine ``importance``.
         group: the people.
         rounds: how many are learned from.
         seed: of everything random.

@@ -9,7 +9,8 @@ and a new round is one more term. From it the network proposes how this person d
     psi   ~ q(. | e_1 .. e_W, number of steps)               scalar sites, a mixture of Gaussians
     m     ~ p(m | psi, actions)                              exact
 
-and importance weights take care of what it gets wrong (:mod:`mirror_ppl.inference.importance`).
+and importance weights take care of what it gets wrong
+(:mod:`mirror_ppl.inference.adaptive_importance`).
 
 The network is trained on people drawn from the prior and simulated in the true domain (inference
 compilation: Le, Baydin and Wood, 2017), see :mod:`mirror_ppl.training.guide`.
@@ -18,7 +19,7 @@ compilation: Le, Baydin and Wood, 2017), see :mod:`mirror_ppl.training.guide`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pyro
@@ -27,6 +28,9 @@ import torch
 from torch import Tensor, nn
 
 from mirror_ppl.errors import InputError
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
+from mirror_ppl.inference.engine import Engine, Inferred, Job
+from mirror_ppl.inference.importance import infer_by_importance
 from mirror_ppl.inference.sampler import Sampler, Weighted
 from mirror_ppl.likelihood.combination_sets import Alike
 from mirror_ppl.likelihood.view_table import ViewTable
@@ -223,3 +227,24 @@ def sample_amortized(
         if found.effective >= enough:
             break
     return found
+
+
+def infer_amortized(job: Job) -> Inferred:
+    """Person after person, each at once."""
+    network = job.network
+    assert network is not None
+    return infer_by_importance(
+        replace(job, screening=guide_screening()),
+        lambda builder, _: sample_amortized(job.human, network, builder),
+    )
+
+
+ENGINE = Engine(
+    "amortized",
+    "a trained network proposes, importance weights correct; at once",
+    infer_amortized,
+    ImportanceOptions,
+    pooled_draws=4000,
+    weighted=True,
+    needs_network=True,
+)

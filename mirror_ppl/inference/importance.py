@@ -1,129 +1,97 @@
-"""Posteriors by importance: how a person may decide, weighted by what their rounds say of it.
-
-Draws of the sites that perception does not read (how somebody decides) come from a proposal that is
-adapted stage by stage; what they see is marginalized exactly under each of them. So the posterior
-is right whatever the proposal, if it has enough draws (:mod:`mirror_ppl.inference.sampler`).
-"""
+"""The engine `importance`: person after person, by weighted draws that are resampled."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
 
 import torch
-from pyro.distributions import MultivariateStudentT
-from torch import Tensor
 
-from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
-from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted
-from mirror_ppl.likelihood.view_table import ViewTable
-from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import unconstrained
+from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.engine import Engine, Inferred, Job
+from mirror_ppl.inference.sampler import Weighted
+from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models.prior import Draws, sample_sites
 
-PLAIN_STAGES = 2
-"""Stages after which the residual is proposed, too, where it hardly matters."""
-LEARNED_FROM = 64.0
-"""Effective draws from which it is learned what to propose, at least: moments of fewer say little,
-and what is proposed by them might never get to where else somebody could be. If there are not so
-many, weights are tempered until there are."""
-FEW = 16.0
-"""Effective draws, or fewer, with which the residual is proposed at once."""
-TAILS = 8.0
-"""Degrees of freedom of what is proposed. In unconstrained space priors of probabilities fall off
-as an exponential, which a Gaussian would miss."""
-PRUNING_DRAWS = 64
-"""Draws from the prior after which combinations of discrete sites are given up."""
+SECONDS_BETWEEN_CHECKPOINTS = 10.0
+
+
+def infer_by_importance(
+    job: Job, first_pass: Callable[[ViewTableBuilder, ImportanceOptions], Weighted] | None = None
+) -> Inferred:
+    """Person after person.
+
+    Args:
+        job: what to infer.
+        first_pass: weighted draws of what the rounds of a person say; adaptive importance sampling
+            unless given.
+    """
+    human, people = job.human, job.rounds.num_people
+    done = _People() if job.checkpoint is None else _People.restored(*job.checkpoint)
+    saved = monotonic()
+    with torch.random.fork_rng(devices=[]):
+        for person in range(len(done), people):
+            job.report("infer", person, people, "people")
+            builder, rounds = (
+                ViewTableBuilder(human, job.screening),
+                list(rounds_of(job.rounds, person)),
+            )
+            for one_round in rounds:
+                builder.add(*one_round)
+            # Whatever the number of draws that others took.
+            torch.manual_seed((job.seed + 1) * 1_000_003 + person)
+            first = coarse(job.settings) if looks_twice(human) else job.settings
+            if first_pass is None:
+                found = sample_importance(human, builder.table(), first)
+            else:
+                found = first_pass(builder, first)
+            if looks_twice(human):
+                builder, found = second_look(
+                    human, rounds, job.screening, job.settings, builder, found
+                )
+            done.draws.append(found.sample(job.draws, builder.grid))
+            done.pareto_k.append(found.pareto_k)
+            if job.checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
+                done.save(*job.checkpoint)
+                saved = monotonic()
+        order = sample_sites(human, 1)
+    job.report("infer", people, people, "people")
+    # Site after site, so that draws of pooled people, which are many, are not in memory twice.
+    draws = {name: torch.cat([own.pop(name) for own in done.draws], 1) for name in order}
+    return Inferred(draws, torch.tensor(done.pareto_k))
 
 
 @dataclass(frozen=True)
-class ImportanceOptions:
-    """Settings of adaptive importance sampling.
+class _People:
+    """Those who are done."""
 
-    Attributes:
-        proposals: draws of each stage.
-        enough: effective draws at which no stage is added.
-        stages: the largest number of stages.
-        wider: factor on the covariance of what is proposed after the first stage, by which its
-            scale is set.
-        prune_margin: nats below the best by which a combination of discrete sites, under each of
-            the first draws, is given up.
-    """
+    draws: list[Draws] = field(default_factory=list)
+    pareto_k: list[float] = field(default_factory=list)
 
-    proposals: int = 512
-    enough: float = 400.0
-    stages: int = 8
-    wider: float = 1.2
-    prune_margin: float = 12.0
+    def __len__(self) -> int:
+        return len(self.draws)
 
-    def __post_init__(self) -> None:
-        for name in ("proposals", "stages"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+    def save(self, path: Path, run: str) -> None:
+        save_checkpoint(path, run, vars(self))
+
+    @classmethod
+    def restored(cls, path: Path, run: str) -> _People:
+        if not path.exists():
+            return cls()
+        content = read_checkpoint(path, run)
+        return cls(content["draws"], content["pareto_k"])
 
 
-@torch.no_grad()
-def sample_importance(
-    human: HumanModel,
-    table: ViewTable,
-    options: ImportanceOptions,
-    near: Weighted | None = None,
-) -> Weighted:
-    """Weighted draws of one person by adaptive importance sampling.
-
-    The first stage draws from the prior; each that follows draws the scalar sites from a Student t
-    distribution, in unconstrained space, that has the moments of the weighted draws so far, and
-    discrete sites of the policy by how probable they are so far. Where that is not enough, stages
-    propose the residual of the policy, too. As long as few draws have all the weight, weights are
-    tempered before anything is learned from them (Koblents and Miguez, *A population Monte Carlo
-    scheme with transformed weights*, 2015).
-
-    Args:
-        human: the model of people.
-        table: views of one person's rounds.
-        options: settings.
-        near: draws from much the same posterior, whose moments are used from the first stage on.
-    """
-    sampler = Sampler(human, table)
-    dependent = dependent_sites(human, sampler.sites)
-
-    def near_to(place: Tensor, log_weights: Tensor) -> Proposal:
-        if not sampler.sites:
-            return NoScalars()
-
-        def fit(some: Tensor) -> MultivariateStudentT:
-            return _heavy_tailed(some, log_weights, options.wider)
-
-        if not dependent:
-            return fit(place)
-        return RelativeProposal(human, sampler.sites, dependent, place, fit)
-
-    few = min(PRUNING_DRAWS, options.proposals)
-    sampler.draw(few)
-    sampler.prune(options.prune_margin)
-    if near is not None and sampler.sites:
-        found = unconstrained(sampler.sites, near.policy)
-        near = near.tempered(LEARNED_FROM)
-        sampler.propose(near_to(found, near.log_weights), options.proposals)
-    elif options.proposals > few:
-        sampler.draw(options.proposals - few)
-    for stage in range(options.stages if sampler.sites or sampler.supports else 0):
-        found = sampler.weighted()
-        if found.effective >= options.enough:
-            return found
-        few = found.effective <= FEW
-        found = found.tempered(LEARNED_FROM)
-        if not sampler.proposes_residual and (few or stage >= PLAIN_STAGES):
-            sampler.learn_residual(found)
-        sampler.learn_discrete(found)
-        sampler.propose(near_to(sampler.place, found.log_weights), options.proposals)
-    return sampler.weighted()
-
-
-def _heavy_tailed(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateStudentT:
-    weights = log_weights.exp().to(place)[:, None]
-    mean = (weights * place).sum(0)
-    centred = place - mean
-    covariance = wider * (weights * centred).T @ centred
-    # Where few draws have all the weight, their spread says nothing.
-    floor = 1e-3 * place.var(0) + 1e-8
-    spread = torch.linalg.cholesky(covariance + torch.diag(floor))
-    return MultivariateStudentT(place.new_tensor(TAILS), mean, spread)
+ENGINE = Engine(
+    "importance",
+    "adaptive importance sampling from the prior on",
+    infer_by_importance,
+    ImportanceOptions,
+    pooled_draws=4000,
+    weighted=True,
+)

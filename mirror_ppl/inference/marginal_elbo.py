@@ -9,42 +9,50 @@ fewer::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from pyro import poutine
+from pyro.infer import TraceEnum_ELBO
+from pyro.infer.elbo import ELBO
 from torch import Tensor
 
+from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.likelihood.enumeration import combination_values
-from mirror_ppl.likelihood.table_program import TableProgram
-from mirror_ppl.likelihood.view_table import ViewTable
-from mirror_ppl.models.human import HumanModel
 
 
-def marginal_elbo(
-    human: HumanModel, table: ViewTable, guide: Callable[..., Mapping[str, Tensor]]
-) -> Callable[[ViewTable], Tensor]:
-    """Negative ELBO in nats of one draw of a guide, as a function of a table.
+class MarginalELBO(ELBO):
+    """An ELBO for ``pyro.infer.SVI``, of a program that is compiled to tables of views.
 
     Args:
-        human: a model all of whose discrete sites are read by ``perceive``.
-        table: any of this model.
-        guide: over its continuous sites.
+        compiled: every discrete site is one that perception reads.
     """
-    values = combination_values(human, table)
 
-    def loss(table: ViewTable) -> Tensor:
-        guided = poutine.trace(guide).get_trace(table)
-        replayed = poutine.replay(TableProgram(human), trace=guided)
+    def __init__(self, compiled: ViewTables) -> None:
+        super().__init__(max_plate_nesting=PLATES)
+        self.compiled = compiled
+        self._values = combination_values(compiled.human, compiled.table)
+
+    def _get_trace(self, *_: Any) -> Any:
+        """Of the base class; there is one draw, of all combinations at once."""
+        raise NotImplementedError
+
+    def differentiable_loss(
+        self, model: Callable[..., Any], guide: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Tensor:
+        """Negative ELBO in nats, of one draw of the guide over the continuous sites."""
+        guided = poutine.trace(guide).get_trace(*args, **kwargs)
         combinations = {
-            site: value[table.possible_numbers][..., None]  # [C, P, 1]
-            for site, value in values.items()
+            site: value[self.compiled.table.possible_numbers][..., None]  # [C, P, 1]
+            for site, value in self._values.items()
         }
-        trace = poutine.trace(poutine.condition(replayed, data=combinations)).get_trace(table)
+        replayed = poutine.condition(poutine.replay(model, trace=guided), data=combinations)
+        trace = poutine.trace(replayed).get_trace(*args, **kwargs)
         trace.compute_log_prob()
-        total = torch.zeros((), device=table.index.device)
-        joint = torch.zeros((), device=table.index.device)
+        total = torch.zeros((), device=self.compiled.table.index.device)
+        joint = torch.zeros((), device=self.compiled.table.index.device)
         for node in trace.nodes.values():
             if node["type"] != "sample":
                 continue
@@ -55,4 +63,20 @@ def marginal_elbo(
                 total = total + node["log_prob"].sum()
         return guided.log_prob_sum() - total - torch.logsumexp(joint, 0).sum()
 
-    return loss
+    def loss(self, *args: Any, **kwargs: Any) -> float:
+        """Negative ELBO in nats."""
+        with torch.no_grad():
+            return self.differentiable_loss(*args, **kwargs).item()
+
+    def loss_and_grads(self, *args: Any, **kwargs: Any) -> float:
+        """Negative ELBO in nats; gradients are added to the parameters."""
+        loss = self.differentiable_loss(*args, **kwargs)
+        loss.backward()
+        return loss.item()
+
+
+def elbo_of(compiled: Compiled) -> ELBO:
+    """An ELBO that sums discrete sites out, whatever samples them."""
+    if isinstance(compiled, ViewTables) and compiled.sums_over_combinations:
+        return MarginalELBO(compiled)
+    return TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)

@@ -1,46 +1,55 @@
-"""Hamiltonian Monte Carlo (NUTS), to compare other guides with on small problems."""
+"""The engine `nuts`: Hamiltonian Monte Carlo, to compare others with on small problems."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import pyro
 import torch
 from pyro.infer import MCMC, NUTS
 from pyro.infer.autoguide import init_to_median
 
+from mirror_ppl.checks import whole_number
+from mirror_ppl.inference.batches import in_batches
+from mirror_ppl.inference.engine import Engine, Inferred, Job
+from mirror_ppl.likelihood.compiled import Compiled
 from mirror_ppl.likelihood.densities import PLATES
-from mirror_ppl.likelihood.enumeration import (
-    draw_combinations,
-    log_joints,
-    require_acting_on_beliefs,
-)
-from mirror_ppl.likelihood.table_program import TableProgram
-from mirror_ppl.likelihood.view_table import ViewTable
-from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.progress import Report, silent
 
-WARMUP = 200
+
+@dataclass(frozen=True)
+class NUTSOptions:
+    """Settings of Hamiltonian Monte Carlo.
+
+    Attributes:
+        warmup: steps that are thrown away, in which step sizes are learned.
+        tree_depth: the largest depth of a trajectory's tree.
+    """
+
+    warmup: int = 200
+    tree_depth: int = 6
+
+    def __post_init__(self) -> None:
+        for name in ("warmup", "tree_depth"):
+            object.__setattr__(self, name, whole_number(getattr(self, name), name, 1))
 
 
 def sample_nuts(
-    human: HumanModel, table: ViewTable, number: int, seed: int, report: Report = silent
+    compiled: Compiled, options: NUTSOptions, number: int, seed: int, report: Report = silent
 ) -> Draws:
     """Joint draws ``[S, P, 1, ...]`` of all sites, of one chain; they depend on each other.
 
-    Discrete sites are marginalized while the chain runs, and drawn afterwards.
+    Discrete sites are summed out while the chain runs, and drawn afterwards.
 
     Args:
-        human: the model of people.
-        table: views of the rounds to learn from.
-        number: of draws S; as many as ``WARMUP`` are thrown away before.
+        compiled: the program and the rounds to learn from.
+        options: settings.
+        number: of draws S.
         seed: of everything random.
         report: told of steps.
-
-    Raises:
-        HumanModelError: actions depend on what is seen otherwise than through beliefs.
     """
-    require_acting_on_beliefs(human, table)
-    total, done = WARMUP + number, 0
+    total, done = options.warmup + number, 0
 
     def count(*_: object) -> None:
         nonlocal done
@@ -50,18 +59,30 @@ def sample_nuts(
     with torch.random.fork_rng(devices=[]), pyro.validation_enabled(False):
         torch.manual_seed(seed)
         kernel = NUTS(
-            TableProgram(human),
+            compiled.program,
             max_plate_nesting=PLATES,
             init_strategy=init_to_median,
-            max_tree_depth=6,
+            max_tree_depth=options.tree_depth,
         )
-        chain = MCMC(kernel, number, WARMUP, hook_fn=count, disable_progbar=True)
-        chain.run(table)
-        policy = chain.get_samples()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        joints = log_joints(human, table, policy)
-        discrete = [draw_combinations(human, table, joint, 1) for joint in joints]
-    drawn = {name: torch.cat([one[name] for one in discrete]) for name in discrete[0]}
-    values = {**policy, **drawn}
-    return {name: values[name] for name in sample_sites(human, 1)}
+        chain = MCMC(kernel, number, options.warmup, hook_fn=count, disable_progbar=True)
+        chain.run()
+        drawn = compiled.sample_discrete(chain.get_samples())
+    return {name: drawn[name] for name in sample_sites(compiled.human, 1)}
+
+
+def infer_by_nuts(job: Job) -> Inferred:
+    """All people of a batch in one chain."""
+
+    def infer_batch(compiled: Compiled, part: Job) -> Inferred:
+        return Inferred(sample_nuts(compiled, part.settings, part.draws, part.seed, part.report))
+
+    return in_batches(job, infer_batch)
+
+
+ENGINE = Engine(
+    "nuts",
+    "Hamiltonian Monte Carlo; slow, to compare with on small problems",
+    infer_by_nuts,
+    NUTSOptions,
+    any_program=True,
+)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from mirror_ppl.domains import Observation, Visibility
-from mirror_ppl.inference.importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel

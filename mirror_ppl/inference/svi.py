@@ -1,40 +1,41 @@
-"""Stochastic variational inference of implants, with the discrete ones marginalized exactly.
+"""The engine `svi`: ``pyro.infer.SVI`` with discrete sites summed out.
 
-The evidence lower bound enumerates every discrete site of the human model in parallel, so a guide
+The evidence lower bound enumerates every discrete site of the human program in parallel, so a guide
 is needed for the continuous sites alone. Mean-field guides on relaxed sight thresholds get stuck
 between plateaus of the likelihood; enumeration has no such trap.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pyro
 import torch
 from pyro import poutine
-from pyro.infer import TraceEnum_ELBO, config_enumerate, infer_discrete
+from pyro.infer import SVI, config_enumerate
 from pyro.infer.autoguide import AutoGuide, AutoNormal, init_to_median
 from pyro.infer.autoguide.utils import deep_setattr
 from pyro.nn import PyroParam
+from pyro.optim import PyroLRScheduler
 from torch import Tensor
 from torch.distributions import biject_to
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.checks import real_number, whole_number
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.marginal_elbo import marginal_elbo
-from mirror_ppl.likelihood.combinations import discrete_sites
+from mirror_ppl.inference.batches import in_batches
+from mirror_ppl.inference.engine import Engine, Inferred, Job
+from mirror_ppl.inference.marginal_elbo import elbo_of
+from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.likelihood.densities import PLATES
-from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joint
-from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
-from mirror_ppl.likelihood.tables import combination_scores, restricted
-from mirror_ppl.likelihood.view_table import NO_VIEW, ViewTable
-from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import Draws, sample_sites, values_of
-from mirror_ppl.models.sites import discrete_names, latent_sites
+from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import combination_scores
+from mirror_ppl.likelihood.view_table import NO_VIEW
+from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.progress import Report, silent
 
 PRUNING_DRAWS = 4
@@ -44,13 +45,12 @@ LEAST_WIDTH = 0.01
 
 
 @dataclass(frozen=True)
-class FitOptions:
-    """Settings of fitting implants.
+class SVIOptions:
+    """Settings of variational inference.
 
     Attributes:
-        steps: gradient steps of variational inference.
+        steps: gradient steps.
         learning_rate: of Adam at the start; it falls to a twentieth on a cosine.
-        draws: posterior draws S.
         checkpoint_every: steps between checkpoints.
         prune_every: steps after which combinations of discrete implants are given up that have
             become hopeless under the guide.
@@ -59,13 +59,12 @@ class FitOptions:
 
     steps: int = 300
     learning_rate: float = 0.1
-    draws: int = 200
     checkpoint_every: int = 25
     prune_every: int = 25
     prune_margin: float = 12.0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "draws", "checkpoint_every", "prune_every"):
+        for name in ("steps", "checkpoint_every", "prune_every"):
             object.__setattr__(self, name, whole_number(getattr(self, name), name, 1))
         if not 0 < real_number(self.learning_rate, "learning_rate", 0) <= 1:
             raise InputError(
@@ -125,18 +124,37 @@ class PriorScaledNormal(AutoNormal):
             deep_setattr(self.scales, name, parameter)
 
 
-def continuous_guide(human: HumanModel, table: ViewTable) -> PriorScaledNormal:
-    """A mean-field guide over the continuous sites of a human model, one factor a person."""
-    model = poutine.block(TableProgram(human), hide=list(_enumerated(human, table)))
-    guide = PriorScaledNormal(model, init_loc_fn=init_to_median)
-    guide(table)
+def continuous_guide(
+    compiled: Compiled, start: Mapping[str, Tensor] | None = None
+) -> PriorScaledNormal:
+    """A mean-field guide over the continuous sites of a human program, one factor a person.
+
+    Args:
+        compiled: the program and the rounds.
+        start: draws ``[S, P, 1, ...]`` at which it starts; the prior unless given.
+    """
+    # Parameters are the guide's own until SVI takes them into Pyro's store.
+    with pyro.settings.context(module_local_params=True):
+        program = poutine.block(compiled.program, hide=list(compiled.discrete))
+        guide = PriorScaledNormal(program, init_loc_fn=init_to_median)
+        guide()
+        if start is not None:
+            guide.start_at(start)
     return guide
 
 
+@contextmanager
+def own_parameters(seed: int) -> Iterator[None]:
+    """A random state and a parameter store that end with what is done in them."""
+    with torch.random.fork_rng(devices=[]), pyro.get_param_store().scope():
+        torch.manual_seed(seed)
+        yield
+
+
 def fit_implants(
-    human: HumanModel,
-    table: ViewTable,
-    options: FitOptions,
+    compiled: Compiled,
+    options: SVIOptions,
+    draws: int,
     seed: int,
     report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
@@ -145,9 +163,9 @@ def fit_implants(
     """Posterior of the implants of P people.
 
     Args:
-        human: the model of people.
-        table: views of the rounds to learn from.
+        compiled: the program and the rounds to learn from.
         options: settings.
+        draws: number of posterior draws S.
         seed: seed of everything random here.
         report: told of gradient steps and of draws.
         checkpoint: a file that is written now and then and continued from if it exists, and what
@@ -157,146 +175,141 @@ def fit_implants(
     Raises:
         CheckpointError: the checkpoint is damaged or of another run.
     """
-    with torch.random.fork_rng(devices=[]), pyro.settings.context(module_local_params=True):
-        torch.manual_seed(seed)
-        guide = continuous_guide(human, table)
-        if start is not None:
-            guide.start_at(start)
-        table, losses = _optimize(human, table, guide, options, report, checkpoint)
-        draws = draw_implants(human, table, guide, options.draws, report)
-        draws = {name: draws[name] for name in sample_sites(human, 1)}
-    return ImplantPosterior(guide, draws, tuple(losses))
+    with own_parameters(seed):
+        guide = continuous_guide(compiled, start)
+        losses = _optimize(compiled, guide, options, report, checkpoint)
+        drawn = draw_implants(compiled, guide, draws, report)
+    return ImplantPosterior(guide, drawn, tuple(losses))
 
 
 def _optimize(
-    human: HumanModel,
-    table: ViewTable,
+    compiled: Compiled,
     guide: AutoGuide,
-    options: FitOptions,
+    options: SVIOptions,
     report: Report,
     checkpoint: tuple[Path, str] | None,
-) -> tuple[ViewTable, list[float]]:
-    """Optimize the guide; returns the table without what was given up, and the losses."""
-    elbo = negative_elbo(human, table, guide)
-    optimizer = torch.optim.Adam(guide.parameters(), options.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimizer, options.steps, options.learning_rate / 20
+) -> list[float]:
+    """Optimize the guide; returns the losses. Of tables, hopeless combinations are given up."""
+    optimizer = PyroLRScheduler(
+        torch.optim.lr_scheduler.CosineAnnealingLR,
+        {
+            "optimizer": torch.optim.Adam,
+            "optim_args": {"lr": options.learning_rate},
+            "T_max": options.steps,
+            "eta_min": options.learning_rate / 20,
+        },
     )
+    program = config_enumerate(compiled.program, "parallel")
+    svi = SVI(program, guide, optimizer, elbo_of(compiled))
     losses: list[float] = []
     if checkpoint is not None and checkpoint[0].exists():
-        losses, alive = _restore(*checkpoint, guide, optimizer, schedule)
-        table = restricted(table, alive)
+        losses = _restore(*checkpoint, guide, optimizer, compiled)
     while len(losses) < options.steps:
-        optimizer.zero_grad()
         # What is wrong with a model shows at the first step; checking all of them costs a third.
         with pyro.validation_enabled(not losses):
-            loss = elbo(table)
-        loss.backward()
+            losses.append(cast(float, svi.step()))
         optimizer.step()
-        schedule.step()
-        losses.append(loss.item())
         report("fit", len(losses), options.steps, f"negative ELBO {losses[-1]:.1f}")
-        if len(losses) % options.prune_every == 0 or len(losses) == options.steps:
-            table = _prune(human, table, guide, options.prune_margin)
+        if isinstance(compiled, ViewTables) and (
+            len(losses) % options.prune_every == 0 or len(losses) == options.steps
+        ):
+            _prune(compiled, guide, options.prune_margin)
         if checkpoint is not None and len(losses) % options.checkpoint_every == 0:
-            alive = (table.index != NO_VIEW).any(1)
-            _save(*checkpoint, guide, optimizer, schedule, losses, alive)
-    return table, losses
-
-
-def negative_elbo(
-    human: HumanModel, table: ViewTable, guide: AutoGuide
-) -> Callable[[ViewTable], Tensor]:
-    """The loss of fitting: discrete sites are summed out, whatever samples them."""
-    if set(discrete_sites(human)) == set(table.sites) == _enumerated(human, table):
-        return marginal_elbo(human, table, guide)
-    return TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)(
-        config_enumerate(TableProgram(human), "parallel"), guide
-    )
+            _save(*checkpoint, guide, optimizer, losses, compiled)
+    return losses
 
 
 @torch.no_grad()
-def _prune(human: HumanModel, table: ViewTable, guide: AutoGuide, margin: float) -> ViewTable:
+def _prune(compiled: ViewTables, guide: AutoGuide, margin: float) -> None:
     """Give up combinations that are behind the best one by more than the margin.
 
     Each is scored under the guide's draw that suits it best.
     """
-    best = None
+    human, table, best = compiled.human, compiled.table, None
     for _ in range(PRUNING_DRAWS):
         with (
             poutine.block(),
-            poutine.condition(data=guide(table)),
+            poutine.condition(data=guide()),
             pyro.plate("person", table.people, dim=-PLATES),
         ):
             likelihoods = log_likelihoods(human, human.prior(), table)
         score = combination_scores(table, likelihoods)
         best = score if best is None else torch.maximum(best, score)
     assert best is not None
-    return restricted(table, best >= best.amax(-1, keepdim=True) - margin)
+    compiled.restrict(best >= best.amax(-1, keepdim=True) - margin)
 
 
 def _save(
-    path: Path, run: str, guide, optimizer, schedule, losses: list[float], alive: Tensor
+    path: Path,
+    run: str,
+    guide: AutoGuide,
+    optimizer: PyroLRScheduler,
+    losses: list[float],
+    compiled: Compiled,
 ) -> None:
     content = {
         "guide": guide.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "schedule": schedule.state_dict(),
+        "optimizer": optimizer.get_state(),
         "losses": losses,
-        "alive": alive,
         "torch": torch.random.get_rng_state(),
     }
+    if isinstance(compiled, ViewTables):
+        content["alive"] = (compiled.table.index != NO_VIEW).any(1)
     save_checkpoint(path, run, content)
 
 
-def _restore(path: Path, run: str, guide, optimizer, schedule) -> tuple[list[float], Tensor]:
+def _restore(
+    path: Path, run: str, guide: AutoGuide, optimizer: PyroLRScheduler, compiled: Compiled
+) -> list[float]:
     content = read_checkpoint(path, run)
     guide.load_state_dict(content["guide"])
-    optimizer.load_state_dict(content["optimizer"])
-    schedule.load_state_dict(content["schedule"])
+    optimizer.set_state(content["optimizer"])
+    if isinstance(compiled, ViewTables):
+        compiled.restrict(content["alive"])
     torch.random.set_rng_state(content["torch"])
-    return content["losses"], content["alive"]
+    return content["losses"]
 
 
 @torch.no_grad()
 def draw_implants(
-    human: HumanModel,
-    table: ViewTable,
-    guide: AutoGuide,
-    number: int,
-    report: Report = silent,
+    compiled: Compiled, guide: AutoGuide, number: int, report: Report = silent
 ) -> Draws:
     """Joint draws ``[S, P, 1, ...]`` of all sites from the guide and the enumerated posterior.
 
     Draws are independent of each other.
     """
-    only_views = set(discrete_sites(human)) == set(table.sites) == _enumerated(human, table)
-    by_table = only_views and acts_on_beliefs(human, table)
-    draw = _draw_by_table if by_table else _draw_by_enumeration
     drawn: list[Draws] = []
     for done in range(number):
         report("draw", done, number, "")
-        drawn.append(draw(human, table, guide))
+        one = {name: value[None] for name, value in guide().items()}
+        drawn.append(compiled.sample_discrete(one))
     report("draw", number, number, "")
-    return {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
+    order = sample_sites(compiled.human, 1)
+    return {name: torch.cat([one[name] for one in drawn]) for name in order}
 
 
-def _enumerated(human: HumanModel, table: ViewTable) -> set[str]:
-    """Every discrete site of the whole program, those that ``act`` samples included."""
-    return discrete_names(poutine.trace(TableProgram(human)).get_trace(table))
+def infer_by_svi(job: Job) -> Inferred:
+    """All people of a batch together."""
+
+    def infer_batch(compiled: Compiled, part: Job) -> Inferred:
+        found = fit_implants(
+            compiled,
+            part.settings,
+            part.draws,
+            part.seed,
+            part.report,
+            part.checkpoint,
+            part.start,
+        )
+        return Inferred(found.draws, losses=found.losses)
+
+    return in_batches(job, infer_batch)
 
 
-def _draw_by_table(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
-    continuous = guide(table)
-    discrete = draw_combinations(human, table, log_joint(human, table, continuous), 1)
-    return {**continuous, **{name: value[0] for name, value in discrete.items()}}
-
-
-def _draw_by_enumeration(human: HumanModel, table: ViewTable, guide: AutoGuide) -> Draws:
-    continuous = guide(table)
-    sampled = infer_discrete(
-        poutine.condition(config_enumerate(TableProgram(human), "parallel"), data=continuous),
-        first_available_dim=-1 - PLATES,
-    )
-    trace = poutine.trace(sampled).get_trace(table)
-    return {**continuous, **values_of(latent_sites(trace))}
+ENGINE = Engine(
+    "svi",
+    "variational inference, one optimization for the people at hand",
+    infer_by_svi,
+    SVIOptions,
+    any_program=True,
+)

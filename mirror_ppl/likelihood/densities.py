@@ -20,7 +20,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.models.human import ACTION, HumanModel
+from mirror_ppl.models.human import ACTION, HumanModel, require_standard_program
 
 BATCH = 3
 """Dimensions of draws, people and their rounds; combinations of discrete values go before them."""
@@ -36,13 +36,7 @@ def require_compilable(human: HumanModel) -> None:
     Raises:
         HumanModelError: this is one.
     """
-    kind = type(human)
-    if kind.model is not HumanModel.model or kind.choose is not HumanModel.choose:
-        raise HumanModelError(
-            f"{kind.__name__} overrides model() or choose(), which cannot be compiled; override "
-            "prior, round_latents, sees, perceive, evidence, believe or act, or run "
-            "pyro.infer.SVI on its model"
-        )
+    require_standard_program(human, "be compiled")
     # Of data of several people it is noticed here that they are no one person's.
     for name, node in prior_nodes(human, {}, 1, 1).items():
         check_plates(name, log_prob(node), 1)

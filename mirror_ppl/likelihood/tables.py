@@ -156,14 +156,29 @@ def build_view_table(
             builder.add(*one_round)
         tables.append(builder.table())
         report(person + 1)
-    return _joined(tables, demonstrations)
+    return join_tables(tables, demonstrations.shape)
 
 
-def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> ViewTable:
-    """The table of P people of the tables of each of them."""
-    rounds, views = demonstrations.shape[1], [views_of(table, 0) for table in tables]
+def join_tables(
+    tables: Sequence[ViewTable], shape: tuple[int, int, int] | None = None
+) -> ViewTable:
+    """The table of P people of the tables of each of them.
+
+    Args:
+        tables: of one person each.
+        shape: (P, B, T), to which they are padded; as far as the longest reaches unless given.
+    """
+    if shape is None:
+        rounds, steps = (max(table.recorded.shape[axis] for table in tables) for axis in (1, 2))
+    else:
+        _, rounds, steps = shape
+    views = [views_of(table, 0).lengthened(steps) for table in tables]
     own = [table.attention for table in tables if isinstance(table.attention, Attention)]
     chains = [table.attention for table in tables if isinstance(table.attention, Chain)]
+
+    def recorded(value: Tensor) -> Tensor:
+        return _pad(pad(value, [0, steps - value.shape[1]]), rounds)
+
     attention = None
     if chains:
         facts = {
@@ -194,8 +209,8 @@ def _joined(tables: Sequence[ViewTable], demonstrations: Demonstrations) -> View
         sizes=tables[0].sizes,
         index=torch.stack([_pad(table.index[0], rounds, NO_VIEW) for table in tables]),
         **_padded(views),
-        recorded=demonstrations.actions.clamp(min=0),
-        steps=demonstrations.mask,
+        recorded=torch.stack([recorded(table.recorded[0]) for table in tables]),
+        steps=torch.stack([recorded(table.steps[0]) for table in tables]),
         view_counts=torch.cat([table.view_counts for table in tables]),
         attention=attention,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
@@ -26,7 +27,8 @@ class AtStep(Messenger):
 class MaskObserved(Messenger):
     """Observed sites and factors do not count where a mask is false.
 
-    Sampled ones do: summed or integrated out, each of them comes to 1.
+    Sampled ones do, without scales and masks of their own: summed or integrated out, each of them
+    comes to 1.
 
     Args:
         mask: which of them count, boolean ``[P, B]``.
@@ -37,5 +39,13 @@ class MaskObserved(Messenger):
         self.mask = mask
 
     def _pyro_sample(self, msg: Any) -> None:
-        if msg["is_observed"] and not site_is_subsample(msg):
+        if site_is_subsample(msg):
+            return
+        if msg["is_observed"]:
             msg["mask"] = self.mask if msg["mask"] is None else msg["mask"] & self.mask
+            return
+        if msg["mask"] is not None:
+            msg["mask"] = msg["mask"] | ~self.mask
+        if isinstance(msg["scale"], Tensor) or msg["scale"] != 1:
+            scale = torch.as_tensor(msg["scale"], device=self.mask.device)
+            msg["scale"] = torch.where(self.mask, scale, torch.ones_like(scale))

@@ -35,6 +35,7 @@ from torch import Tensor, nn
 from mirror_ppl.checks import require_methods
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.distributions import NormalizedCategorical
 from mirror_ppl.models.handlers import AtStep, MaskObserved
@@ -369,6 +370,30 @@ class HumanModel(nn.Module):
                         action = self.choose(implants, belief, values, actions[..., step])
                         if world and rounds.rewards is not None:
                             reward(self.self_model, state, action, rounds.rewards[..., step])
+
+
+def has_own_program(human: HumanModel) -> bool:
+    """Whether a human model overrides the program itself, and not only what it calls."""
+    kind = type(human)
+    return kind.model is not HumanModel.model or kind.choose is not HumanModel.choose
+
+
+def require_standard_program(human: HumanModel, what: str) -> None:
+    """Refuse human models whose program is their own, for what is made of the methods it calls.
+
+    Args:
+        human: the model of people.
+        what: they cannot do, such as "be compiled".
+
+    Raises:
+        HumanModelError: this is one.
+    """
+    if has_own_program(human):
+        raise HumanModelError(
+            f"{type(human).__name__} overrides model() or choose() and cannot {what}; the engines "
+            "svi and nuts run it as it is, everything else needs a model that overrides prior, "
+            "round_latents, sees, perceive, evidence, believe or act instead"
+        )
 
 
 def recorded_covariates(human: HumanModel, rounds: Demonstrations) -> dict[str, Tensor]:

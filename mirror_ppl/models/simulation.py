@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Observation, Visibility, map_state, roll_out, total_reward
-from mirror_ppl.models.human import HumanModel, Implants, messages_at
+from mirror_ppl.models.human import HumanModel, Implants, messages_at, require_standard_program
 
 
 @torch.no_grad()
@@ -36,6 +36,7 @@ def play_rounds(
         generator: source of how rounds begin and of what people choose.
         scenario: of each round of each person, ``[P B]`` in that order; drawn unless given.
     """
+    require_standard_program(human, "be simulated in the true world")
     domain, steps = human.domain, human.domain.horizon
     people = len(next(iter(implants.values())))
     device = generator.device

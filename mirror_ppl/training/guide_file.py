@@ -81,7 +81,7 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
                 found, own = model_name(str(found)), model_name(own)
             raise AssetError(
                 f"{path}: is for {name.replace('_', ' ')} {found}, not {own}; "
-                "train a guide for it, or use --guide exact"
+                "train a guide for it, or use --guide importance"
             )
     try:
         card = json.loads(metadata["card"])
@@ -112,6 +112,6 @@ def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGu
             raise AssetError(
                 f"no guide ships for {name} in {human.domain.name}: train one with "
                 "python -m mirror_ppl.train --what guide and name it with --guide-file, or use "
-                "--guide exact"
+                "--guide importance"
             ) from error
     return load_guide(path, human)[0]

@@ -180,7 +180,7 @@ def _attributes(
         "setting": train.setting,
         "human_model": type(human).__name__,
         "self_model": fingerprint(human.self_model),
-        "guide": options.guide,
+        "guide": options.engine,
         "refined": options.refine,
         "pooling": pooling,
         "version": __version__,

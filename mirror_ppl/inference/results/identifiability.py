@@ -35,7 +35,7 @@ from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
 from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.progress import Report, silent
 
@@ -126,8 +126,10 @@ def identify(
 
     Returns:
         ``None`` of models in which there is nothing discrete to see, or in which actions depend on
-        what is seen otherwise than through beliefs.
+        what is seen otherwise than through beliefs, or whose program is their own.
     """
+    if has_own_program(human):
+        return None
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     if not sizes:
         return None

@@ -18,10 +18,11 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.results.summary import score
 from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.compiled import Sequential
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.likelihood.view_table import combination_number
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.progress import Report, silent
@@ -138,6 +139,8 @@ def predict_rounds(
     """
     check_rounds(human, rounds)
     draws = checked_draws(human, draws, rounds.num_people)
+    if has_own_program(human):
+        return Sequential(human, rounds).predict(draws)
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     parts = []
     for some in _groups(rounds.num_people):

@@ -1,0 +1,129 @@
+"""Posteriors by importance: how a person may decide, weighted by what their rounds say of it.
+
+Draws of the sites that perception does not read (how somebody decides) come from a proposal that is
+adapted stage by stage; what they see is marginalized exactly under each of them. So the posterior
+is right whatever the proposal, if it has enough draws (:mod:`mirror_ppl.inference.sampler`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from pyro.distributions import MultivariateStudentT
+from torch import Tensor
+
+from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
+from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted
+from mirror_ppl.likelihood.view_table import ViewTable
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import unconstrained
+
+PLAIN_STAGES = 2
+"""Stages after which the residual is proposed, too, where it hardly matters."""
+LEARNED_FROM = 64.0
+"""Effective draws from which it is learned what to propose, at least: moments of fewer say little,
+and what is proposed by them might never get to where else somebody could be. If there are not so
+many, weights are tempered until there are."""
+FEW = 16.0
+"""Effective draws, or fewer, with which the residual is proposed at once."""
+TAILS = 8.0
+"""Degrees of freedom of what is proposed. In unconstrained space priors of probabilities fall off
+as an exponential, which a Gaussian would miss."""
+PRUNING_DRAWS = 64
+"""Draws from the prior after which combinations of discrete sites are given up."""
+
+
+@dataclass(frozen=True)
+class ImportanceOptions:
+    """Settings of adaptive importance sampling.
+
+    Attributes:
+        proposals: draws of each stage.
+        enough: effective draws at which no stage is added.
+        stages: the largest number of stages.
+        wider: factor on the covariance of what is proposed after the first stage, by which its
+            scale is set.
+        prune_margin: nats below the best by which a combination of discrete sites, under each of
+            the first draws, is given up.
+    """
+
+    proposals: int = 512
+    enough: float = 400.0
+    stages: int = 8
+    wider: float = 1.2
+    prune_margin: float = 12.0
+
+    def __post_init__(self) -> None:
+        for name in ("proposals", "stages"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+
+
+@torch.no_grad()
+def sample_importance(
+    human: HumanModel,
+    table: ViewTable,
+    options: ImportanceOptions,
+    near: Weighted | None = None,
+) -> Weighted:
+    """Weighted draws of one person by adaptive importance sampling.
+
+    The first stage draws from the prior; each that follows draws the scalar sites from a Student t
+    distribution, in unconstrained space, that has the moments of the weighted draws so far, and
+    discrete sites of the policy by how probable they are so far. Where that is not enough, stages
+    propose the residual of the policy, too. As long as few draws have all the weight, weights are
+    tempered before anything is learned from them (Koblents and Miguez, *A population Monte Carlo
+    scheme with transformed weights*, 2015).
+
+    Args:
+        human: the model of people.
+        table: views of one person's rounds.
+        options: settings.
+        near: draws from much the same posterior, whose moments are used from the first stage on.
+    """
+    sampler = Sampler(human, table)
+    dependent = dependent_sites(human, sampler.sites)
+
+    def near_to(place: Tensor, log_weights: Tensor) -> Proposal:
+        if not sampler.sites:
+            return NoScalars()
+
+        def fit(some: Tensor) -> MultivariateStudentT:
+            return _heavy_tailed(some, log_weights, options.wider)
+
+        if not dependent:
+            return fit(place)
+        return RelativeProposal(human, sampler.sites, dependent, place, fit)
+
+    few = min(PRUNING_DRAWS, options.proposals)
+    sampler.draw(few)
+    sampler.prune(options.prune_margin)
+    if near is not None and sampler.sites:
+        found = unconstrained(sampler.sites, near.policy)
+        near = near.tempered(LEARNED_FROM)
+        sampler.propose(near_to(found, near.log_weights), options.proposals)
+    elif options.proposals > few:
+        sampler.draw(options.proposals - few)
+    for stage in range(options.stages if sampler.sites or sampler.supports else 0):
+        found = sampler.weighted()
+        if found.effective >= options.enough:
+            return found
+        few = found.effective <= FEW
+        found = found.tempered(LEARNED_FROM)
+        if not sampler.proposes_residual and (few or stage >= PLAIN_STAGES):
+            sampler.learn_residual(found)
+        sampler.learn_discrete(found)
+        sampler.propose(near_to(sampler.place, found.log_weights), options.proposals)
+    return sampler.weighted()
+
+
+def _heavy_tailed(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateStudentT:
+    weights = log_weights.exp().to(place)[:, None]
+    mean = (weights * place).sum(0)
+    centred = place - mean
+    covariance = wider * (weights * centred).T @ centred
+    # Where few draws have all the weight, their spread says nothing.
+    floor = 1e-3 * place.var(0) + 1e-8
+    spread = torch.linalg.cholesky(covariance + torch.diag(floor))
+    return MultivariateStudentT(place.new_tensor(TAILS), mean, spread)

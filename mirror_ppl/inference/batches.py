@@ -1,0 +1,59 @@
+"""Engines that infer several people together: as many at once as fit into memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from mirror_ppl.checkpoints import read_checkpoint
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
+from mirror_ppl.inference.engine import Inferred, Job
+from mirror_ppl.inference.importance import infer_by_importance
+from mirror_ppl.inference.second_look import LIKELY_DRAWS, coarse, looks_twice
+from mirror_ppl.likelihood.compiled import Compiled, compile
+from mirror_ppl.models.human import has_own_program
+from mirror_ppl.models.prior import Draws
+
+PEOPLE_AT_ONCE = 50
+"""People whose views are in memory together; they do not depend on each other."""
+
+
+def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> Inferred:
+    """Infer so many people at once that their views fit into memory.
+
+    Args:
+        job: what to infer.
+        infer_batch: does so for some people, of whom program and rounds are compiled.
+    """
+    people, found, files = job.rounds.num_people, [], {}
+    if job.checkpoint is not None:
+        path, run = job.checkpoint
+        for begin in range(0, people, PEOPLE_AT_ONCE):
+            files[begin] = path.with_name(f"{path.name}.{begin}") if begin else path, run
+            if files[begin][0].exists():  # what cannot be continued is refused before any work
+                read_checkpoint(*files[begin])
+    for begin in range(0, people, PEOPLE_AT_ONCE):
+        some = range(begin, min(begin + PEOPLE_AT_ONCE, people))
+        own = replace(job.of(some), seed=job.seed + begin, checkpoint=files.get(begin))
+        compiled = compile(
+            own.human,
+            own.rounds,
+            screening=own.screening,
+            likely=own.start or _likely(own),
+            report=lambda done, begin=begin: job.report("views", begin + done, people, "people"),
+        )
+        found.append(infer_batch(compiled, own))
+    draws = {name: torch.cat([one.draws[name] for one in found], 1) for name in found[0].draws}
+    losses = tuple(sum(step) for step in zip(*(one.losses for one in found), strict=True))
+    return Inferred(draws, losses=losses)
+
+
+def _likely(job: Job) -> Draws | None:
+    """Roughly who people are, where what stands for all they may attend to hangs on that."""
+    if has_own_program(job.human) or not looks_twice(job.human):
+        return None
+    settings = coarse(ImportanceOptions())
+    first = replace(job, draws=LIKELY_DRAWS, settings=settings, checkpoint=None, start=None)
+    return dict(infer_by_importance(first).draws)

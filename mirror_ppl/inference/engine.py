@@ -1,0 +1,102 @@
+"""What an engine is: a way to infer the implants of people, and what it is given and returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.likelihood.view_table_builder import Screening
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.progress import Report, silent
+
+if TYPE_CHECKING:
+    from mirror_ppl.inference.amortized import AmortizedGuide
+    from mirror_ppl.inference.population.pooling import Population
+
+
+@dataclass(frozen=True)
+class Inferred:
+    """What was inferred of P people.
+
+    Attributes:
+        draws: joint posterior draws by site, ``[S, P, 1, ...]``, as the human model samples them.
+        pareto_k: of importance weights ``[P]``, if there are any.
+        losses: negative ELBO at each step in nats, if one was optimized.
+        population: that people are from, if they were pooled.
+        effective: number ``[P]`` of each person's own draws that pooling leaves, if they were.
+    """
+
+    draws: Mapping[str, Tensor]
+    pareto_k: Tensor | None = None
+    losses: tuple[float, ...] = field(default=())
+    population: Population | None = None
+    effective: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """What an engine has to do: infer the implants of P people, each under the model's own prior.
+
+    Attributes:
+        human: the model of people.
+        rounds: of P people.
+        draws: posterior draws S of each person.
+        settings: of the engine, see :attr:`Engine.settings`.
+        seed: of everything random.
+        screening: when to give up combinations of discrete sites; ``None`` for never.
+        network: of the amortized guide, if there is one.
+        report: told of progress.
+        checkpoint: a file that is written now and then and continued from if it exists, and what
+            identifies this run (a checkpoint of another run is refused).
+        start: draws ``[S, P, 1, ...]`` at which to start, if there are any.
+    """
+
+    human: HumanModel
+    rounds: Demonstrations
+    draws: int
+    settings: Any
+    seed: int
+    screening: Screening | None = None
+    network: AmortizedGuide | None = None
+    report: Report = silent
+    checkpoint: tuple[Path, str] | None = None
+    start: Mapping[str, Tensor] | None = None
+
+    def of(self, people: range) -> Job:
+        """The part of the job about some of the people."""
+        if len(people) == self.rounds.num_people:
+            return self
+        start = self.start
+        if start is not None:
+            start = {name: value[:, people.start : people.stop] for name, value in start.items()}
+        return replace(self, rounds=self.rounds.select_people(people), start=start)
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A way to infer implants.
+
+    Attributes:
+        name: by which users know it.
+        summary: what it does, in a few words.
+        run: does a job.
+        settings: makes the engine's own settings, unless they are given.
+        pooled_draws: of each person under the human model's own prior, from which pooling chooses.
+        any_program: whether it runs human models that cannot be compiled.
+        weighted: whether its draws are corrected by importance weights.
+        needs_network: whether it needs an amortized guide.
+    """
+
+    name: str
+    summary: str
+    run: Callable[[Job], Inferred]
+    settings: Callable[[], Any]
+    pooled_draws: int = 1000
+    any_program: bool = False
+    weighted: bool = False
+    needs_network: bool = False

@@ -1,0 +1,320 @@
+"""A human program with recorded rounds, ready for engines.
+
+:func:`compile` gives tables of views, on which perception and beliefs are worked out once. A human
+model that overrides ``model`` or ``choose`` is not what the tables compute, so it stays the program
+that it is: slower, and for the engines that run any Pyro program.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import pyro
+import torch
+from pyro import poutine
+from pyro.infer import config_enumerate, infer_discrete
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.likelihood.combinations import discrete_sites
+from mirror_ppl.likelihood.densities import PLATES, Given, log_prob, sample_nodes
+from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joints
+from mirror_ppl.likelihood.predictive import predict_actions
+from mirror_ppl.likelihood.table_program import TableProgram
+from mirror_ppl.likelihood.tables import join_tables, restricted, rounds_of
+from mirror_ppl.likelihood.view_table import ViewTable
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.models.human import ACTION, HumanModel, has_own_program
+from mirror_ppl.models.prior import Draws, draw_prior, values_of
+from mirror_ppl.models.sites import discrete_names, latent_sites
+
+
+class Compiled(ABC):
+    """What the recorded rounds of P people say under a human program.
+
+    Attributes:
+        human: the model of people.
+    """
+
+    def __init__(self, human: HumanModel) -> None:
+        self.human = human
+
+    @property
+    @abstractmethod
+    def people(self) -> int:
+        """Number of people P."""
+
+    @abstractmethod
+    def program(self) -> None:
+        """The Pyro program, conditioned on the rounds; people are at dimension -2."""
+
+    @abstractmethod
+    def log_joint(self, draws: Mapping[str, Tensor]) -> Tensor:
+        """Log density ``[S, P]`` of draws ``[S, P, 1, ...]`` of all sites and of the rounds.
+
+        Latents of rounds are summed out.
+        """
+
+    @abstractmethod
+    def predict(self, draws: Mapping[str, Tensor]) -> Tensor:
+        """Log-probabilities ``[S, P, B, T, A]`` of actions, given what was done before them."""
+
+    @cached_property
+    def discrete(self) -> set[str]:
+        """Names of the sites that are enumerated."""
+        with torch.random.fork_rng(devices=[]), poutine.block():
+            return discrete_names(poutine.trace(self.program).get_trace())
+
+    @torch.no_grad()
+    def sample_discrete(self, continuous: Mapping[str, Tensor]) -> Draws:
+        """Draws ``[S, P, 1, ...]`` of all sites, given those of the continuous ones.
+
+        Discrete sites are drawn from their posterior, with the global random state.
+        """
+        number = len(next(iter(continuous.values()))) if continuous else 1
+        drawn = [
+            self._with_discrete({name: value[draw] for name, value in continuous.items()})
+            for draw in range(number)
+        ]
+        return {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
+
+    def _with_discrete(self, continuous: Mapping[str, Tensor]) -> Draws:
+        """One draw ``[P, 1, ...]``."""
+        sampled = infer_discrete(
+            poutine.condition(config_enumerate(self.program, "parallel"), data=dict(continuous)),
+            first_available_dim=-1 - PLATES,
+        )
+        with poutine.block():
+            sites = latent_sites(poutine.trace(sampled).get_trace())
+        own = {name: node for name, node in sites.items() if name in discrete_sites(self.human)}
+        return {**continuous, **values_of(own)}
+
+
+class ViewTables(Compiled):
+    """Compiled to tables of views.
+
+    Args:
+        human: the model of people.
+        table: of the rounds of P people.
+        builders: that made it, for each person, if rounds are to be added.
+    """
+
+    def __init__(
+        self, human: HumanModel, table: ViewTable, builders: Sequence[ViewTableBuilder] = ()
+    ) -> None:
+        super().__init__(human)
+        self.table = table
+        self._builders = builders
+
+    @property
+    def people(self) -> int:
+        """Number of people P."""
+        return self.table.people
+
+    def program(self) -> None:
+        """The program, with actions of all rounds as one site of each person."""
+        TableProgram(self.human)(self.table)
+
+    def restrict(self, alive: Tensor) -> None:
+        """Give up the combinations ``[P, M]`` of discrete sites that are not alive."""
+        self.table = restricted(self.table, alive)
+
+    def add(self, rounds: Demonstrations) -> None:
+        """Take in more rounds of the same people.
+
+        Args:
+            rounds: as many of each person as of the others.
+        """
+        for person, builder in enumerate(self._builders):
+            for one_round in rounds_of(rounds, person):
+                builder.add(*one_round)
+        self.table = join_tables([builder.table() for builder in self._builders])
+
+    @cached_property
+    def sums_over_combinations(self) -> bool:
+        """Whether every discrete site is one that perception reads, and nothing else reads it."""
+        sites = set(self.table.sites)
+        return sites == set(discrete_sites(self.human)) == self.discrete
+
+    @cached_property
+    def acts_on_beliefs(self) -> bool:
+        """Whether what a person sees reaches their actions through beliefs alone."""
+        return acts_on_beliefs(self.human, self.table)
+
+    @torch.no_grad()
+    def log_joint(self, draws: Mapping[str, Tensor]) -> Tensor:
+        """Log density ``[S, P]`` of draws ``[S, P, 1, ...]`` of all sites and of the rounds."""
+        number = len(next(iter(draws.values())))
+        with (
+            poutine.block(),
+            poutine.trace() as trace,
+            Given(dict(draws)),
+            pyro.plate("draw", number, dim=-1 - PLATES),
+        ):
+            self.program()
+        return _added(sample_nodes(trace.trace).values(), number, self.people)
+
+    def predict(self, draws: Mapping[str, Tensor]) -> Tensor:
+        """Log-probabilities ``[S, P, B, T, A]`` of actions, given what was done before them."""
+        return predict_actions(self.human, self.table, draws)
+
+    def _with_discrete(self, continuous: Mapping[str, Tensor]) -> Draws:
+        if not (self.sums_over_combinations and self.acts_on_beliefs):
+            return super()._with_discrete(continuous)
+        one = {name: value[None] for name, value in continuous.items()}
+        joint = log_joints(self.human, self.table, one)[0]
+        drawn = draw_combinations(self.human, self.table, joint, 1)
+        return {**continuous, **{name: value[0] for name, value in drawn.items()}}
+
+
+class Sequential(Compiled):
+    """Not compiled: the program itself, step after step.
+
+    Args:
+        human: the model of people, whose ``model`` may be any Pyro program with the sites of
+            ``prior``, an observed site ``action_<t>`` for each step, and whatever else it observes.
+        rounds: of P people.
+
+    Raises:
+        HumanModelError: it is not such a program.
+    """
+
+    def __init__(self, human: HumanModel, rounds: Demonstrations) -> None:
+        super().__init__(human)
+        self.rounds = rounds
+        self._check()
+
+    @property
+    def people(self) -> int:
+        """Number of people P."""
+        return self.rounds.num_people
+
+    def program(self) -> None:
+        """The human model's own program."""
+        self.human.model(self.rounds)
+
+    def log_joint(self, draws: Mapping[str, Tensor]) -> Tensor:
+        """Log density ``[S, P]`` of draws ``[S, P, 1, ...]`` of all sites and of the rounds."""
+        nodes, number = self._run(draws), len(next(iter(draws.values())))
+        of_people = [node for node in nodes.values() if not _of_rounds(node)]
+        shape = (number, self.people, self.rounds.shape[1])
+        total = torch.zeros(shape)
+        for node in nodes.values():
+            if _of_rounds(node):
+                total = total + log_prob(node)
+        total = _over_latents(total, len(shape)).sum(-1)
+        return total + _added(of_people, number, self.people)
+
+    def predict(self, draws: Mapping[str, Tensor]) -> Tensor:
+        """Log-probabilities ``[S, P, B, T, A]`` of actions, given what was done before them."""
+        number = len(next(iter(draws.values())))
+        shape = (number, *self.rounds.shape[:2])
+        so_far, found = torch.zeros(shape), []
+        for name, node in self._run(draws).items():
+            if node["is_observed"] and name.startswith(f"{ACTION}_"):
+                logits = node["fn"].logits
+                share = so_far - _over_latents(so_far, len(shape))
+                predicted = _over_latents(share[..., None] + logits, len(shape) + 1)
+                found.append(predicted.expand(*shape, -1))
+            if _of_rounds(node):
+                so_far = so_far + log_prob(node)
+        return torch.stack(found, -2)
+
+    @torch.no_grad()
+    def _run(self, draws: Mapping[str, Tensor]) -> dict[str, dict]:
+        """Nodes of the program under draws ``[S, P, 1, ...]``; latents of rounds enumerated."""
+        number = len(next(iter(draws.values())))
+        with (
+            poutine.block(),
+            poutine.trace() as trace,
+            poutine.enum(first_available_dim=-2 - PLATES),
+            Given(dict(draws)),
+            pyro.plate("draw", number, dim=-1 - PLATES),
+        ):
+            program: Any = config_enumerate(self.program, "parallel")  # type: ignore[reportCallIssue]
+            program()
+        return sample_nodes(trace.trace)
+
+    def _check(self) -> None:
+        kind = type(self.human).__name__
+        with torch.random.fork_rng(devices=[]), poutine.block():
+            nodes = sample_nodes(poutine.trace(self.program).get_trace())
+        expected = draw_prior(self.human, 1, 1, 0)
+        latent = {name: node for name, node in nodes.items() if not node["is_observed"]}
+        if missing := [name for name in expected if name not in latent]:
+            raise HumanModelError(
+                f"{kind}.model does not sample {', '.join(missing)} of prior(); call self.prior()"
+            )
+        for name, node in latent.items():
+            if name not in expected and not (_of_rounds(node) and node["fn"].has_enumerate_support):
+                raise HumanModelError(
+                    f'{kind}.model samples "{name}" outside of prior(); sample it there, or as a '
+                    "discrete site of a round"
+                )
+        for step in range(self.rounds.shape[2]):
+            if f"{ACTION}_{step}" not in nodes or not nodes[f"{ACTION}_{step}"]["is_observed"]:
+                raise HumanModelError(
+                    f'{kind}.model has no observed site "{ACTION}_{step}": the recorded action of '
+                    "that step, from which people are inferred"
+                )
+
+
+def _of_rounds(node: Mapping[str, Any]) -> bool:
+    """Whether a site is one of each round, and not of each person."""
+    return any(frame.dim == -1 for frame in node["cond_indep_stack"])
+
+
+def _over_latents(values: Tensor, dimensions: int) -> Tensor:
+    """Sum, in logarithms, over the dimensions of latents of rounds, to the left of the others."""
+    while values.dim() > dimensions:
+        values = values.logsumexp(0)
+    return values
+
+
+def _added(nodes: Iterable[Mapping[str, Any]], number: int, people: int) -> Tensor:
+    """Log densities of nodes of each person, ``[S, P]``."""
+    total = torch.zeros(number, people, 1)
+    for node in nodes:
+        total = total + log_prob(node)
+    return total.squeeze(-1)
+
+
+@torch.no_grad()
+def compile(  # noqa: A001 - the word for it
+    human: HumanModel,
+    rounds: Demonstrations,
+    *,
+    screening: Screening | None = None,
+    likely: Mapping[str, Tensor] | None = None,
+    report: Callable[[int], None] = lambda people: None,
+) -> ViewTables | Sequential:
+    """Compile a human program and recorded rounds.
+
+    Args:
+        human: the model of people.
+        rounds: of P people.
+        screening: when to give up combinations of discrete sites on the way; never unless given.
+        likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`ViewTableBuilder`.
+        report: called with the number of people done.
+
+    Raises:
+        HumanModelError: the model breaks its contract.
+    """
+    if has_own_program(human):
+        return Sequential(human, rounds)
+    builders = []
+    for person in range(rounds.num_people):
+        own = None
+        if likely is not None:
+            own = {name: value[:, person : person + 1] for name, value in likely.items()}
+        builder = ViewTableBuilder(human, screening, likely=own)
+        for one_round in rounds_of(rounds, person):
+            builder.add(*one_round)
+        builders.append(builder)
+        report(person + 1)
+    tables = [builder.table() for builder in builders]
+    return ViewTables(human, join_tables(tables, rounds.shape), builders)
