@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +94,7 @@ def _run(
 
 def _become(command: str, arguments: list[str], folder: Path, place: Path) -> None:
     """Be the command, in a copy of this process."""
-    from mirror_ppl.console import run
+    from mirror_ppl.console import guarded, run
 
     os.setsid()
     os.chdir(folder)
@@ -104,13 +105,15 @@ def _become(command: str, arguments: list[str], folder: Path, place: Path) -> No
     sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
     resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST, LARGEST))
     status = BROKEN
+    # Of a process that is a copy, joblib makes none of its own.
+    warnings.filterwarnings("ignore", "Loky-backed parallel loops")
     try:
         module = importlib.import_module(f"mirror_ppl.{command or '__main__'}")
         if command:
             told = {"prog": module.PROGRAM, "description": module.DESCRIPTION, "args": arguments}
             status = run(module.Options, module.main, **told)
         else:
-            status = module.main(arguments)
+            status = guarded(lambda: module.main(arguments))
     except BaseException:  # noqa: BLE001 - whatever it is, it is a fault
         traceback.print_exc()
     finally:

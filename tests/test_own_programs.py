@@ -85,7 +85,12 @@ def test_pyro_infers_it_too(recordings):
     with pyro.get_param_store().scope():
         pyro.set_rng_seed(0)
         guide = AutoNormal(human.model)
-        svi = SVI(human.model, guide, pyro.optim.Adam({"lr": 0.05}), Trace_ELBO(4, vectorize_particles=False))
+        svi = SVI(
+            human.model,
+            guide,
+            pyro.optim.Adam({"lr": 0.05}),
+            Trace_ELBO(4, vectorize_particles=False),
+        )
         for _ in range(200):
             svi.step(recordings)
         found = guide.median()["otherwise"].item()

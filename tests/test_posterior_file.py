@@ -1,5 +1,7 @@
 """Posterior files read back: draws as they were, and every file that cannot be used refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -305,4 +307,12 @@ def test_values_that_cannot_be_are_refused(path, name, value, message):
     file = load_posterior(path)
     file.values[name][1] = value
     with pytest.raises(PosteriorError, match=message):
+        file.draws(human())
+
+
+def test_values_of_another_kind_are_refused(path):
+    file = load_posterior(path)
+    name = "sight_front_own"
+    file = replace(file, values={**file.values, name: file.values[name].astype(str)})
+    with pytest.raises(PosteriorError, match='"sight_front_own" holds no numbers'):
         file.draws(human())

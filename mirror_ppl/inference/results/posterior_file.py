@@ -67,6 +67,8 @@ class PosteriorFile:
             if name not in self.values:
                 raise PosteriorError(f'{self.path}: has no draws of the site "{name}"')
             value = self.values[name][chosen]
+            if value.dtype.kind not in "biuf":
+                raise PosteriorError(f'{self.path}: "{name}" holds no numbers')
             if is_reach(name, site["value"]):
                 distance = np.abs(value[..., None] - bins)
                 if not (distance.min(-1) < np.diff(bins).min() / 2).all():
