@@ -1,14 +1,39 @@
 """MIRROR as a Pyro program: what a person sees, how they decide, and what a robot should tell them.
 
+    import mirror_ppl
+
+    fit = mirror_ppl.infer("recordings.nc")
+    fit.plot.sight()
+    decision = mirror_ppl.Communicator(fit, "person-01").plan(round_so_far)
+
 The models are in `mirror_ppl.models`, the ways to fit them in `mirror_ppl.inference`, the worlds in
-`mirror_ppl.domains`; nothing of it is imported here, so that `import mirror_ppl` stays quick.
-Gymnasium (0.06 s beyond numpy) only learns the names under which it can make the worlds.
+`mirror_ppl.domains`. Nothing of it is imported before it is used, so that `import mirror_ppl` stays
+quick; Gymnasium (0.06 s beyond numpy) only learns the names under which it can make the worlds.
 """
+
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
 
 from gymnasium import register as _register
 
+if _TYPE_CHECKING:
+    from mirror_ppl.face import Communicator, Fit, HumanModel, infer, load_recordings, worlds
+
 __version__ = "0.1.0"
+__all__ = ["Communicator", "Fit", "HumanModel", "infer", "load_recordings", "worlds"]
 
 _register("mirror_ppl/Driving-v0", "mirror_ppl.domains.driving_environment:DrivingEnv")
 _register("mirror_ppl/SearchRescue-v0", "mirror_ppl.domains.rescue_environment:SearchRescueEnv")
 _register("mirror_ppl/BombDefusal-v0", "mirror_ppl.domains.bomb_environment:BombDefusalEnv")
+
+
+def __getattr__(name: str) -> _Any:
+    if name in __all__:
+        from mirror_ppl import face
+
+        return getattr(face, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
 
-from mirror_ppl.console import run, usable_device
+from mirror_ppl.console import run
 from mirror_ppl.errors import OptionError
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.limits import check_numbers, require_memory, share
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from mirror_ppl.data import Demonstrations
 
 PROGRAM = "python -m mirror_ppl.fit"
-DOMAIN, POPULATION = "driving", "paper"
 CHECKPOINT = "fit.checkpoint"
 CHECKPOINTS = re.compile(r"fit\.checkpoint(\.refined)?(\.\d+)?")
 COPIES = 4
@@ -103,98 +102,48 @@ def main(options: Options) -> None:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
     began = monotonic()
-    demonstrations = _recordings(options)
     from mirror_ppl.domains import get_domain
     from mirror_ppl.evaluation.fit_report import show_fit
-    from mirror_ppl.files import json_text, output_folder, write_together
-    from mirror_ppl.inference.engines import InferenceOptions
-    from mirror_ppl.inference.population.pooling import Pooling
-    from mirror_ppl.inference.results.export import add_identifiability, netcdf_content
-    from mirror_ppl.inference.results.fitting import fit_people
-    from mirror_ppl.inference.results.identifiability import identify
-    from mirror_ppl.inference.results.population_file import load_population
+    from mirror_ppl.face import RESULTS, infer
+    from mirror_ppl.files import output_folder
     from mirror_ppl.inference.svi import SVIOptions
-    from mirror_ppl.likelihood.contract import check_contract
-    from mirror_ppl.models.loading import load_human_model
-    from mirror_ppl.models.weights import load_self_model, shipped_weights
-    from mirror_ppl.plots.identifiability import plot_identifiability
-    from mirror_ppl.plots.sight import FILES, sight_pictures
-    from mirror_ppl.training.guide_file import network_for
 
-    device = usable_device(options.device)
-    guide, note = current_name(options.guide)
+    recordings = _recordings(options)
+    engine, note = current_name(options.guide)
     if note is not None:
         print(f"--guide: {note}", file=sys.stderr)
-    settings = InferenceOptions(
-        guide,
-        options.draws,
-        SVIOptions(steps=options.steps) if guide == "svi" else None,
-        pooling=options.pooling,
-        refine=options.refine,
-        allow_contradictions=share(options.allow_contradictions, "--allow-contradictions"),
-    )
-    weights = options.self_model or shipped_weights(demonstrations.domain)
-    self_model, _ = load_self_model(weights, demonstrations.domain)
-    human = load_human_model(options.human_model, self_model.to(device))
-    check_contract(human)
-    network = network_for(guide, options.guide_file, human)
-    population = None
-    if options.prior_from is not None:
-        pooling = Pooling(human)
-        population = load_population(options.prior_from, pooling, demonstrations.setting)
-    _require_memory(demonstrations, options)
-    results = ("summary.json", "posterior.nc", "open.png", *FILES)
-    with output_folder(options.out, (*results, CHECKPOINT)) as folder, Stages() as stages:
-        result = fit_people(
-            human,
-            demonstrations.to(device),
-            settings,
-            options.seed,
-            options.train_rounds,
-            stages.report,
-            folder / CHECKPOINT,
-            network,
-            population,
+    allowed = share(options.allow_contradictions, "--allow-contradictions")
+    _require_memory(recordings, options)
+    with output_folder(options.out, (*RESULTS, CHECKPOINT)) as folder, Stages() as stages:
+        fit = infer(
+            recordings,
+            human=options.human_model,
+            engine=engine,
+            pooling=options.pooling,
+            seed=options.seed,
+            draws=options.draws,
+            train_rounds=options.train_rounds,
+            settings=SVIOptions(steps=options.steps) if engine == "svi" else None,
+            refine=options.refine,
+            explore=options.explore,
+            allow_contradictions=allowed,
+            prior_from=options.prior_from,
+            guide_file=options.guide_file,
+            self_model=options.self_model,
+            device=options.device,
+            report=stages.report,
+            checkpoint=folder / CHECKPOINT,
         )
-        found = identify(
-            human,
-            result.train,
-            result.posterior.draws,
-            options.seed,
-            result.posterior.population,
-            stages.report,
-            options.explore,
-        )
-        if found is not None:
-            scenarios = get_domain(demonstrations.domain).scenarios
-            for number, person in enumerate(result.summary["people"]):
-                person["identifiability"] = found.of(number, scenarios)
-            add_identifiability(result.data, found, result.data["posterior"].attrs)
-        if options.prior_from is not None:
-            result.summary["prior_from"] = str(options.prior_from)
-        pictures = sight_pictures(result.data)
-        drawn = {name: picture for name, (picture, _) in pictures.items()}
-        if found is not None and not found.nothing:
-            drawn["open.png"] = plot_identifiability(result.data)
-        summary = result.summary | {"seconds": round(monotonic() - began, 1)}
-        contents = {
-            folder / "posterior.nc": netcdf_content(result.data),
-            **{folder / name: picture.content() for name, picture in drawn.items()},
-            folder / "summary.json": json_text(summary),
-        }
-        # Those of an older fit go first: it may have drawn what this one does not, and results of
-        # a fit that is killed here cannot be taken for whole without their summary.
-        write_together(contents, remove=[folder / name for name in results])
+        seconds = round(monotonic() - began, 1)
+        pictures = fit.save(folder, seconds=seconds)
         for file in folder.glob(f"{CHECKPOINT}*"):
             if CHECKPOINTS.fullmatch(file.name) and file.is_file():
                 file.unlink()
-    show_fit(summary, get_domain(demonstrations.domain).reach_unit)
+    show_fit(fit.summary | {"seconds": seconds}, get_domain(recordings.domain).reach_unit)
     print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
     print(f"{folder / 'summary.json'}: the numbers above")
-    for name, (_, shows) in pictures.items():
+    for name, shows in pictures.items():
         print(f"{folder / name}: {shows}")
-    if "open.png" in drawn:
-        print(f"{folder / 'open.png'}: what is open about what they see, and what would tell")
 
 
 def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
@@ -212,28 +161,21 @@ def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
     require_memory(4 * values, "so many draws of predictions")
 
 
-def _recordings(options: Options):
-    from mirror_ppl.data import asset_path, load_demonstrations
-    from mirror_ppl.domains import get_domain, require_known
-    from mirror_ppl.people import PEOPLE
+def _recordings(options: Options) -> Demonstrations:
+    from mirror_ppl.face import load_recordings
 
+    given = {name: getattr(options, name) for name in ("domain", "setting", "population")}
     if options.demos is not None:
-        recorded = load_demonstrations(options.demos)
+        recorded = load_recordings(options.demos)
         for name in ("domain", "setting"):
-            given, own = getattr(options, name), getattr(recorded, name)
-            if given not in (None, own):
-                raise OptionError(f"--{name} is {given}, but --demos is of {own}; leave one out")
+            if given[name] not in (None, own := getattr(recorded, name)):
+                raise OptionError(
+                    f"--{name} is {given[name]}, but --demos is of {own}; leave one out"
+                )
         if options.population is not None:
             raise OptionError("--population is of the shipped recordings; leave it or --demos out")
         return recorded
-    domain = DOMAIN if options.domain is None else options.domain
-    settings = get_domain(domain).settings
-    setting = settings[-1] if options.setting is None else options.setting
-    require_known(setting, "setting", settings, domain)
-    population = POPULATION if options.population is None else options.population
-    require_known(population, "population", PEOPLE[domain].populations, domain)
-    name = f"{domain}_{setting}_{population}.nc"
-    return load_demonstrations(asset_path(name))
+    return load_recordings(**given)
 
 
 if __name__ == "__main__":

@@ -7,22 +7,20 @@ them are differences in what they said.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from time import perf_counter
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mirror_ppl.communication import rules
-from mirror_ppl.communication.communicator import Communicator, Decision
+from mirror_ppl.communication.communicator import Decision
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.minds import Person
-from mirror_ppl.communication.objectives import Divergence, ExpectedUtility
+from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.communication.search import Automatic
-from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld
 from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.oracle import Oracle
@@ -34,9 +32,7 @@ from mirror_ppl.people.populations import derived_generator
 from mirror_ppl.people.recordings import Start
 
 COMMUNICATORS = (
-    "mirror",
-    "mirror-self-model",
-    "mirror-kl",
+    *PLANNERS,
     "none",
     "all",
     "random",
@@ -46,57 +42,6 @@ COMMUNICATORS = (
 """Everything that can be paired with people, in the order in which it is shown."""
 RATES_FROM = "mirror"
 """Whose rate of items ``random`` has."""
-
-
-@dataclass(frozen=True)
-class PlannerOptions:
-    """Settings of the planners.
-
-    Attributes:
-        horizon: steps looked ahead.
-        discount: per step.
-        branch: see :class:`ExpectedUtility`.
-        patience: length of the plans that are compared, see :class:`Automatic`.
-        items: most items of a message, see :class:`Automatic`.
-        sure: standard errors that a gain must exceed, see :class:`Communicator`.
-        beyond: see :class:`ExpectedUtility`.
-        kl_weight: units of reward that mirror-kl gives for a nat.
-        kl_measure: what mirror-kl measures, see :class:`Divergence`.
-    """
-
-    horizon: int = 10
-    discount: float = 1.0
-    branch: float = 0.1
-    patience: int = 3
-    items: int | None = None
-    sure: float = 2.0
-    kl_weight: float = 1.0
-    kl_measure: str = "kl"
-    beyond: bool = False
-
-    @classmethod
-    def of(cls, domain: str, **changes: Any) -> Self:
-        """The settings for a domain, with changes; None leaves what is set for the domain."""
-        given = {name: value for name, value in changes.items() if value is not None}
-        return cls(**(BY_DOMAIN.get(domain, {}) | given))
-
-
-BY_DOMAIN: dict[str, dict[str, Any]] = {
-    "search_rescue": {"horizon": 16, "beyond": True, "branch": 0.4, "items": 2, "sure": 1.0},
-    # Costs grow so fast that no third item is worth its own; the oracle looks at two, too. A bomb
-    # does nothing by itself, so what helps cannot wait; and where the next stage takes as long,
-    # steps that are looked at are used up all the same, whenever this one ends.
-    # A wrong button costs much more than a message: it is rash to be silent until a gain is sure.
-    "bomb_defusal": {
-        "horizon": 12,
-        "beyond": True,
-        "branch": 0.4,
-        "items": 2,
-        "patience": 1,
-        "sure": 0.0,
-    },
-}
-"""Settings of planners that differ by domain."""
 
 
 @dataclass(frozen=True)
@@ -257,21 +202,6 @@ def _oracle(listener: Listener) -> Say:
         return lambda rounds, _: (oracle.messages(torch.stack([r.actions for r in rounds])), None)
     knows = ReachableOracle(listener.driver, start)
     return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
-
-
-def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
-    """The planner of that name: mirror, mirror-self-model or mirror-kl."""
-    search = Automatic(options.patience, items=options.items)
-    if name == "mirror-kl":
-        objective = Divergence(options.kl_weight, options.kl_measure)
-        return Communicator(person, objective, replace(search, steps=1), options.sure, seed)
-    world = SimulatorWorld(person.human.known_world(person.draws))
-    if name == "mirror-self-model":
-        world = SelfModelWorld(person.human.self_model)
-    objective = ExpectedUtility(
-        world, options.horizon, options.discount, options.branch, options.beyond
-    )
-    return Communicator(person, objective, search, options.sure, seed)
 
 
 @torch.no_grad()

@@ -38,12 +38,14 @@ class Fit:
     """Everything that came out of fitting P people.
 
     Attributes:
+        human: the human model.
         train: the rounds that were learned from.
         posterior: draws, and how they came about.
         data: the posterior and predictions as ArviZ ``InferenceData``.
         summary: what ``summary.json`` holds.
     """
 
+    human: HumanModel
     train: Demonstrations
     posterior: Inferred
     data: az.InferenceData
@@ -166,7 +168,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         "people": found,
     }
     summary |= newcomer
-    return Fit(learned, posterior, data, summary)
+    return Fit(human, learned, posterior, data, summary)
 
 
 def _attributes(

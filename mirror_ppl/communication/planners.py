@@ -1,0 +1,111 @@
+"""The planners by name: what each is for, and what makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+from mirror_ppl.communication.communicator import Communicator
+from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective
+from mirror_ppl.communication.search import Automatic
+from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld, World
+from mirror_ppl.errors import UnknownNameError
+
+
+@dataclass(frozen=True)
+class PlannerOptions:
+    """Settings of the planners.
+
+    Attributes:
+        horizon: steps looked ahead.
+        discount: per step.
+        branch: see :class:`ExpectedUtility`.
+        patience: length of the plans that are compared, see :class:`Automatic`.
+        items: most items of a message, see :class:`Automatic`.
+        sure: standard errors that a gain must exceed, see :class:`Communicator`.
+        beyond: see :class:`ExpectedUtility`.
+        kl_weight: units of reward that mirror-kl gives for a nat.
+        kl_measure: what mirror-kl measures, see :class:`Divergence`.
+    """
+
+    horizon: int = 10
+    discount: float = 1.0
+    branch: float = 0.1
+    patience: int = 3
+    items: int | None = None
+    sure: float = 2.0
+    kl_weight: float = 1.0
+    kl_measure: str = "kl"
+    beyond: bool = False
+
+    @classmethod
+    def of(cls, domain: str, **changes: Any) -> Self:
+        """The settings for a domain, with changes; None leaves what is set for the domain."""
+        given = {name: value for name, value in changes.items() if value is not None}
+        return cls(**(BY_DOMAIN.get(domain, {}) | given))
+
+
+BY_DOMAIN: dict[str, dict[str, Any]] = {
+    "search_rescue": {"horizon": 16, "beyond": True, "branch": 0.4, "items": 2, "sure": 1.0},
+    # Costs grow so fast that no third item is worth its own; the oracle looks at two, too. A bomb
+    # does nothing by itself, so what helps cannot wait; and where the next stage takes as long,
+    # steps that are looked at are used up all the same, whenever this one ends.
+    # A wrong button costs much more than a message: it is rash to be silent until a gain is sure.
+    "bomb_defusal": {
+        "horizon": 12,
+        "beyond": True,
+        "branch": 0.4,
+        "items": 2,
+        "patience": 1,
+        "sure": 0.0,
+    },
+}
+"""Settings of planners that differ by domain."""
+
+
+def _utility(world: World, options: PlannerOptions) -> Objective:
+    return ExpectedUtility(world, options.horizon, options.discount, options.branch, options.beyond)
+
+
+def _mirror(person: Person, options: PlannerOptions) -> Objective:
+    return _utility(SimulatorWorld(person.human.known_world(person.draws)), options)
+
+
+def _mirror_self_model(person: Person, options: PlannerOptions) -> Objective:
+    return _utility(SelfModelWorld(person.human.self_model), options)
+
+
+def _mirror_kl(person: Person, options: PlannerOptions) -> Objective:
+    del person
+    return Divergence(options.kl_weight, options.kl_measure)
+
+
+PLANNERS: Mapping[str, Callable[[Person, PlannerOptions], Objective]] = {
+    "mirror": _mirror,
+    "mirror-self-model": _mirror_self_model,
+    "mirror-kl": _mirror_kl,
+}
+"""What makes the objective of each; a new one is a function and its name here.
+
+``mirror`` looks for reward in the domain's simulator, ``mirror-self-model`` in what the robot has
+learned of the world; ``mirror-kl`` brings the person's belief near to the robot's.
+"""
+MYOPIC = ("mirror-kl",)
+"""Those whose objective looks at one step."""
+
+
+def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
+    """The planner of that name for one person.
+
+    Raises:
+        UnknownNameError: there is none.
+    """
+    if name not in PLANNERS:
+        raise UnknownNameError.of("planner", name, PLANNERS)
+    search = Automatic(options.patience, items=options.items)
+    if name in MYOPIC:
+        search = replace(search, steps=1)
+    objective = PLANNERS[name](person, options)
+    return Communicator(person, objective, search, options.sure, seed)

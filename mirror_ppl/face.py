@@ -1,0 +1,366 @@
+"""What most users need: infer people from recordings, look at them, plan what to tell them.
+
+The names here are those of the package itself, as in ``mirror_ppl.infer``. Commands call them, too.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mirror_ppl.checks import require_kind, seed_number, whole_number
+from mirror_ppl.communication.communicator import Communicator as PlannedCommunicator
+from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.planners import PlannerOptions, planner_of
+from mirror_ppl.console import usable_device
+from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
+from mirror_ppl.domains import DOMAINS as worlds
+from mirror_ppl.domains import get_domain, require_known
+from mirror_ppl.errors import InputError
+from mirror_ppl.files import json_text, write_together
+from mirror_ppl.inference.engines import ENGINES, InferenceOptions
+from mirror_ppl.inference.population.pooling import Pooling
+from mirror_ppl.inference.results import fitting
+from mirror_ppl.inference.results.export import add_identifiability, netcdf_content
+from mirror_ppl.inference.results.identifiability import identify
+from mirror_ppl.inference.results.population_file import load_population
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.limits import LIMITS
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.people import PEOPLE
+from mirror_ppl.plots.fit import FILES, FitPlots
+from mirror_ppl.progress import Report, Stages
+from mirror_ppl.training.guide_file import network_for
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Communicator", "Fit", "HumanModel", "infer", "load_recordings", "worlds"]
+
+RESULTS = ("summary.json", "posterior.nc", *FILES)
+"""Names of all files that a fit may write."""
+
+
+@dataclass(frozen=True, repr=False)
+class Fit(fitting.Fit):
+    """What was inferred of P people.
+
+    Attributes:
+        human: the human model.
+        train: the rounds that were learned from.
+        posterior: draws ``[S, P, 1, ...]`` by site, and how they came about.
+        data: posterior, predictions and recordings as ArviZ ``InferenceData``.
+        summary: the numbers that `summary.json` holds.
+    """
+
+    def __repr__(self) -> str:
+        told = self.summary
+        return (
+            f"Fit({told['domain']}, {told['setting']}: {len(self.people)} people, "
+            f"{told['guide']}, {len(next(iter(self.posterior.draws.values())))} draws)"
+        )
+
+    @property
+    def people(self) -> tuple[str, ...]:
+        """Ids of the P people."""
+        return self.train.people
+
+    @cached_property
+    def plot(self) -> FitPlots:
+        """The pictures of this fit, such as ``fit.plot.sight()``."""
+        return FitPlots(self.data)
+
+    def person(self, name: str | None = None) -> FittedPerson:
+        """One of the people; the only one unless named.
+
+        Raises:
+            UnknownNameError: there is nobody of that id.
+            InputError: there are several people, and none is named.
+        """
+        if name is None and len(self.people) > 1:
+            raise InputError(
+                f"the fit is of {len(self.people)} people: name one of them, such as "
+                f"{next(iter(self.people))!r}"
+            )
+        chosen = next(iter(self.people)) if name is None else name
+        return FittedPerson(self, require_known(chosen, "person", self.people))
+
+    def save(self, folder: str | Path, **told: Any) -> dict[str, str]:
+        """Write ``posterior.nc``, ``summary.json`` and the pictures, all of them or none.
+
+        Args:
+            folder: where to; files of an older fit are replaced.
+            told: what ``summary.json`` says besides.
+
+        Returns:
+            What each picture shows, by file name.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+        folder = Path(folder)
+        pictures = self.plot.files()
+        contents = {
+            folder / "posterior.nc": netcdf_content(self.data),
+            **{folder / name: picture.content() for name, (picture, _) in pictures.items()},
+            folder / "summary.json": json_text(self.summary | told),
+        }
+        # Those of an older fit go first: it may have drawn what this one does not, and results of
+        # a fit that is killed here cannot be taken for whole without their summary.
+        write_together(contents, remove=[folder / name for name in RESULTS])
+        return {name: shows for name, (_, shows) in pictures.items()}
+
+
+@dataclass(frozen=True)
+class FittedPerson:
+    """One person of a fit.
+
+    Attributes:
+        fit: that they are of.
+        name: their id.
+    """
+
+    fit: Fit
+    name: str
+
+    def __repr__(self) -> str:
+        return f"FittedPerson({self.name}: {self.summary['rounds']} rounds)"
+
+    @property
+    def number(self) -> int:
+        """Which of the people this is, from 0."""
+        return self.fit.people.index(self.name)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Their part of the fit's summary."""
+        return self.fit.summary["people"][self.number]
+
+    @property
+    def implants(self) -> pd.DataFrame:
+        """Median, 90% interval and truth (if known) of each implant that is one number."""
+        import pandas as pd
+
+        return pd.DataFrame(self.summary["implants"]).T
+
+    @property
+    def draws(self) -> dict[str, Any]:
+        """Posterior draws ``[S, 1, 1, ...]`` by site, tensors."""
+        own = slice(self.number, self.number + 1)
+        return {name: value[:, own] for name, value in self.fit.posterior.draws.items()}
+
+    def listener(self, draws: int = 64) -> Person:
+        """The person to plan messages for, of so many draws, spread evenly over all there are."""
+        held = len(next(iter(self.fit.posterior.draws.values())))
+        number = min(whole_number(draws, "draws", *LIMITS["draws"]), held)
+        chosen = [round(place * (held - 1) / max(number - 1, 1)) for place in range(number)]
+        return Person(self.fit.human, {name: value[chosen] for name, value in self.draws.items()})
+
+
+class Communicator(PlannedCommunicator):
+    """Plans messages for one person of a fit.
+
+    Args:
+        fit: what :func:`infer` returned.
+        person: id; the only one unless named.
+        planner: ``mirror`` (reward, in the domain's simulator), ``mirror-self-model`` (reward, in
+            what the robot learned of the world) or ``mirror-kl`` (beliefs near to the robot's).
+        draws: posterior draws to plan with; 20 to 100 are enough.
+        seed: of everything random; the same seed and round give the same decision.
+        settings: of the planner, see :class:`PlannerOptions`; those of the domain unless given.
+
+    Raises:
+        InputError: the fit is of several people and none is named, or an argument is something
+            else.
+        UnknownNameError: there is no such person, planner or setting.
+    """
+
+    def __init__(
+        self,
+        fit: Fit,
+        person: str | None = None,
+        *,
+        planner: str = "mirror",
+        draws: int = 64,
+        seed: int = 0,
+        **settings: Any,
+    ) -> None:
+        listener = require_kind(fit, Fit, "fit").person(person).listener(draws)
+        known = [field.name for field in fields(PlannerOptions)]
+        for name in settings:
+            require_known(name, "setting", known)
+        options = PlannerOptions.of(listener.human.domain.name, **settings)
+        made = planner_of(planner, listener, options, seed_number(seed))
+        super().__init__(made.person, made.objective, made.search, made.sure, made.seed)
+
+
+def load_recordings(
+    path: str | Path | None = None,
+    *,
+    domain: str | None = None,
+    setting: str | None = None,
+    population: str | None = None,
+) -> Demonstrations:
+    """Read recordings: a file in the documented format, or simulated people that ship.
+
+    Args:
+        path: the file.
+        domain: of the shipped recordings, ``driving`` unless given. Of a file it is checked.
+        setting: of the shipped recordings, the one in which people see less unless given. Of a
+            file it is checked.
+        population: of the shipped recordings, ``paper`` unless given.
+
+    Raises:
+        InputError: the file is of another domain or setting, or a population is given with it.
+        DemonstrationsError: the file is missing or damaged, or breaks the format.
+        UnknownNameError: there is no such domain, setting or population.
+    """
+    if path is not None:
+        recorded = load_demonstrations(path)
+        for name, given in (("domain", domain), ("setting", setting)):
+            own = getattr(recorded, name)
+            if given not in (None, own):
+                raise InputError(f"{name} is {given}, but the recordings are of {own}")
+        if population is not None:
+            raise InputError("population is of the shipped recordings, not of a file")
+        return recorded
+    domain = "driving" if domain is None else domain
+    settings = get_domain(domain).settings
+    setting = require_known(setting or settings[-1], "setting", settings, domain)
+    populations = PEOPLE[domain].populations
+    population = require_known(population or "paper", "population", populations, domain)
+    return load_demonstrations(asset_path(f"{domain}_{setting}_{population}.nc"))
+
+
+def infer(  # noqa: PLR0913 - everything a fit can depend on
+    recordings: Demonstrations | str | Path | None = None,
+    *,
+    human: HumanModel | type[HumanModel] | str | None = None,
+    engine: str = "importance",
+    pooling: str = "none",
+    seed: int = 0,
+    draws: int = 200,
+    train_rounds: int | None = None,
+    settings: Any = None,
+    refine: int = 0,
+    explore: int = 8,
+    allow_contradictions: float = 0.0,
+    prior_from: str | Path | None = None,
+    guide_file: str | Path | None = None,
+    self_model: SelfModel | str | Path | None = None,
+    device: str = "cpu",
+    report: Report | None = None,
+    checkpoint: str | Path | None = None,
+) -> Fit:
+    """Infer what people see and how they decide.
+
+    Args:
+        recordings: rounds of P people, or a file of them; simulated people that ship unless given.
+        human: the human model: an object or a class, one of the package's names (such as
+            ``one-radius``) or ``path/to/file.py:Class``; the package's own for the domain unless
+            given.
+        engine: one of ``mirror_ppl.inference.engines.ENGINES``.
+        pooling: ``none``, or ``partial`` to infer the population that the people are from, too.
+        seed: of everything random: the same seed gives the same fit.
+        draws: posterior draws S of each person.
+        train_rounds: how many rounds of each person to learn from; see
+            :func:`mirror_ppl.inference.results.fitting.split_rounds`.
+        settings: of the engine; its own unless given.
+        refine: gradient steps of ``svi`` that start at what the engine found.
+        explore: rounds that the model plays in each scenario, to find the most informative one; 0
+            leaves it out.
+        allow_contradictions: share of steps, from 0 to 1, that may contradict the next observation.
+        prior_from: a file of a fit with ``pooling="partial"``, whose population is the prior.
+        guide_file: network of the engine ``amortized``; the one that ships unless given.
+        self_model: the robot's networks, or a file of them; those that ship unless given. Not with
+            a human model that is an object, which has its own.
+        device: where to compute: cpu, cuda or cuda:0.
+        report: told of progress; shown on stderr if that is a terminal unless given.
+        checkpoint: file to continue from; written on the way, and kept.
+
+    Raises:
+        InputError: an argument of another kind.
+        MirrorError: what was asked for cannot be done; its kinds are those of
+            :func:`mirror_ppl.inference.results.fitting.fit_people`.
+    """
+    if not isinstance(recordings, Demonstrations):
+        recordings = load_recordings(recordings)
+    where = usable_device(device)
+    options = InferenceOptions(
+        engine,
+        draws,
+        settings,
+        pooling=pooling,
+        refine=refine,
+        allow_contradictions=allow_contradictions,
+    )
+    explore = whole_number(explore, "explore", *LIMITS["explore"])
+    if guide_file is not None and not ENGINES[options.engine].needs_network:
+        raise InputError("guide_file is for the engine amortized")
+    model = _human(human, self_model, recordings.domain).to(where)
+    check_contract(model)
+    network = network_for(options.engine, None if guide_file is None else Path(guide_file), model)
+    population = None
+    if prior_from is not None:
+        if pooling != "none":
+            raise InputError("prior_from is for people who are not pooled; leave out pooling")
+        population = load_population(Path(prior_from), Pooling(model), recordings.setting)
+    with Stages() if report is None and sys.stderr.isatty() else nullcontext() as stages:
+        report = report or (stages.report if stages is not None else _silent)
+        found = fitting.fit_people(
+            model,
+            recordings.to(where),
+            options,
+            seed,
+            train_rounds,
+            report,
+            None if checkpoint is None else Path(checkpoint),
+            network,
+            population,
+        )
+        open_questions = identify(
+            model,
+            found.train,
+            found.posterior.draws,
+            seed,
+            found.posterior.population,
+            report,
+            explore,
+        )
+    if open_questions is not None:
+        scenarios = get_domain(recordings.domain).scenarios
+        for number, person in enumerate(found.summary["people"]):
+            person["identifiability"] = open_questions.of(number, scenarios)
+        add_identifiability(found.data, open_questions, found.data["posterior"].attrs)
+    if prior_from is not None:
+        found.summary["prior_from"] = str(prior_from)
+    return Fit(**vars(found))
+
+
+def _silent(name: str, done: int, total: int, message: str) -> None:
+    """Report nothing."""
+
+
+def _human(
+    human: HumanModel | type[HumanModel] | str | None,
+    self_model: SelfModel | str | Path | None,
+    domain: str,
+) -> HumanModel:
+    """The human model of recordings of that domain."""
+    if isinstance(human, HumanModel):
+        if self_model is not None:
+            raise InputError("self_model is for a human model that is to be made; this one has one")
+        return human
+    if not isinstance(self_model, SelfModel):
+        path = shipped_weights(domain) if self_model is None else Path(self_model)
+        self_model, _ = load_self_model(path, domain)
+    if isinstance(human, type) and issubclass(human, HumanModel):
+        return human(self_model)
+    return load_human_model(human, self_model)

@@ -1,0 +1,115 @@
+"""The pictures of a fit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mirror_ppl.errors import InputError
+from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
+from mirror_ppl.plots import sight
+from mirror_ppl.plots.identifiability import plot_identifiability
+from mirror_ppl.plots.implants import plot_implants
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.rounds import plot_predictive_check, plot_round
+
+if TYPE_CHECKING:
+    import arviz as az
+
+OPEN = "open.png"
+FILES = (*sight.FILES, OPEN)
+"""Names of the files of all pictures that there may be."""
+
+
+class FitPlots:
+    """Draws what was inferred of people; notebooks show what its methods return.
+
+    Args:
+        data: the fit.
+    """
+
+    def __init__(self, data: az.InferenceData) -> None:
+        self.data = data
+
+    def sight(self) -> Picture:
+        """What each person sees: the road, the house, or how probably they notice what is there.
+
+        Raises:
+            InputError: there is no such picture of this world and human model.
+        """
+        return self._of_sight("sight.png", "notices.png")
+
+    def samples(self) -> Picture:
+        """Posterior samples of what each person sees, beside the truth where it is known.
+
+        Raises:
+            InputError: there is no such picture of this world and human model.
+        """
+        return self._of_sight("samples.png")
+
+    def implants(self, person: str) -> Picture:
+        """Each implant of a person that is one number: posterior beside prior.
+
+        Raises:
+            UnknownNameError: there is nobody of that id.
+        """
+        return plot_implants(self.data, person)
+
+    def identifiability(self) -> Picture:
+        """Posterior entropy of what people see, and the most informative scenarios.
+
+        Raises:
+            InputError: the data identify everything, or the human model has nothing discrete to
+                see.
+        """
+        if not self._has_identifiability():
+            raise InputError("nothing about what these people see is left to identify")
+        return plot_identifiability(self.data)
+
+    def predictive_check(self) -> Picture:
+        """How often people change lanes, beside how often the model says that they do.
+
+        Raises:
+            InputError: the world is not driving.
+        """
+        self._require_driving("predictive_check")
+        return plot_predictive_check(self.data)
+
+    def round(self, person: str, number: int, *, held_out: bool = False) -> Picture:
+        """One round of a driver over time, see :func:`mirror_ppl.plots.rounds.plot_round`.
+
+        Raises:
+            InputError: the world is not driving.
+            UnknownNameError: there is nobody of that id, or no such round.
+        """
+        self._require_driving("round")
+        return plot_round(self.data, person, number, held_out=held_out)
+
+    def files(self) -> dict[str, tuple[Picture, str]]:
+        """Every picture that a fit writes, with what it shows, by file name."""
+        pictures = dict(sight.sight_pictures(self.data))
+        if self._has_identifiability():
+            shows = "what is open about what they see, and what would tell"
+            pictures[OPEN] = plot_identifiability(self.data), shows
+        return pictures
+
+    def _has_identifiability(self) -> bool:
+        if "identifiability" not in self.data.groups():
+            return False
+        group = self.data["identifiability"]
+        found = [group[name].values for name in ("open_together", "information")]
+        return any((values >= NEGLIGIBLE).any() for values in found)
+
+    def _require_driving(self, picture: str) -> None:
+        if self.data["posterior"].attrs.get("domain") != "driving":
+            raise InputError(f"there is a picture {picture} of driving only")
+
+    def _of_sight(self, *names: str) -> Picture:
+        known = sight.PICTURES.get(str(self.data["posterior"].attrs.get("domain", "")), {})
+        for name in names:
+            if name in known and known[name].possible(self.data):
+                return known[name].draw(self.data)
+        raise InputError(
+            f"there is no picture {names[0].removesuffix('.png')} of "
+            f"{self.data['posterior'].attrs.get('human_model')} in "
+            f"{self.data['posterior'].attrs.get('domain')}; implants() draws any human model"
+        )

@@ -1,0 +1,201 @@
+"""`mirror_ppl.infer` and what it returns: what most users call."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from refused import refused
+from running import command
+
+import mirror_ppl
+from mirror_ppl import fit as fit_command
+from mirror_ppl.arviz import az
+from mirror_ppl.communication import RoundSoFar
+from mirror_ppl.data import save_demonstrations
+from mirror_ppl.errors import DemonstrationsError, InputError, UnknownNameError
+from mirror_ppl.models.variants import VARIANTS
+from mirror_ppl.people import simulate
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return mirror_ppl.load_recordings().select_people(["person-01", "person-04"])
+
+
+@pytest.fixture(scope="module")
+def fit(recordings):
+    return mirror_ppl.infer(recordings, draws=30, train_rounds=2, explore=2, seed=3)
+
+
+def test_nothing_is_imported_before_it_is_used():
+    code = "import sys, mirror_ppl; print('torch' in sys.modules, dir(mirror_ppl))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("False ")
+    assert "'infer'" in done.stdout
+    with pytest.raises(AttributeError, match="has no attribute 'inferr'"):
+        mirror_ppl.inferr  # noqa: B018
+
+
+def test_the_command_writes_what_infer_returns(fit, recordings, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_demonstrations(tmp_path / "two.nc", recordings)
+    options = ("--draws", 30, "--train-rounds", 2, "--explore", 2, "--seed", 3)
+    assert command(fit_command, "--demos", "two.nc", *options, "--out", "command") == 0
+    pictures = fit.save(tmp_path / "python")
+    one, other = (
+        json.loads((tmp_path / name / "summary.json").read_text()) for name in ("command", "python")
+    )
+    assert one.pop("seconds") > 0
+    assert one == other
+    names = {"summary.json", "posterior.nc", *pictures}
+    for folder in ("command", "python"):
+        assert {file.name for file in (tmp_path / folder).iterdir()} - {".fit.lock"} >= names
+    sights = [(tmp_path / name / "sight.png").read_bytes() for name in ("command", "python")]
+    assert sights[0] == sights[1]
+    one, other = (
+        az.from_netcdf(tmp_path / name / "posterior.nc") for name in ("command", "python")
+    )
+    assert one.groups() == other.groups()
+    for group in one.groups():
+        xr.testing.assert_equal(one[group], other[group])
+
+
+def test_a_fit_says_what_it_is(fit):
+    assert repr(fit) == "Fit(driving, fog: 2 people, importance, 30 draws)"
+    assert fit.people == ("person-01", "person-04")
+    person = fit.person("person-04")
+    assert repr(person) == "FittedPerson(person-04: 2 rounds)"
+    assert person.implants.loc["sight_front_own", "truth"] == 2
+    assert list(person.implants.columns[:3]) == ["median", "q05", "q95"]
+    own = fit.data.posterior["consistency"].sel(person="person-04").values[0]
+    np.testing.assert_allclose(person.draws["consistency"][:, 0, 0], own)
+
+
+def test_pictures_are_drawn(fit):
+    for picture in (
+        fit.plot.sight(),
+        fit.plot.samples(),
+        fit.plot.implants("person-01"),
+        fit.plot.identifiability(),
+        fit.plot.predictive_check(),
+        fit.plot.round("person-01", 0),
+    ):
+        assert picture.content().startswith(b"\x89PNG")
+
+
+def test_messages_are_planned(fit):
+    communicator = mirror_ppl.Communicator(fit, "person-01", draws=8, horizon=3)
+    assert communicator.person.number == 8
+    assert communicator.objective.horizon == 3
+    domain = mirror_ppl.worlds["driving"]
+    state = domain.initial(1, torch.Generator().manual_seed(0))
+    now = {name: value[0] for name, value in domain.observe(state).items()}
+    decision = communicator.plan(RoundSoFar.begin(domain, now))
+    assert decision.why()
+    kl = mirror_ppl.Communicator(fit, "person-01", planner="mirror-kl", draws=8)
+    assert kl.search.steps == 1
+
+
+def test_one_person_need_not_be_named(recordings):
+    one = recordings.select_people(["person-04"])
+    fit = mirror_ppl.infer(one, draws=5, train_rounds=1, explore=0)
+    assert fit.person().name == "person-04"
+    assert mirror_ppl.Communicator(fit).person.number == 5
+
+
+@pytest.mark.parametrize(
+    "human", ["one-radius", VARIANTS["one-radius"], None], ids=["name", "class", "object"]
+)
+def test_human_models_are_named_or_given(recordings, human, fit):
+    kind = VARIANTS["one-radius"]
+    human = kind(fit.human.self_model) if human is None else human
+    found = mirror_ppl.infer(recordings, human=human, draws=5, train_rounds=1, explore=0)
+    assert isinstance(found.human, kind)
+    assert "sight_radius" in found.data.posterior
+
+
+def test_files_are_read(tmp_path):
+    save_demonstrations(tmp_path / "one.nc", simulate("driving", "clear", "paper", 1, 2, 0))
+    fit = mirror_ppl.infer(str(tmp_path / "one.nc"), draws=5, explore=0)
+    assert fit.summary["setting"] == "clear"
+    refused(
+        lambda: mirror_ppl.load_recordings(tmp_path / "one.nc", setting="fog"),
+        "setting is fog, but the recordings are of clear",
+    )
+    refused(
+        lambda: mirror_ppl.load_recordings(tmp_path / "one.nc", population="paper"),
+        "population is of the shipped recordings",
+    )
+    with pytest.raises(DemonstrationsError, match="there is no such file"):
+        mirror_ppl.infer(tmp_path / "none.nc")
+
+
+WRONG = {
+    "person": (lambda fit: fit.person("person-02"), UnknownNameError, 'unknown person "person-02"'),
+    "nobody": (lambda fit: fit.person(), InputError, "of 2 people: name one of them, such as"),
+    "planner": (
+        lambda fit: mirror_ppl.Communicator(fit, "person-01", planner="oracle"),
+        UnknownNameError,
+        'unknown planner "oracle"; known: mirror, mirror-kl, mirror-self-model',
+    ),
+    "setting": (
+        lambda fit: mirror_ppl.Communicator(fit, "person-01", horizn=3),
+        UnknownNameError,
+        'unknown setting "horizn"; .*horizon',
+    ),
+    "no fit": (
+        lambda fit: mirror_ppl.Communicator(fit.data),
+        InputError,
+        "fit must be of the class Fit",
+    ),
+    "engine": (
+        lambda fit: mirror_ppl.infer(fit.train, engine="sv"),
+        UnknownNameError,
+        'unknown engine "sv"',
+    ),
+    "settings": (
+        lambda fit: mirror_ppl.infer(fit.train, engine="svi", settings=3),
+        InputError,
+        "settings must be of the class SVIOptions",
+    ),
+    "guide": (
+        lambda fit: mirror_ppl.infer(fit.train, guide_file="guide.safetensors"),
+        InputError,
+        "guide_file is for the engine amortized",
+    ),
+    "pooling": (
+        lambda fit: mirror_ppl.infer(fit.train, pooling="partial", prior_from="posterior.nc"),
+        InputError,
+        "prior_from is for people who are not pooled",
+    ),
+    "self-model": (
+        lambda fit: mirror_ppl.infer(fit.train, human=fit.human, self_model="weights"),
+        InputError,
+        "self_model is for a human model that is to be made",
+    ),
+    "world": (
+        lambda fit: mirror_ppl.load_recordings(domain="flying"),
+        UnknownNameError,
+        'unknown domain "flying"',
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_cannot_be_is_refused(fit, wrong):
+    call, kind, message = WRONG[wrong]
+    with pytest.raises(kind, match=message):
+        call(fit)
+
+
+def test_worlds_without_a_picture_say_so():
+    some = mirror_ppl.load_recordings(domain="bomb_defusal").select_people(["person-01"])
+    fit = mirror_ppl.infer(some, draws=5, train_rounds=1, explore=0, human="policy-only")
+    for draw in (fit.plot.sight, fit.plot.predictive_check, fit.plot.identifiability):
+        with pytest.raises(InputError):
+            draw()
+    assert fit.plot.implants("person-01").content()
