@@ -76,7 +76,7 @@ train = recordings.select_rounds(range(rounds))
 person = "person-04"
 one = train.select_people([person])
 options = {
-    "importance": InferenceOptions("importance", 400),
+    "exact": InferenceOptions("importance", 400),
     "amortized": InferenceOptions("amortized", 400),
     "svi": InferenceOptions("svi", 400, SVIOptions(steps=10 if quick else 300)),
 }

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
@@ -408,5 +409,6 @@ def _smoothed(raw: Tensor) -> tuple[Tensor, float]:
         return torch.log_softmax(raw, 0), -math.inf
     from mirror_ppl.arviz import az
 
-    smooth, pareto_k = az.psislw(raw.cpu().numpy())
+    with np.errstate(over="ignore"):  # of tails that end
+        smooth, pareto_k = az.psislw(raw.cpu().numpy())
     return torch.log_softmax(torch.as_tensor(smooth, device=raw.device), 0), float(pareto_k)
