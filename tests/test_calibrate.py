@@ -116,7 +116,7 @@ def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
             "no guide ships for one-radius in driving: train one with python -m",
         ),
         (("--jobs", 0), "--jobs must be at least 1, or -1 for all, not 0"),
-        (("--guide", "magic"), 'unknown guide "magic"'),
+        (("--guide", "magic"), 'unknown engine "magic"'),
         (("--guide", "amortized", "--guide-file", "nowhere.x"), "nowhere.x: there is no such file"),
         (("--setting", "hail"), 'unknown setting "hail"'),
         (("--domain", "sailing"), 'unknown domain "sailing"'),

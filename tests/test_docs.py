@@ -167,7 +167,11 @@ def test_every_page_is_listed_in_the_readme():
     [
         ("docs/self_model.md", "Setting", SelfModelOptions()),
         ("docs/human_model.md", "Setting of `svi` (`SVIOptions`)", SVIOptions()),
-        ("docs/human_model.md", "Setting of `exact` (`ImportanceOptions`)", ImportanceOptions()),
+        (
+            "docs/human_model.md",
+            "Setting of `importance` (`ImportanceOptions`)",
+            ImportanceOptions(),
+        ),
     ],
 )
 def test_tables_of_settings_are_the_defaults(name, heading, options):

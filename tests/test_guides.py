@@ -27,6 +27,7 @@ from mirror_ppl.inference.amortized import (
 )
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
+from mirror_ppl.inference.nuts import NUTSOptions
 from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.inference.svi import SVIOptions
@@ -69,7 +70,7 @@ def network(toy):
 
 
 def options_of(guide):
-    return InferenceOptions(guide, DRAWS, SVIOptions(steps=400))
+    return InferenceOptions(guide, DRAWS, SVIOptions(steps=400) if guide == "svi" else None)
 
 
 def bound(variance, draws):
@@ -225,7 +226,7 @@ def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
 @pytest.mark.parametrize("guide", ["importance", "svi"])
 def test_models_with_little_to_infer(toy, recordings, guide):
     """Sight alone, and an implant that actions do not depend on."""
-    some, few = recordings.select_people([0]), SVIOptions(steps=2)
+    some, few = recordings.select_people([0]), SVIOptions(steps=2) if guide == "svi" else None
 
     class OnlySight(ToyHuman):
         def act(self, implants, belief, values):
@@ -257,7 +258,7 @@ def test_a_prior_that_depends_on_what_is_seen_is_refused(toy, recordings):
     human = Hierarchical(toy.self_model)
     for guide in ("importance", "svi"):
         with pytest.raises(HumanModelError, match='"depends" depends on a discrete site'):
-            infer(human, recordings, InferenceOptions(guide, 5, SVIOptions(steps=1)), 0)
+            infer(human, recordings, InferenceOptions(guide, 5), 0)
 
 
 def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):
@@ -410,15 +411,15 @@ def test_models_whose_views_are_not_enough_are_refused(self_model, recordings):
     table = build_view_table(human, some)
     assert not acts_on_beliefs(human, table)
     assert acts_on_beliefs(ToyHuman(self_model), table)
-    for guide in ("importance", "nuts"):
-        with pytest.raises(HumanModelError, match="only the guide svi"):
-            infer(human, some, InferenceOptions(guide), 0)
-    draws = infer(human, some, InferenceOptions("svi", 50, SVIOptions(steps=2)), 0).draws
-    assert draws["reach"].shape == (50, 1, 1)
+    with pytest.raises(HumanModelError, match="only the engines svi and nuts"):
+        infer(human, some, InferenceOptions("importance"), 0)
+    for engine, few in (("svi", SVIOptions(steps=2)), ("nuts", NUTSOptions(warmup=5))):
+        draws = infer(human, some, InferenceOptions(engine, 50, few), 0).draws
+        assert draws["reach"].shape == (50, 1, 1)
 
 
 def test_guides_that_are_not_there(toy, recordings):
-    with pytest.raises(UnknownNameError, match=r'unknown guide "magic"; known: .*exact'):
+    with pytest.raises(UnknownNameError, match=r'unknown engine "magic"; known: .*importance'):
         InferenceOptions("magic")
     with pytest.raises(ValueError, match="draws must be from 1 to 100000, not 0"):
         InferenceOptions(draws=0)

@@ -13,7 +13,7 @@ from mirror_ppl.checks import as_tensor, listed, require_keys, whole_number
 from mirror_ppl.console import usable_device
 from mirror_ppl.data import schema
 from mirror_ppl.data.provenance import checked_provenance
-from mirror_ppl.data.schema import NO_INDEX, TOLD, TRUTH
+from mirror_ppl.data.schema import MEASURED, NO_INDEX, TOLD, TRUTH
 from mirror_ppl.domains import Observation, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, is_name, shown
 
@@ -48,6 +48,8 @@ class Demonstrations:
             unknown.
         action_entropy: entropy in nats of the choice that a simulated person made, ``[P, B, T]``,
             from 0 to the logarithm of the number of actions; NaN in padding and where unknown.
+        measurements: values ``[P]`` of sites of the human model's prior that were measured, such as
+            answers to a questionnaire, by name; NaN where unknown. Fits observe them.
         provenance: where the recordings come from: command, seed, population, version.
 
     Raises:
@@ -69,6 +71,7 @@ class Demonstrations:
     scenarios: Tensor | None = None
     truth: Mapping[str, Tensor] = field(default_factory=dict)
     action_entropy: Tensor | None = None
+    measurements: Mapping[str, Tensor] = field(default_factory=dict)
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -77,7 +80,8 @@ class Demonstrations:
         modalities = {modality.name: modality for modality in domain.modalities}
         require_keys(self.observations, modalities, "observations", DemonstrationsError)
         require_keys(self.told, modalities, "told", DemonstrationsError, all_of_them=False)
-        _check_truths(self.truth)
+        _check_names(self.truth, "truth")
+        _check_names(self.measurements, "measurements")
         people = listed(self.people, "people", "ids", DemonstrationsError)
         provenance = checked_provenance(self.provenance)
         variables: dict[str, Any] = self.variables()
@@ -95,6 +99,7 @@ class Demonstrations:
             "lengths": variables["length"],
             "told": {name: variables[TOLD + name] for name in modalities},
             "truth": {name: variables[TRUTH + name] for name in self.truth},
+            "measurements": {name: variables[MEASURED + name] for name in self.measurements},
             "provenance": provenance,
         }
         fields |= {OPTIONAL[name]: variables[name] for name in OPTIONAL.keys() & variables.keys()}
@@ -142,6 +147,7 @@ class Demonstrations:
             lengths=variables.get("length", every),
             told=_without_prefix(TOLD, variables),
             truth=_without_prefix(TRUTH, variables),
+            measurements=_without_prefix(MEASURED, variables),
             provenance=provenance or {},
             **{key: variables.get(name) for name, key in OPTIONAL.items()},
         )
@@ -158,6 +164,7 @@ class Demonstrations:
             "action": self.actions,
             **{name: value for name, value in optional.items() if value is not None},
             **{TRUTH + name: value for name, value in self.truth.items()},
+            **{MEASURED + name: value for name, value in self.measurements.items()},
         }
 
     @property
@@ -295,8 +302,8 @@ class Demonstrations:
 def concatenate(parts: Iterable[Demonstrations]) -> Demonstrations:
     """The people of all parts, in order, on the first part's device.
 
-    Scenarios, truths and entropies that a part lacks become unknown. Rewards are kept if every part
-    has them. Of the provenance, what all parts agree on is kept.
+    Scenarios, truths, measurements and entropies that a part lacks become unknown. Rewards are kept
+    if every part has them. Of the provenance, what all parts agree on is kept.
 
     Raises:
         DemonstrationsError: there is no part, or something else; the parts are of different domains
@@ -384,9 +391,9 @@ def _check_slice(rounds: slice) -> None:
         ) from error
 
 
-def _check_truths(truth: Any) -> None:
-    if not isinstance(truth, Mapping):
-        raise DemonstrationsError(f"truth must be a dict of values by name, not {shown(truth)}")
-    for name in truth:
+def _check_names(values: Any, what: str) -> None:
+    if not isinstance(values, Mapping):
+        raise DemonstrationsError(f"{what} must be a dict of values by name, not {shown(values)}")
+    for name in values:
         if not is_name(name) or "/" in name:
-            raise DemonstrationsError(f"truth has {shown(name)}, expected {schema.A_NAME}, no /")
+            raise DemonstrationsError(f"{what} has {shown(name)}, expected {schema.A_NAME}, no /")

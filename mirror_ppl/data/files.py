@@ -16,7 +16,7 @@ from mirror_ppl.checks import as_path, require_kind
 from mirror_ppl.data import schema
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.data.provenance import DESCRIPTION, RESERVED
-from mirror_ppl.data.schema import TOLD, TRUTH
+from mirror_ppl.data.schema import MEASURED, OF_PERSON, TOLD, TRUTH
 from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError, shown
 from mirror_ppl.files import write_whole
@@ -141,7 +141,7 @@ def from_dataset(
     dataset = _in_order(dataset, schema.dimension_labels(world))
     dimensions = schema.variable_dimensions(world)
     for name in map(str, dataset.data_vars):
-        if name.startswith(TRUTH):
+        if name.startswith(OF_PERSON):
             dimensions[name] = ("person",)
         elif name.startswith(TOLD) and name not in dimensions:
             known = ", ".join(other for other in dimensions if other.startswith(TOLD))
@@ -258,6 +258,10 @@ def _attributes(domain: Domain, name: str) -> dict[str, object]:
         implant = name.removeprefix(TRUTH)
         long_name = f"true value of the implant {implant}, nan if unknown"
         return {"long_name": long_name, "units": "those of the implant"}
+    if name.startswith(MEASURED):
+        site = name.removeprefix(MEASURED)
+        long_name = f"measured value of the site {site} of the human model, nan if unknown"
+        return {"long_name": long_name, "units": "those of the site"}
     if name.startswith(TOLD):
         modality = name.removeprefix(TOLD)
         long_name = f"whether the {modality} item was communicated just before the action"

@@ -22,6 +22,10 @@ TOLD = "told_"
 """Prefix of what was communicated through a modality."""
 TRUTH = "truth_"
 """Prefix of the true value of an implant."""
+MEASURED = "measured_"
+"""Prefix of what was measured of a person beside their rounds."""
+OF_PERSON = (TRUTH, MEASURED)
+"""Prefixes of variables that have one number a person."""
 NO_INDEX = -1
 """Stands for the actions and scenarios of padding, and for scenarios that are unknown."""
 ROUNDING = 1e-3
@@ -31,7 +35,7 @@ A_NAME = f"printable text of at most {MOST_CHARACTERS} characters"
 
 
 def variable_dimensions(domain: Domain) -> dict[str, tuple[str, ...]]:
-    """Names of the dimensions of each variable; those of any ``truth_...`` are ``person`` alone."""
+    """Names of the dimensions of each variable; those of `OF_PERSON` are ``person`` alone."""
     rounds = ("person", "round")
     steps, times = (*rounds, "step"), (*rounds, "time")
     dimensions = {
@@ -86,7 +90,7 @@ def checked(
     """
     _check_people(people)
     dimensions = variable_dimensions(domain)
-    dimensions |= {name: ("person",) for name in variables if name.startswith(TRUTH)}
+    dimensions |= {name: ("person",) for name in variables if name.startswith(OF_PERSON)}
     places = _Places(tuple(people), dimensions, dimension_labels(domain))
     action = as_tensor(variables["action"], "action", DemonstrationsError)
     sizes = places.sizes(action)
@@ -115,7 +119,7 @@ def checked(
     for name, value in given.items():
         if name in result:
             continue
-        if name.startswith(TRUTH):
+        if name.startswith(OF_PERSON):
             result[name] = value.to(dtype, copy=True)
             expected = "a finite number, or nan if unknown"
             places.refuse(name, result[name].isinf(), result[name], expected)

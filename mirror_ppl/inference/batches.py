@@ -14,7 +14,8 @@ from mirror_ppl.inference.importance import infer_by_importance
 from mirror_ppl.inference.second_look import LIKELY_DRAWS, coarse, looks_twice
 from mirror_ppl.likelihood.compiled import Compiled, compile
 from mirror_ppl.models.human import has_own_program
-from mirror_ppl.models.prior import Draws
+from mirror_ppl.models.measured import alike_measured, measured_draws
+from mirror_ppl.models.prior import Draws, sample_sites
 
 PEOPLE_AT_ONCE = 50
 """People whose views are in memory together; they do not depend on each other."""
@@ -28,15 +29,20 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
         infer_batch: does so for some people, of whom program and rounds are compiled.
     """
     people, found, files = job.rounds.num_people, [], {}
+    batches = [
+        range(begin, min(begin + PEOPLE_AT_ONCE, some.stop))
+        for some in alike_measured(job.rounds)
+        for begin in range(some.start, some.stop, PEOPLE_AT_ONCE)
+    ]
     if job.checkpoint is not None:
         path, run = job.checkpoint
-        for begin in range(0, people, PEOPLE_AT_ONCE):
+        for begin in (some.start for some in batches):
             files[begin] = path.with_name(f"{path.name}.{begin}") if begin else path, run
             if files[begin][0].exists():  # what cannot be continued is refused before any work
                 read_checkpoint(*files[begin])
-    for begin in range(0, people, PEOPLE_AT_ONCE):
-        some = range(begin, min(begin + PEOPLE_AT_ONCE, people))
-        own = replace(job.of(some), seed=job.seed + begin, checkpoint=files.get(begin))
+    for some in batches:
+        begin, own = some.start, job.of(some)
+        own = replace(own, seed=job.seed + begin, checkpoint=files.get(begin))
         compiled = compile(
             own.human,
             own.rounds,
@@ -44,8 +50,10 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
             likely=own.start or _likely(own),
             report=lambda done, begin=begin: job.report("views", begin + done, people, "people"),
         )
-        found.append(infer_batch(compiled, own))
-    draws = {name: torch.cat([one.draws[name] for one in found], 1) for name in found[0].draws}
+        one = infer_batch(compiled, own)
+        found.append(replace(one, draws={**one.draws, **measured_draws(own.rounds, job.draws)}))
+    order = sample_sites(job.human, 1)
+    draws = {name: torch.cat([one.draws[name] for one in found], 1) for name in order}
     losses = tuple(sum(step) for step in zip(*(one.losses for one in found), strict=True))
     return Inferred(draws, losses=losses)
 

@@ -28,6 +28,7 @@ from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Populatio
 from mirror_ppl.likelihood.view_table_builder import Screening
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel, require_standard_program
+from mirror_ppl.models.measured import require_measurable
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.progress import Report, silent
@@ -142,6 +143,14 @@ def infer(
     if checkpoint is not None:
         checkpoint = as_path(checkpoint[0], "checkpoint"), checkpoint[1]
     engine = ENGINES[options.engine]
+    if demonstrations.measurements:
+        require_measurable(human, demonstrations)
+        if engine.needs_network or options.pooling != "none" or population is not None:
+            raise InputError(
+                f"{', '.join(demonstrations.measurements)} of people was measured, which the "
+                "engine amortized and pooling cannot take into account: use another engine, each "
+                "person by themselves"
+            )
     job = Job(
         human,
         demonstrations,

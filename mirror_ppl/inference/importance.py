@@ -16,6 +16,7 @@ from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models.measured import measured_draws, with_measurements
 from mirror_ppl.models.prior import Draws, sample_sites
 
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
@@ -37,10 +38,11 @@ def infer_by_importance(
     with torch.random.fork_rng(devices=[]):
         for person in range(len(done), people):
             job.report("infer", person, people, "people")
-            builder, rounds = (
-                ViewTableBuilder(human, job.screening),
-                list(rounds_of(job.rounds, person)),
-            )
+            own = job.rounds.select_people([person]) if job.rounds.measurements else None
+            if own is not None:
+                human = with_measurements(job.human, own)
+            builder = ViewTableBuilder(human, job.screening)
+            rounds = list(rounds_of(job.rounds, person))
             for one_round in rounds:
                 builder.add(*one_round)
             # Whatever the number of draws that others took.
@@ -54,12 +56,13 @@ def infer_by_importance(
                 builder, found = second_look(
                     human, rounds, job.screening, job.settings, builder, found
                 )
-            done.draws.append(found.sample(job.draws, builder.grid))
+            drawn = found.sample(job.draws, builder.grid)
+            done.draws.append(drawn if own is None else drawn | measured_draws(own, job.draws))
             done.pareto_k.append(found.pareto_k)
             if job.checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
                 done.save(*job.checkpoint)
                 saved = monotonic()
-        order = sample_sites(human, 1)
+        order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
     # Site after site, so that draws of pooled people, which are many, are not in memory twice.
     draws = {name: torch.cat([own.pop(name) for own in done.draws], 1) for name in order}

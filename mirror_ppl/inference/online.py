@@ -95,6 +95,11 @@ class OnlinePosterior:
         """
         check_rounds(self.human, demonstrations, people=1)
         check_world(demonstrations, self.allow_contradictions)
+        if demonstrations.measurements:
+            raise InputError(
+                f"{', '.join(demonstrations.measurements)} was measured, which infer() takes into "
+                "account and OnlinePosterior does not"
+            )
         (person,) = demonstrations.people
         if self.person not in (None, person):
             raise InputError(f"the rounds are of {person!r}, those before of {self.person!r}")

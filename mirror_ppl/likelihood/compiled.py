@@ -29,6 +29,7 @@ from mirror_ppl.likelihood.tables import join_tables, restricted, rounds_of
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import ACTION, HumanModel, has_own_program
+from mirror_ppl.models.measured import with_measurements
 from mirror_ppl.models.prior import Draws, draw_prior, values_of
 from mirror_ppl.models.sites import discrete_names, latent_sites
 
@@ -296,7 +297,7 @@ def compile(  # noqa: A001 - the word for it
 
     Args:
         human: the model of people.
-        rounds: of P people.
+        rounds: of P people, of whom the same sites were measured, if any were.
         screening: when to give up combinations of discrete sites on the way; never unless given.
         likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`ViewTableBuilder`.
         report: called with the number of people done.
@@ -304,17 +305,19 @@ def compile(  # noqa: A001 - the word for it
     Raises:
         HumanModelError: the model breaks its contract.
     """
+    observed = with_measurements(human, rounds)
     if has_own_program(human):
-        return Sequential(human, rounds)
+        return Sequential(observed, rounds)
     builders = []
     for person in range(rounds.num_people):
         own = None
         if likely is not None:
             own = {name: value[:, person : person + 1] for name, value in likely.items()}
-        builder = ViewTableBuilder(human, screening, likely=own)
+        alone = with_measurements(human, rounds.select_people([person]))
+        builder = ViewTableBuilder(alone, screening, likely=own)
         for one_round in rounds_of(rounds, person):
             builder.add(*one_round)
         builders.append(builder)
         report(person + 1)
     tables = [builder.table() for builder in builders]
-    return ViewTables(human, join_tables(tables, rounds.shape), builders)
+    return ViewTables(observed, join_tables(tables, rounds.shape), builders)

@@ -28,7 +28,7 @@ AXES = (
     "residual_unit_and_bias",
 )
 """Names of dimensions and other variables in posterior files."""
-PREFIXES = ("told_", "truth_")
+PREFIXES = ("told_", "truth_", "measured_")
 """With which names of variables of recordings begin."""
 
 

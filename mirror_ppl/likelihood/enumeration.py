@@ -177,7 +177,8 @@ def require_acting_on_beliefs(human: HumanModel, table: ViewTable) -> None:
     """
     if not acts_on_beliefs(human, table):
         raise HumanModelError(
-            "act() reads a site that perceive() reads, too; only the guide svi can fit this"
+            "act() reads a site that perceive() reads, too; only the engines svi and nuts can fit "
+            "this"
         )
 
 
