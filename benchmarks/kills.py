@@ -240,6 +240,8 @@ def make_inputs(folder: Path) -> None:
 
 def main() -> int:
     """Run the study."""
+    # Started in the background of a shell it would be ignored, by the commands as well.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
