@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mirror_ppl.console import console_for_tables, run
 from mirror_ppl.errors import OptionError
-from mirror_ppl.inference.names import current_name
+from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers
 from mirror_ppl.progress import Progress
 
@@ -97,9 +96,7 @@ def main(options: Options) -> int:
     from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
     from mirror_ppl.training.guide_file import network_for
 
-    guide, note = current_name(options.guide)
-    if note is not None:
-        print(f"--guide: {note}", file=sys.stderr)
+    guide = told_engine(options.guide)
     settings = InferenceOptions(guide, options.draws)
     known = get_domain(options.domain).settings
     setting = require_known(options.setting or known[-1], "setting", known, options.domain)

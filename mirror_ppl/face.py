@@ -36,7 +36,7 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import PEOPLE
 from mirror_ppl.plots.fit import FILES, FitPlots
-from mirror_ppl.progress import Report, Stages
+from mirror_ppl.progress import Report, Stages, silent
 from mirror_ppl.training.guide_file import network_for
 
 if TYPE_CHECKING:
@@ -313,7 +313,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             raise InputError("prior_from is for people who are not pooled; leave out pooling")
         population = load_population(Path(prior_from), Pooling(model), recordings.setting)
     with Stages() if report is None and sys.stderr.isatty() else nullcontext() as stages:
-        report = report or (stages.report if stages is not None else _silent)
+        report = report or (stages.report if stages is not None else silent)
         found = fitting.fit_people(
             model,
             recordings.to(where),
@@ -342,10 +342,6 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)
     return Fit(**vars(found))
-
-
-def _silent(name: str, done: int, total: int, message: str) -> None:
-    """Report nothing."""
 
 
 def _human(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mirror_ppl.console import run
 from mirror_ppl.errors import OptionError
-from mirror_ppl.inference.names import current_name
+from mirror_ppl.inference.names import current_name, told_engine
 from mirror_ppl.limits import check_numbers, require_memory, share
 from mirror_ppl.progress import Stages
 
@@ -109,9 +108,7 @@ def main(options: Options) -> None:
     from mirror_ppl.inference.svi import SVIOptions
 
     recordings = _recordings(options)
-    engine, note = current_name(options.guide)
-    if note is not None:
-        print(f"--guide: {note}", file=sys.stderr)
+    engine = told_engine(options.guide)
     allowed = share(options.allow_contradictions, "--allow-contradictions")
     _require_memory(recordings, options)
     with output_folder(options.out, (*RESULTS, CHECKPOINT)) as folder, Stages() as stages:

@@ -123,6 +123,13 @@ def test_what_cannot_have_been_measured_is_refused(wrong, recordings):
         infer(Answering(self_model()), measured(recordings, **values), InferenceOptions(), 0)
 
 
+@pytest.mark.parametrize("engine", ["importance", "svi"])
+def test_what_people_see_is_not_measured(engine, recordings):
+    some = measured(recordings, reach=[1])
+    with pytest.raises(InputError, match=r'"reach" was measured, but perceive\(\) reads it'):
+        infer(Answering(self_model()), some, InferenceOptions(engine), 0)
+
+
 def test_what_cannot_take_it_into_account_refuses_it(recordings):
     human, some = Answering(self_model()), measured(recordings, answer=[0.7])
     for options in (InferenceOptions("amortized"), InferenceOptions(pooling="partial")):

@@ -1,6 +1,7 @@
 """Human models that override the program itself, and what runs as it stands or is compiled."""
 
 import math
+from dataclasses import replace
 
 import pyro
 import pyro.distributions as dist
@@ -11,7 +12,8 @@ from pyro.infer.autoguide import AutoNormal
 from test_one_program import PROGRAMS, exact_mean, recordings, self_model, toy
 
 from mirror_ppl.communication.minds import Person
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, InputError
+from mirror_ppl.inference import batches
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.nuts import NUTSOptions
 from mirror_ppl.inference.results.fitting import fit_people
@@ -56,10 +58,12 @@ def test_rounds_can_be_added(recordings):
     human = PROGRAMS[-1](self_model())
     draws = draw_prior(human, 1, 3, 0)
     first, second = (recordings.select_rounds([number]) for number in (0, 1))
-    compiled = compile(human, first)
+    compiled = compile(human, first, growing=True)
     compiled.add(second)
     whole = compile(human, recordings.select_rounds([0, 1]))
     torch.testing.assert_close(compiled.log_joint(draws), whole.log_joint(draws))
+    with pytest.raises(InputError, match="compiled with growing=True"):
+        whole.add(second)
 
 
 @pytest.mark.parametrize("engine", ["svi", "nuts"])
@@ -145,6 +149,45 @@ class More(Asked):
         super().model(rounds, world)
         with pyro.plate("others", rounds.num_people, dim=-2):
             pyro.sample("mood", dist.Normal(0.0, 1.0))
+
+
+class Tied(Asked):
+    """People who are alike, whoever they are."""
+
+    def model(self, rounds, world=False):
+        super().model(rounds, world)
+        rate = self.implants["in_sight"]
+        pyro.factor("tied", -500.0 * (rate - rate.mean()).square().sum())
+
+
+def two_people(recordings):
+    """Twice the same rounds."""
+    twice = {
+        name: value.repeat(2, *(1,) * (value.dim() - 1))
+        for name, value in recordings.variables().items()
+    }
+    return recordings._like(twice, ["a", "b"])
+
+
+def test_what_ties_people_together_is_of_nobody_alone(recordings, monkeypatch):
+    two = two_people(recordings)
+    found = infer(Tied(self_model()), two, InferenceOptions("nuts", 30, NUTSOptions(30)), 0)
+    first, second = found.draws["in_sight"].squeeze(-1).T
+    assert (first - second).abs().mean() < 0.1  # .3 without the factor
+    compiled = compile(Tied(self_model()), two)
+    assert compiled.joint == ["tied"]
+    with pytest.raises(HumanModelError, match='Tied.model has "tied" outside of a plate of people'):
+        compiled.log_joint(draw_prior(compiled.human, 2, 3, 0))
+    monkeypatch.setattr(batches, "PEOPLE_AT_ONCE", 1)
+    with pytest.raises(HumanModelError, match='ties people together by "tied": infer at most 1 pe'):
+        infer(Tied(self_model()), two, InferenceOptions("svi", 4, SVIOptions(steps=1)), 0)
+
+
+def test_measured_sites_are_observed_by_a_program_of_ones_own(recordings):
+    measured = replace(recordings, measurements={"in_sight": torch.tensor([0.9])})
+    found = infer(Asked(self_model()), measured, InferenceOptions("svi", 9, SVIOptions(steps=5)), 0)
+    assert found.draws["in_sight"].flatten().tolist() == pytest.approx([0.9] * 9)
+    assert len(found.draws["otherwise"].unique()) > 1
 
 
 class Less(ToyHuman):

@@ -46,6 +46,28 @@ TEMPERATURES = (1.0, 2.0, 4.0, 8.0)
 LEAST_EVIDENCE = -30.0
 
 
+@dataclass(frozen=True)
+class AmortizedOptions:
+    """Settings of proposing by a network.
+
+    Attributes:
+        proposals: draws from the guide of a stage.
+        enough: effective draws at which no stage is added.
+        stages: the largest number of stages.
+        prune_margin: see :class:`ImportanceOptions`.
+    """
+
+    proposals: int = 64
+    enough: float = 400.0
+    stages: int = 16
+    prune_margin: float = 12.0
+
+    def __post_init__(self) -> None:
+        for name in ("proposals", "stages"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+
+
 def guide_screening() -> Screening:
     """The screening that an amortized guide needs: its ways are what the network reads."""
     return Screening(ways=WAYS)
@@ -195,10 +217,7 @@ def sample_amortized(
     human: HumanModel,
     guide: AmortizedGuide,
     builder: ViewTableBuilder,
-    enough: float = 400.0,
-    proposals: int = 64,
-    stages: int = 16,
-    prune_margin: float = 12.0,
+    options: AmortizedOptions | None = None,
     sites: Mapping[str, Any] | None = None,
 ) -> Weighted:
     """Weighted draws of one person: the guide's, and the ways that evidence is about.
@@ -207,24 +226,20 @@ def sample_amortized(
         human: the model of people that the guide was trained for.
         guide: the trained network.
         builder: the person's rounds so far.
-        enough: effective draws at which no stage is added.
-        proposals: draws from the guide of a stage.
-        stages: the largest number of stages.
-        prune_margin: see :class:`ImportanceOptions`.
+        options: settings.
         sites: see :class:`Sampler`.
     """
-    if stages < 1:
-        raise ValueError(f"stages must be at least 1, not {stages}")
+    options = options or AmortizedOptions()
     evidence = evidence_of(builder)
     sampler = Sampler(human, evidence.table, evidence.alike, sites)
     sampler.add_prior_draws(evidence.ways, evidence.joint)
-    sampler.prune(prune_margin)
+    sampler.prune(options.prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
     density = guide.density(evidence.log_evidence, steps)
-    for _ in range(stages):
-        sampler.propose(density, proposals)
+    for _ in range(options.stages):
+        sampler.propose(density, options.proposals)
         found = sampler.weighted()
-        if found.effective >= enough:
+        if found.effective >= options.enough:
             break
     return found
 
@@ -234,16 +249,15 @@ def infer_amortized(job: Job) -> Inferred:
     network = job.network
     assert network is not None
     return infer_by_importance(
-        replace(job, screening=guide_screening()),
-        lambda builder, _: sample_amortized(job.human, network, builder),
+        replace(job, screening=guide_screening(), settings=ImportanceOptions()),
+        lambda builder, _: sample_amortized(job.human, network, builder, job.settings),
     )
 
 
 ENGINE = Engine(
     "amortized",
-    "a trained network proposes, importance weights correct; at once",
     infer_amortized,
-    ImportanceOptions,
+    AmortizedOptions,
     pooled_draws=4000,
     weighted=True,
     needs_network=True,

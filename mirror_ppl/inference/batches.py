@@ -8,11 +8,12 @@ from dataclasses import replace
 import torch
 
 from mirror_ppl.checkpoints import read_checkpoint
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.engine import Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
 from mirror_ppl.inference.second_look import LIKELY_DRAWS, coarse, looks_twice
-from mirror_ppl.likelihood.compiled import Compiled, compile
+from mirror_ppl.likelihood.compiled import Compiled, Sequential, compile
 from mirror_ppl.models.human import has_own_program
 from mirror_ppl.models.measured import alike_measured, measured_draws
 from mirror_ppl.models.prior import Draws, sample_sites
@@ -50,6 +51,11 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
             likely=own.start or _likely(own),
             report=lambda done, begin=begin: job.report("views", begin + done, people, "people"),
         )
+        if isinstance(compiled, Sequential) and compiled.joint and len(batches) > 1:
+            raise HumanModelError(
+                f'{type(job.human).__name__}.model ties people together by "{compiled.joint[0]}": '
+                f"infer at most {PEOPLE_AT_ONCE} people at once, of whom the same was measured"
+            )
         one = infer_batch(compiled, own)
         found.append(replace(one, draws={**one.draws, **measured_draws(own.rounds, job.draws)}))
     order = sample_sites(job.human, 1)
@@ -59,7 +65,7 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
 
 
 def _likely(job: Job) -> Draws | None:
-    """Roughly who people are, where what stands for all they may attend to hangs on that."""
+    """Roughly who people are, where that decides what stands for all they may attend to."""
     if has_own_program(job.human) or not looks_twice(job.human):
         return None
     settings = coarse(ImportanceOptions())

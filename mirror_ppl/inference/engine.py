@@ -83,9 +83,8 @@ class Engine:
 
     Attributes:
         name: by which users know it.
-        summary: what it does, in a few words.
         run: does a job.
-        settings: makes the engine's own settings, unless they are given.
+        settings: class of the engine's settings; made without arguments unless they are given.
         pooled_draws: of each person under the human model's own prior, from which pooling chooses.
         any_program: whether it runs human models that cannot be compiled.
         weighted: whether its draws are corrected by importance weights.
@@ -93,9 +92,8 @@ class Engine:
     """
 
     name: str
-    summary: str
     run: Callable[[Job], Inferred]
-    settings: Callable[[], Any]
+    settings: type
     pooled_draws: int = 1000
     any_program: bool = False
     weighted: bool = False

@@ -25,9 +25,10 @@ from mirror_ppl.inference.amortized import AmortizedGuide, require_network_of
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
+from mirror_ppl.likelihood.combinations import require_unread
 from mirror_ppl.likelihood.view_table_builder import Screening
 from mirror_ppl.limits import LIMITS
-from mirror_ppl.models.human import HumanModel, require_standard_program
+from mirror_ppl.models.human import HumanModel, has_own_program, require_standard_program
 from mirror_ppl.models.measured import require_measurable
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
@@ -85,8 +86,7 @@ class InferenceOptions:
         engine = ENGINES[self.engine]
         if self.settings is None:
             object.__setattr__(self, "settings", engine.settings())
-        elif isinstance(engine.settings, type):
-            require_kind(self.settings, engine.settings, "settings")
+        require_kind(self.settings, engine.settings, "settings")
         if self.pooling not in POOLINGS:
             raise UnknownNameError.of("pooling", self.pooling, POOLINGS)
         object.__setattr__(self, "draws", whole_number(self.draws, "draws", *LIMITS["draws"]))
@@ -145,6 +145,8 @@ def infer(
     engine = ENGINES[options.engine]
     if demonstrations.measurements:
         require_measurable(human, demonstrations)
+        if not has_own_program(human):
+            require_unread(human, demonstrations.measurements)
         if engine.needs_network or options.pooling != "none" or population is not None:
             raise InputError(
                 f"{', '.join(demonstrations.measurements)} of people was measured, which the "

@@ -14,9 +14,9 @@ from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_i
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
-from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.tables import person_builders, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
-from mirror_ppl.models.measured import measured_draws, with_measurements
+from mirror_ppl.models.measured import measured_draws
 from mirror_ppl.models.prior import Draws, sample_sites
 
 SECONDS_BETWEEN_CHECKPOINTS = 10.0
@@ -32,19 +32,13 @@ def infer_by_importance(
         first_pass: weighted draws of what the rounds of a person say; adaptive importance sampling
             unless given.
     """
-    human, people = job.human, job.rounds.num_people
+    people = job.rounds.num_people
     done = _People() if job.checkpoint is None else _People.restored(*job.checkpoint)
     saved = monotonic()
     with torch.random.fork_rng(devices=[]):
-        for person in range(len(done), people):
-            job.report("infer", person, people, "people")
-            own = job.rounds.select_people([person]) if job.rounds.measurements else None
-            if own is not None:
-                human = with_measurements(job.human, own)
-            builder = ViewTableBuilder(human, job.screening)
-            rounds = list(rounds_of(job.rounds, person))
-            for one_round in rounds:
-                builder.add(*one_round)
+        job.report("infer", len(done), people, "people")
+        for builder in person_builders(job.human, job.rounds, job.screening, first=len(done)):
+            human, person = builder.human, len(done)
             # Whatever the number of draws that others took.
             torch.manual_seed((job.seed + 1) * 1_000_003 + person)
             first = coarse(job.settings) if looks_twice(human) else job.settings
@@ -53,17 +47,20 @@ def infer_by_importance(
             else:
                 found = first_pass(builder, first)
             if looks_twice(human):
+                rounds = list(rounds_of(job.rounds, person))
                 builder, found = second_look(
                     human, rounds, job.screening, job.settings, builder, found
                 )
             drawn = found.sample(job.draws, builder.grid)
-            done.draws.append(drawn if own is None else drawn | measured_draws(own, job.draws))
+            if job.rounds.measurements:
+                drawn |= measured_draws(job.rounds.select_people([person]), job.draws)
+            done.draws.append(drawn)
             done.pareto_k.append(found.pareto_k)
+            job.report("infer", len(done), people, "people")
             if job.checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
                 done.save(*job.checkpoint)
                 saved = monotonic()
         order = sample_sites(job.human, 1)
-    job.report("infer", people, people, "people")
     # Site after site, so that draws of pooled people, which are many, are not in memory twice.
     draws = {name: torch.cat([own.pop(name) for own in done.draws], 1) for name in order}
     return Inferred(draws, torch.tensor(done.pareto_k))
@@ -92,7 +89,6 @@ class _People:
 
 ENGINE = Engine(
     "importance",
-    "adaptive importance sampling from the prior on",
     infer_by_importance,
     ImportanceOptions,
     pooled_draws=4000,

@@ -36,7 +36,7 @@ class MarginalELBO(ELBO):
         self._values = combination_values(compiled.human, compiled.table)
 
     def _get_trace(self, *_: Any) -> Any:
-        """Of the base class; there is one draw, of all combinations at once."""
+        """Not used: the loss takes one draw of the guide, and all combinations at once."""
         raise NotImplementedError
 
     def differentiable_loss(

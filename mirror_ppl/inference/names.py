@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 FORMER = {"exact": "importance"}
 
 
@@ -11,3 +13,11 @@ def current_name(name: str) -> tuple[str, str | None]:
         return name, None
     new = FORMER[name]
     return new, f'"{name}" is called "{new}" now; version 0.3 no longer knows the old name'
+
+
+def told_engine(name: str) -> str:
+    """The name now of the engine of ``--guide``; a former one is told on stderr."""
+    name, note = current_name(name)
+    if note is not None:
+        print(f"--guide: {note}", file=sys.stderr)
+    return name

@@ -81,7 +81,6 @@ def infer_by_nuts(job: Job) -> Inferred:
 
 ENGINE = Engine(
     "nuts",
-    "Hamiltonian Monte Carlo; slow, to compare with on small problems",
     infer_by_nuts,
     NUTSOptions,
     any_program=True,

@@ -14,6 +14,7 @@ from mirror_ppl.errors import InputError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
+    AmortizedOptions,
     guide_screening,
     require_network_of,
     sample_amortized,
@@ -27,8 +28,8 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites
 from mirror_ppl.models.recorded import check_rounds
 
-ENOUGH = 64.0
-"""Effective draws at which a guide proposes no more: enough for an answer that cannot wait."""
+AT_ONCE = AmortizedOptions(enough=64.0)
+"""Fewer effective draws than otherwise, but enough for an answer that cannot wait."""
 
 
 class OnlinePosterior:
@@ -37,7 +38,7 @@ class OnlinePosterior:
     Args:
         human: the model of people.
         network: a trained guide (see :func:`mirror_ppl.training.guide_file.load_guide`); without,
-            draws are those of ``exact``, which takes longer at each asking.
+            draws are those of ``importance``, which takes longer at each asking.
         seed: of everything random. The same rounds in the same order give the same draws.
         allow_contradictions: share of the steps that are added at once, from 0 to 1, that may
             contradict the next observation.
@@ -140,7 +141,7 @@ class OnlinePosterior:
         else:
             # What the first asking has checked need not be checked again.
             sites = None if math.isnan(self.pareto_k) else self._sites
-            found = sample_amortized(human, self.network, self._sightings, ENOUGH, sites=sites)
+            found = sample_amortized(human, self.network, self._sightings, AT_ONCE, sites)
         if looks_twice(human):
             _, found = second_look(
                 human, self._rounds, self._screening, options, self._sightings, found

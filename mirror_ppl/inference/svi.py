@@ -308,7 +308,6 @@ def infer_by_svi(job: Job) -> Inferred:
 
 ENGINE = Engine(
     "svi",
-    "variational inference, one optimization for the people at hand",
     infer_by_svi,
     SVIOptions,
     any_program=True,

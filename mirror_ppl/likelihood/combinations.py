@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import prod
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 from pyro import poutine
 from torch import Tensor
 
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.likelihood.attention import attention_nodes, attention_sites
 from mirror_ppl.likelihood.densities import (
     BATCH,
@@ -99,6 +99,21 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
             f"at most {MAX_COMBINATIONS} can be marginalized"
         )
     return supports
+
+
+def require_unread(human: HumanModel, names: Iterable[str]) -> None:
+    """Refuse sites that ``perceive`` reads.
+
+    Raises:
+        InputError: one of these is such a site.
+    """
+    read = perceived_sites(human)
+    for name in names:
+        if name in read:
+            raise InputError(
+                f'"{name}" was measured, but perceive() reads it, which is summed out: let a site '
+                "of prior depend on it, and measure that one"
+            )
 
 
 def grid_of(supports: Mapping[str, Tensor]) -> dict[str, Tensor]:

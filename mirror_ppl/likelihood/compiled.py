@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import pyro
 import torch
@@ -19,13 +19,13 @@ from pyro.infer import config_enumerate, infer_discrete
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.likelihood.densities import PLATES, Given, log_prob, sample_nodes
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import TableProgram
-from mirror_ppl.likelihood.tables import join_tables, restricted, rounds_of
+from mirror_ppl.likelihood.tables import join_tables, person_builders, restricted, rounds_of
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import ACTION, HumanModel, has_own_program
@@ -101,7 +101,7 @@ class ViewTables(Compiled):
     Args:
         human: the model of people.
         table: of the rounds of P people.
-        builders: that made it, for each person, if rounds are to be added.
+        builders: that made it, for each person, where rounds are to be added.
     """
 
     def __init__(
@@ -129,7 +129,12 @@ class ViewTables(Compiled):
 
         Args:
             rounds: as many of each person as of the others.
+
+        Raises:
+            InputError: they were not compiled with ``growing=True``.
         """
+        if not self._builders:
+            raise InputError("rounds are added to what was compiled with growing=True")
         for person, builder in enumerate(self._builders):
             for one_round in rounds_of(rounds, person):
                 builder.add(*one_round)
@@ -182,12 +187,15 @@ class Sequential(Compiled):
 
     Raises:
         HumanModelError: it is not such a program.
+
+    Attributes:
+        joint: sites outside of a plate of people, which say something of all of them together.
     """
 
     def __init__(self, human: HumanModel, rounds: Demonstrations) -> None:
         super().__init__(human)
         self.rounds = rounds
-        self._check()
+        self.joint = self._check()
 
     @property
     def people(self) -> int:
@@ -199,7 +207,17 @@ class Sequential(Compiled):
         self.human.model(self.rounds)
 
     def log_joint(self, draws: Mapping[str, Tensor]) -> Tensor:
-        """Log density ``[S, P]`` of draws ``[S, P, 1, ...]`` of all sites and of the rounds."""
+        """Log density ``[S, P]`` of draws ``[S, P, 1, ...]`` of all sites and of the rounds.
+
+        Raises:
+            HumanModelError: part of the density is of all people together.
+        """
+        if self.joint:
+            raise HumanModelError(
+                f"{type(self.human).__name__}.model has {_quoted(self.joint)} outside of a plate "
+                'of people, so people have no densities of their own; put it into pyro.plate("'
+                'person", P, dim=-2)'
+            )
         nodes, number = self._run(draws), len(next(iter(draws.values())))
         of_people = [node for node in nodes.values() if not _of_rounds(node)]
         shape = (number, self.people, self.rounds.shape[1])
@@ -236,11 +254,11 @@ class Sequential(Compiled):
             Given(dict(draws)),
             pyro.plate("draw", number, dim=-1 - PLATES),
         ):
-            program: Any = config_enumerate(self.program, "parallel")  # type: ignore[reportCallIssue]
-            program()
+            cast(Callable[[], None], config_enumerate(self.program, "parallel"))()
         return sample_nodes(trace.trace)
 
-    def _check(self) -> None:
+    def _check(self) -> list[str]:
+        """Refuse programs that cannot be inferred; names of the sites of all people together."""
         kind = type(self.human).__name__
         with torch.random.fork_rng(devices=[]), poutine.block():
             nodes = sample_nodes(poutine.trace(self.program).get_trace())
@@ -262,11 +280,21 @@ class Sequential(Compiled):
                     f'{kind}.model has no observed site "{ACTION}_{step}": the recorded action of '
                     "that step, from which people are inferred"
                 )
+        return [name for name, node in nodes.items() if -2 not in _plates(node)]
 
 
 def _of_rounds(node: Mapping[str, Any]) -> bool:
     """Whether a site is one of each round, and not of each person."""
-    return any(frame.dim == -1 for frame in node["cond_indep_stack"])
+    return -1 in _plates(node)
+
+
+def _plates(node: Mapping[str, Any]) -> set[int | None]:
+    """Dimensions of the plates that a site is in."""
+    return {frame.dim for frame in node["cond_indep_stack"]}
+
+
+def _quoted(names: Iterable[str]) -> str:
+    return ", ".join(f'"{name}"' for name in names)
 
 
 def _over_latents(values: Tensor, dimensions: int) -> Tensor:
@@ -292,6 +320,7 @@ def compile(  # noqa: A001 - the word for it
     screening: Screening | None = None,
     likely: Mapping[str, Tensor] | None = None,
     report: Callable[[int], None] = lambda people: None,
+    growing: bool = False,
 ) -> ViewTables | Sequential:
     """Compile a human program and recorded rounds.
 
@@ -301,6 +330,7 @@ def compile(  # noqa: A001 - the word for it
         screening: when to give up combinations of discrete sites on the way; never unless given.
         likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`ViewTableBuilder`.
         report: called with the number of people done.
+        growing: whether rounds are to be added, for which more is kept in memory.
 
     Raises:
         HumanModelError: the model breaks its contract.
@@ -308,16 +338,9 @@ def compile(  # noqa: A001 - the word for it
     observed = with_measurements(human, rounds)
     if has_own_program(human):
         return Sequential(observed, rounds)
-    builders = []
-    for person in range(rounds.num_people):
-        own = None
-        if likely is not None:
-            own = {name: value[:, person : person + 1] for name, value in likely.items()}
-        alone = with_measurements(human, rounds.select_people([person]))
-        builder = ViewTableBuilder(alone, screening, likely=own)
-        for one_round in rounds_of(rounds, person):
-            builder.add(*one_round)
-        builders.append(builder)
-        report(person + 1)
-    tables = [builder.table() for builder in builders]
+    builders, tables = [], []
+    for builder in person_builders(human, rounds, screening, likely, report=report):
+        tables.append(builder.table())
+        if growing:
+            builders.append(builder)
     return ViewTables(observed, join_tables(tables, rounds.shape), builders)

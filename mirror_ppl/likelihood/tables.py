@@ -16,6 +16,7 @@ from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
 from mirror_ppl.likelihood.view_table_builder import RoundViews, Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.measured import with_measurements
 
 
 def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
@@ -145,18 +146,37 @@ def build_view_table(
         HumanModelError: ``perceive`` reads a site that cannot be enumerated, or there are too many
             combinations of values.
     """
-    tables = []
-    for person in range(demonstrations.num_people):
+    builders = person_builders(human, demonstrations, screening, likely, candidates, values, report)
+    return join_tables([builder.table() for builder in builders], demonstrations.shape)
+
+
+def person_builders(
+    human: HumanModel,
+    demonstrations: Demonstrations,
+    screening: Screening | None = None,
+    likely: Mapping[str, Tensor] | None = None,
+    candidates: Sequence[Tensor] | None = None,
+    values: int = VALUES,
+    report: Callable[[int], None] = lambda people: None,
+    first: int = 0,
+) -> Iterator[ViewTableBuilder]:
+    """Person after person from the first on, a builder with their rounds; see `build_view_table`.
+
+    What was measured of a person is observed by the human model of their builder.
+    """
+    for person in range(first, demonstrations.num_people):
         own = None
         if likely is not None:
             own = {name: value[:, person : person + 1] for name, value in likely.items()}
+        alone = human
+        if demonstrations.measurements:
+            alone = with_measurements(human, demonstrations.select_people([person]))
         some = None if candidates is None else candidates[person]
-        builder = ViewTableBuilder(human, screening, some, own, values)
+        builder = ViewTableBuilder(alone, screening, some, own, values)
         for one_round in rounds_of(demonstrations, person):
             builder.add(*one_round)
-        tables.append(builder.table())
+        yield builder
         report(person + 1)
-    return join_tables(tables, demonstrations.shape)
 
 
 def join_tables(
