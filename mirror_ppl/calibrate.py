@@ -43,9 +43,9 @@ class Options:
     """The setting under which rounds are recorded; what people see is up to their implants.
     Default: the one in which people see less."""
     guide: str = "importance"
-    """What to test: importance, amortized, svi or nuts."""
+    """What to test: importance, amortized, auto, svi or nuts."""
     guide_file: Path | None = None
-    """Network of the guide amortized (see `python -m mirror_ppl.train --what guide`)."""
+    """Network of the guides amortized and auto (see `python -m mirror_ppl.train --what guide`)."""
     people: int = 500
     """People drawn from the prior."""
     rounds: tuple[int, ...] = (1, 5, 20)
@@ -66,8 +66,8 @@ class Options:
 
     def __post_init__(self) -> None:
         check_numbers(self, "people", "draws", "seed")
-        if self.guide_file is not None and self.guide != "amortized":
-            raise OptionError("--guide-file is for --guide amortized")
+        if self.guide_file is not None and self.guide not in ("auto", "amortized"):
+            raise OptionError("--guide-file is for --guide auto and amortized")
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
             numbers = " ".join(map(str, self.rounds))
             raise OptionError(f"--rounds must be positive and increase, not {numbers or 'none'}")

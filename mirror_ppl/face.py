@@ -243,7 +243,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     recordings: Demonstrations | str | Path | None = None,
     *,
     human: HumanModel | type[HumanModel] | str | None = None,
-    engine: str = "importance",
+    engine: str = "auto",
     pooling: str = "none",
     seed: int = 0,
     draws: int = 200,
@@ -266,7 +266,9 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         human: the human model: an object or a class, one of the package's names (such as
             ``one-radius``) or ``path/to/file.py:Class``; the package's own for the domain unless
             given.
-        engine: one of ``mirror_ppl.inference.engines.ENGINES``.
+        engine: one of ``mirror_ppl.inference.engines.ENGINES``; ``auto`` is the amortized guide
+            where a network of this human model is there and its draws can be relied on, and
+            ``importance`` otherwise; each person's part of the summary says which.
         pooling: ``none``, or ``partial`` to infer the population that the people are from, too.
         seed: of everything random: the same seed gives the same fit.
         draws: posterior draws S of each person.
@@ -278,7 +280,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             leaves it out.
         allow_contradictions: share of steps, from 0 to 1, that may contradict the next observation.
         prior_from: a file of a fit with ``pooling="partial"``, whose population is the prior.
-        guide_file: network of the engine ``amortized``; the one that ships unless given.
+        guide_file: network of ``auto`` and ``amortized``; the one that ships unless given.
         self_model: the robot's networks, or a file of them; those that ship unless given. Not with
             a human model that is an object, which has its own.
         device: where to compute: cpu, cuda or cuda:0.
@@ -302,8 +304,8 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         allow_contradictions=allow_contradictions,
     )
     explore = whole_number(explore, "explore", *LIMITS["explore"])
-    if guide_file is not None and not ENGINES[options.engine].needs_network:
-        raise InputError("guide_file is for the engine amortized")
+    if guide_file is not None and not ENGINES[options.engine].takes_network:
+        raise InputError("guide_file is for the engines auto and amortized")
     model = _human(human, self_model, recordings.domain).to(where)
     check_contract(model)
     network = network_for(options.engine, None if guide_file is None else Path(guide_file), model)

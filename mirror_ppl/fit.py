@@ -55,12 +55,13 @@ class Options:
     one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
-    guide: str = "importance"
-    """How to infer: importance (what people see summed out exactly, how they decide by importance
-    sampling), amortized (the same, proposed at once by a trained network), svi (variational) or
-    nuts (Hamiltonian Monte Carlo, slow)."""
+    guide: str = "auto"
+    """How to infer: auto (amortized for whoever it serves well, if a network of this human model is
+    there, else importance; the output says who was inferred by which), importance (what people see
+    summed out exactly, how they decide by importance sampling), amortized (the same, proposed at
+    once by a trained network), svi (variational) or nuts (Hamiltonian Monte Carlo, slow)."""
     guide_file: Path | None = None
-    """Network of the guide amortized (see `python -m mirror_ppl.train --what guide`)."""
+    """Network of the guides auto and amortized (see `python -m mirror_ppl.train --what guide`)."""
     pooling: str = "none"
     """Whether people tell of each other: none, or partial (the population that they are from is
     inferred with them, and posterior.nc holds it)."""
@@ -84,12 +85,12 @@ class Options:
     """Where to compute: cpu, cuda or cuda:0."""
 
     def __post_init__(self) -> None:
-        if self.guide_file is not None and self.guide != "amortized":
-            raise OptionError("--guide-file is for --guide amortized")
+        if self.guide_file is not None and self.guide not in ("auto", "amortized"):
+            raise OptionError("--guide-file is for --guide auto and amortized")
         if self.prior_from is not None and self.pooling != "none":
             raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
-        if self.refine and current_name(self.guide)[0] not in ("amortized", "importance"):
-            raise OptionError("--refine is for --guide amortized and importance")
+        if self.refine and current_name(self.guide)[0] in ("svi", "nuts"):
+            raise OptionError("--refine is for --guide auto, importance and amortized")
         check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed")
         share(self.allow_contradictions, "--allow-contradictions")
 

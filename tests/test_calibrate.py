@@ -110,7 +110,7 @@ def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
         (("--rounds", 5, 1), "--rounds must be positive and increase, not 5 1"),
         (("--rounds", 0), "--rounds must be positive and increase, not 0"),
         (("--seed", -1), "--seed must be at least 0, not -1"),
-        (("--guide-file", "nowhere.x"), "--guide-file is for --guide amortized"),
+        (("--guide-file", "nowhere.x"), "--guide-file is for --guide auto and amortized"),
         (
             ("--guide", "amortized", "--human-model", "one-radius"),
             "no guide ships for one-radius in driving: train one with python -m",

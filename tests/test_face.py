@@ -65,7 +65,7 @@ def test_the_command_writes_what_infer_returns(fit, recordings, tmp_path, monkey
 
 
 def test_a_fit_says_what_it_is(fit):
-    assert repr(fit) == "Fit(driving, fog: 2 people, importance, 30 draws)"
+    assert repr(fit) == "Fit(driving, fog: 2 people, auto, 30 draws)"
     assert fit.people == ("person-01", "person-04")
     person = fit.person("person-04")
     assert repr(person) == "FittedPerson(person-04: 2 rounds)"
@@ -163,9 +163,9 @@ WRONG = {
         "settings must be of the class SVIOptions",
     ),
     "guide": (
-        lambda fit: mirror_ppl.infer(fit.train, guide_file="guide.safetensors"),
+        lambda fit: mirror_ppl.infer(fit.train, engine="svi", guide_file="guide.safetensors"),
         InputError,
-        "guide_file is for the engine amortized",
+        "guide_file is for the engines auto and amortized",
     ),
     "pooling": (
         lambda fit: mirror_ppl.infer(fit.train, pooling="partial", prior_from="posterior.nc"),

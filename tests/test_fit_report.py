@@ -17,7 +17,12 @@ def person(number):
     }
     implants["rule_type_a"] = {"most_probable": "left first", "probability": 0.75}
     test = {"nll": 0.25, "floor": 0.125, "accuracy": 0.5} if number == 1 else None
-    return {"id": f"person-0{number}", "implants": implants, "test": test}
+    return {
+        "id": f"person-0{number}",
+        "engine": "importance",
+        "implants": implants,
+        "test": test,
+    }
 
 
 def shown(capsys, **changes):
@@ -94,6 +99,13 @@ def test_people_who_notice_things_have_no_reach(capsys):
     assert "Nothing is open about what they see, but for how soon they notice things" in out
     assert "What each person notices (probability at a step) and" in shown(capsys, people=[some])
     assert "What each person sees (cells) and" in shown(capsys)
+
+
+def test_who_was_inferred_how_is_told(capsys):
+    assert "Inferred by the engine importance: 2 of 2 people\n" in shown(capsys)
+    people = [person(1), person(2), person(3) | {"engine": "amortized"}]
+    told = "Inferred by the engine importance: 2 of 3 people; amortized: person-03\n"
+    assert told in shown(capsys, people=people)
 
 
 def test_what_was_not_held_out_is_not_judged(capsys):

@@ -20,6 +20,7 @@ from mirror_ppl.inference import importance
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import (
     AmortizedGuide,
+    AmortizedOptions,
     evidence_of,
     guide_screening,
     reference_places,
@@ -71,6 +72,13 @@ def network(toy):
 
 def options_of(guide):
     return InferenceOptions(guide, DRAWS, SVIOptions(steps=400) if guide == "svi" else None)
+
+
+QUICK = {
+    "importance": ImportanceOptions(256, 100.0),
+    "amortized": AmortizedOptions(256, 100.0),
+}
+"""Settings of the engines that are calibrated here."""
 
 
 def bound(variance, draws):
@@ -159,7 +167,7 @@ class Infer:
         self.human, self.guide, self.network, self.change = human, guide, network, change
 
     def __call__(self, recordings, seed):
-        options = InferenceOptions(self.guide, 99, settings=ImportanceOptions(256, 100.0))
+        options = InferenceOptions(self.guide, 99, QUICK[self.guide])
         found = infer(self.human, recordings, options, seed, self.network)
         draws = {name: self.change(name, value) for name, value in found.draws.items()}
         return Inferred(draws, found.pareto_k)

@@ -91,7 +91,10 @@ def test_refining_continues(human, recordings, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"engine": "svi", "refine": 3}, "starts at what importance or amortized found, not svi"),
+        (
+            {"engine": "svi", "refine": 3},
+            "refining is for the engines auto, importance and amortized, not svi",
+        ),
         ({"refine": -1}, "refine must be at least 0, not -1"),
     ],
 )
@@ -102,7 +105,7 @@ def test_what_cannot_be_refined(options, message):
 
 def test_the_command_refuses_it_in_one_line(capsys):
     assert command(fit, "--guide", "nuts", "--refine", 5) == 2
-    assert "--refine is for --guide amortized and importance" in capsys.readouterr().err
+    assert "--refine is for --guide auto, importance and amortized" in capsys.readouterr().err
     assert command(fit, "--refine", -5) == 2
     assert "--refine must be at least 0, not -5" in capsys.readouterr().err
 

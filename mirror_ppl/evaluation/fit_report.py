@@ -8,8 +8,8 @@ from typing import Any
 from rich.table import Table
 
 from mirror_ppl.console import console_for_tables
-from mirror_ppl.inference.calibration.ranks import HIGH_PARETO_K
 from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
+from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.models.implants import NOTICES
 
 FEW = 20
@@ -37,6 +37,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         "median [90% interval] truth, if known; NLL in nats an action, floor: their own entropy",
     )
     people, wrong = summary["people"], summary["contradictions"]
+    print(_served(people))
     if wrong["contradicting"]:
         print(f"{wrong['contradicting']} of {wrong['steps']} steps contradict the next observation")
     doubtful = [
@@ -69,6 +70,16 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         if floors:
             line += f", {nll - sum(floors) / len(floors):.3f} above the people's own entropy"
         print(line)
+
+
+def _served(people: Sequence[dict[str, Any]]) -> str:
+    """Which engine inferred whom; by name, but of the one that inferred most."""
+    by_engine: dict[str, list[str]] = {}
+    for person in people:
+        by_engine.setdefault(person["engine"], []).append(person["id"])
+    (most, ids), *others = sorted(by_engine.items(), key=lambda one: -len(one[1]))
+    line = f"Inferred by the engine {most}: {len(ids)} of {len(people)} people"
+    return line + "".join(f"; {engine}: {', '.join(some)}" for engine, some in others)
 
 
 def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:

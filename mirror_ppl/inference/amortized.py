@@ -250,7 +250,10 @@ def infer_amortized(job: Job) -> Inferred:
     assert network is not None
     return infer_by_importance(
         replace(job, screening=guide_screening(), settings=ImportanceOptions()),
-        lambda builder, _: sample_amortized(job.human, network, builder, job.settings),
+        lambda builder, _: (
+            ENGINE.name,
+            sample_amortized(job.human, network, builder, job.settings),
+        ),
     )
 
 
@@ -260,5 +263,6 @@ ENGINE = Engine(
     AmortizedOptions,
     pooled_draws=4000,
     weighted=True,
+    takes_network=True,
     needs_network=True,
 )

@@ -29,6 +29,7 @@ class Inferred:
         losses: negative ELBO at each step in nats, if one was optimized.
         population: that people are from, if they were pooled.
         effective: number ``[P]`` of each person's own draws that pooling leaves, if they were.
+        engines: name of the engine that inferred each person.
     """
 
     draws: Mapping[str, Tensor]
@@ -36,6 +37,7 @@ class Inferred:
     losses: tuple[float, ...] = field(default=())
     population: Population | None = None
     effective: Tensor | None = None
+    engines: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ class Engine:
         pooled_draws: of each person under the human model's own prior, from which pooling chooses.
         any_program: whether it runs human models that cannot be compiled.
         weighted: whether its draws are corrected by importance weights.
-        needs_network: whether it needs an amortized guide.
+        takes_network: whether it proposes by an amortized guide, if there is one.
+        needs_network: whether it does nothing without.
     """
 
     name: str
@@ -97,4 +100,5 @@ class Engine:
     pooled_draws: int = 1000
     any_program: bool = False
     weighted: bool = False
+    takes_network: bool = False
     needs_network: bool = False

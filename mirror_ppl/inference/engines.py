@@ -20,7 +20,7 @@ from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, w
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.errors import InputError, UnknownNameError
-from mirror_ppl.inference import amortized, importance, nuts, svi
+from mirror_ppl.inference import amortized, automatic, importance, nuts, svi
 from mirror_ppl.inference.amortized import AmortizedGuide, require_network_of
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.names import current_name
@@ -35,7 +35,8 @@ from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.progress import Report, silent
 
 ENGINES: Mapping[str, Engine] = {
-    engine.name: engine for engine in (importance.ENGINE, amortized.ENGINE, svi.ENGINE, nuts.ENGINE)
+    engine.name: engine
+    for engine in (automatic.ENGINE, importance.ENGINE, amortized.ENGINE, svi.ENGINE, nuts.ENGINE)
 }
 """The registry; a new engine is a file of its own and its name here."""
 REFINING_RATE = 0.02
@@ -73,7 +74,7 @@ class InferenceOptions:
             observation.
     """
 
-    engine: str = "importance"
+    engine: str = "auto"
     draws: int = 200
     settings: Any = None
     screening: Screening | None = Screening()
@@ -96,8 +97,9 @@ class InferenceOptions:
         share = real_number(self.allow_contradictions, "allow_contradictions", 0, 1)
         object.__setattr__(self, "allow_contradictions", share)
         if self.refine and not engine.weighted:
-            others = " or ".join(name for name, one in ENGINES.items() if one.weighted)
-            raise InputError(f"refining starts at what {others} found, not {self.engine}")
+            *others, last = (name for name, one in ENGINES.items() if one.weighted)
+            names = f"{', '.join(others)} and {last}"
+            raise InputError(f"refining is for the engines {names}, not {self.engine}")
 
 
 def infer(
@@ -117,7 +119,7 @@ def infer(
         demonstrations: rounds of P people.
         options: how to infer.
         seed: of everything random.
-        network: of the amortized guide.
+        network: of the amortized guide, for the engines that take one.
         report: told of progress.
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused); not of ``nuts``. Of many
@@ -160,7 +162,7 @@ def infer(
         options.settings,
         seed,
         options.screening,
-        network if engine.needs_network else None,
+        network if engine.takes_network else None,
         report,
         checkpoint,
     )
@@ -188,6 +190,8 @@ def _each(engine: Engine, job: Job, refine: int) -> Inferred:
     if engine.needs_network and job.network is None:
         raise InputError(f"the engine {engine.name} needs its network, not None; see load_guide")
     found = engine.run(job)
+    if not found.engines:
+        found = replace(found, engines=(engine.name,) * job.rounds.num_people)
     if not refine:
         return found
     checkpoint = job.checkpoint
@@ -195,7 +199,7 @@ def _each(engine: Engine, job: Job, refine: int) -> Inferred:
         checkpoint = checkpoint[0].with_name(f"{checkpoint[0].name}.refined"), checkpoint[1]
     settings = svi.SVIOptions(steps=refine, learning_rate=REFINING_RATE)
     again = replace(job, settings=settings, checkpoint=checkpoint, start=found.draws)
-    return svi.ENGINE.run(again)
+    return replace(svi.ENGINE.run(again), engines=found.engines)
 
 
 def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequence[object]) -> str:

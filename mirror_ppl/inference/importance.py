@@ -23,15 +23,17 @@ SECONDS_BETWEEN_CHECKPOINTS = 10.0
 
 
 def infer_by_importance(
-    job: Job, first_pass: Callable[[ViewTableBuilder, ImportanceOptions], Weighted] | None = None
+    job: Job,
+    first_pass: Callable[[ViewTableBuilder, ImportanceOptions], tuple[str, Weighted]] | None = None,
 ) -> Inferred:
     """Person after person.
 
     Args:
         job: what to infer.
-        first_pass: weighted draws of what the rounds of a person say; adaptive importance sampling
-            unless given.
+        first_pass: weighted draws of what the rounds of a person say, and which engine they are
+            from; adaptive importance sampling unless given.
     """
+    first_pass = first_pass or _by_importance
     people = job.rounds.num_people
     done = _People() if job.checkpoint is None else _People.restored(*job.checkpoint)
     saved = monotonic()
@@ -42,10 +44,7 @@ def infer_by_importance(
             # Whatever the number of draws that others took.
             torch.manual_seed((job.seed + 1) * 1_000_003 + person)
             first = coarse(job.settings) if looks_twice(human) else job.settings
-            if first_pass is None:
-                found = sample_importance(human, builder.table(), first)
-            else:
-                found = first_pass(builder, first)
+            engine, found = first_pass(builder, first)
             if looks_twice(human):
                 rounds = list(rounds_of(job.rounds, person))
                 builder, found = second_look(
@@ -56,14 +55,19 @@ def infer_by_importance(
                 drawn |= measured_draws(job.rounds.select_people([person]), job.draws)
             done.draws.append(drawn)
             done.pareto_k.append(found.pareto_k)
-            job.report("infer", len(done), people, "people")
+            done.engines.append(engine)
             if job.checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
                 done.save(*job.checkpoint)
                 saved = monotonic()
+            job.report("infer", len(done), people, "people")
         order = sample_sites(job.human, 1)
     # Site after site, so that draws of pooled people, which are many, are not in memory twice.
     draws = {name: torch.cat([own.pop(name) for own in done.draws], 1) for name in order}
-    return Inferred(draws, torch.tensor(done.pareto_k))
+    return Inferred(draws, torch.tensor(done.pareto_k), engines=tuple(done.engines))
+
+
+def _by_importance(builder: ViewTableBuilder, options: ImportanceOptions) -> tuple[str, Weighted]:
+    return ENGINE.name, sample_importance(builder.human, builder.table(), options)
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,7 @@ class _People:
 
     draws: list[Draws] = field(default_factory=list)
     pareto_k: list[float] = field(default_factory=list)
+    engines: list[str] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.draws)
@@ -84,7 +89,7 @@ class _People:
         if not path.exists():
             return cls()
         content = read_checkpoint(path, run)
-        return cls(content["draws"], content["pareto_k"])
+        return cls(content["draws"], content["pareto_k"], content["engines"])
 
 
 ENGINE = Engine(

@@ -43,6 +43,8 @@ DEFENSIVE_SHARE = 0.1
 """
 RESIDUAL_DRAWS = 64
 """Draws by which it is learned where to look for the residual."""
+HIGH_PARETO_K = 0.7
+"""Above it, importance weights are not to be relied on (Vehtari et al., 2015)."""
 HALVINGS = 20
 """Steps of the search for the power to which weights are raised."""
 

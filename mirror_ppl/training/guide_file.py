@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from mirror_ppl.data import asset_path
 from mirror_ppl.errors import AssetError
 from mirror_ppl.files import json_text
 from mirror_ppl.inference.amortized import AmortizedGuide, reference_places
+from mirror_ppl.inference.engines import ENGINES
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.variants import VARIANTS
@@ -45,15 +46,18 @@ def save_guide(
     Raises:
         OutputError: the file cannot be written.
     """
-    metadata = {
-        "format": FORMAT,
+    metadata = {"format": FORMAT, **_belongs_to(human), "card": json_text(card)}
+    save_tensors(path, guide.state_dict(), metadata)
+
+
+def _belongs_to(human: HumanModel) -> dict[str, str]:
+    """What a guide of this human model says that it is for."""
+    return {
         "domain": human.domain.name,
         "domain_version": human.domain.version,
         "human_model": type(human).__name__,
         "self_model": fingerprint(human.self_model),
-        "card": json_text(card),
     }
-    save_tensors(path, guide.state_dict(), metadata)
 
 
 def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str, Any]]:
@@ -69,12 +73,7 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
     """
     require_kind(human, HumanModel, "human")
     metadata, tensors = read_tensors(path, {FORMAT: "guide"})
-    for name, own in (
-        ("domain", human.domain.name),
-        ("domain_version", human.domain.version),
-        ("human_model", type(human).__name__),
-        ("self_model", fingerprint(human.self_model)),
-    ):
+    for name, own in _belongs_to(human).items():
         found = metadata.get(name)
         if found != own:
             if name == "human_model":
@@ -95,16 +94,19 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
     return guide.eval(), card
 
 
-def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGuide | None:
-    """The network of the guide ``amortized``: a file's, or the one that ships; else ``None``.
+def network_for(engine: str, path: Path | None, human: HumanModel) -> AmortizedGuide | None:
+    """The network that an engine proposes by: a file's, or the one that ships; else ``None``.
 
     Raises:
-        AssetError: there is none for this human model.
+        AssetError: the file cannot be read or is for another human model; or the engine needs a
+            network and none ships.
     """
-    if guide != "amortized":
+    if not ENGINES[engine].takes_network:
         return None
     if path is None:
         own = [name for name, kind in VARIANTS.items() if kind is type(human)]
+        if not ENGINES[engine].needs_network:
+            return _shipped_network(human, own)
         try:
             path = shipped_guide(human.domain.name, own[0] if own else FIRST)
         except AssetError as error:
@@ -115,3 +117,15 @@ def network_for(guide: str, path: Path | None, human: HumanModel) -> AmortizedGu
                 "--guide importance"
             ) from error
     return load_guide(path, human)[0]
+
+
+def _shipped_network(human: HumanModel, names: Sequence[str]) -> AmortizedGuide | None:
+    """The network that ships for exactly this human model with this self-model, if one does."""
+    try:
+        path = shipped_guide(human.domain.name, names[0])
+    except (AssetError, IndexError):
+        return None
+    metadata, _ = read_tensors(path, {FORMAT: "guide"})
+    if _belongs_to(human).items() <= metadata.items():
+        return load_guide(path, human)[0]
+    return None

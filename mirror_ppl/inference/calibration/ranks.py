@@ -23,6 +23,7 @@ from scipy.stats import entropy
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.calibration.uniformity import ecdf_p_value, histogram_p_value
+from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.netcdf import read_netcdf
 
 FAILURE_RATE = 1e-3
@@ -31,8 +32,6 @@ LEVELS = (0.5, 0.8, 0.9)
 """Probabilities of the central intervals whose coverage is counted."""
 ENDS = (0.05, 0.95)
 """Quantiles at the ends of the interval whose width is measured."""
-HIGH_PARETO_K = 0.7
-"""Above it, importance weights are not to be trusted."""
 EXACTLY: Any = {
     "join": "exact",
     "combine_attrs": "override",

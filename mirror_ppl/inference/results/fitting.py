@@ -108,7 +108,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         train_rounds: see :func:`split_rounds`.
         report: told of progress.
         checkpoint: file to continue from; written on the way, removed by nobody.
-        network: of the guide ``amortized``.
+        network: of the engines that take one.
         population: that the people are from, if it is known from others.
 
     Raises:
@@ -156,6 +156,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         newcomer = {"newcomer": summarize_newcomer(newcomer, human.value_names)}
     drawn = in_units(get_domain(train.domain), drawn)
     found = summarize(drawn, train, predicted.scores, human.value_names)
+    for person, engine in zip(found, posterior.engines, strict=True):
+        person["engine"] = engine
     if posterior.pareto_k is not None:
         for person, value in zip(found, posterior.pareto_k.tolist(), strict=True):
             person["pareto_k"] = value if isfinite(value) else None
