@@ -116,7 +116,7 @@ def test_numbers_of_numpy_make_the_same_fit(two):
         (lambda: InferenceOptions(refine=-1), "refine must be at least 0, not -1"),
         (
             lambda: InferenceOptions(engine=3),
-            "unknown engine 3; known: amortized, importance, nuts, svi",
+            "unknown engine 3; known: amortized, auto, importance, nuts, svi",
         ),
     ],
 )
