@@ -70,7 +70,7 @@ def marked(value):
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_workers_end_soon_after_the_process_that_started_them(tmp_path, number):
     code = """
-        import sys, time
+        import signal, sys, time
         from dataclasses import dataclass
         from functools import partial
         from mirror_ppl.console import run
@@ -84,6 +84,8 @@ def test_workers_end_soon_after_the_process_that_started_them(tmp_path, number):
             for _ in run_tasks([partial(time.sleep, 0.1), *[partial(time.sleep, 60)] * 2], 2):
                 print("at work", flush=True)
 
+        # Whoever runs these tests in the background may have had it ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.exit(run(Options, main, prog="x", description="x", args=[]))
         """
     environment = os.environ | {MARK: str(tmp_path)}

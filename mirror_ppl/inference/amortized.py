@@ -28,22 +28,29 @@ import torch
 from torch import Tensor, nn
 
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.adaptive_importance import ImportanceOptions
+from mirror_ppl.inference.adaptive_importance import (
+    LEARNED_FROM,
+    PLAIN_STAGES,
+    ImportanceOptions,
+)
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
+from mirror_ppl.inference.margins import PriorMargins, prior_knots
 from mirror_ppl.inference.sampler import Sampler, Weighted
 from mirror_ppl.likelihood.combination_sets import Alike
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.networks import layers
 from mirror_ppl.models.prior import scalar_sites, unconstrained
 
 WAYS = 64
 COMPONENTS = 4
 HIDDEN = 128
-TEMPERATURES = (1.0, 2.0, 4.0, 8.0)
+DROPOUT = 0.2
+TEMPERATURES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+PRIOR_DRAWS = 20_000
 LEAST_EVIDENCE = -30.0
+SOFTPLUS_ONE = 0.5413  # its softplus is 1
 
 
 @dataclass(frozen=True)
@@ -113,65 +120,87 @@ def evidence_of(builder: ViewTableBuilder) -> Evidence:
 class AmortizedGuide(nn.Module):
     """``q(psi | rounds)`` of the scalar sites of a human model, in unconstrained space.
 
+    Before it has learned anything it is about the prior's margins, and independent.
+
     Args:
         places: of the ways that evidence is about, ``[W, D]``.
+        prior: of draws from the prior, for its margins, ``[S, D]``; the ways if not given.
 
     Attributes:
-        ways: their places in units of the prior's standard deviation, ``[W, D]``.
-        centre, width: of the prior in unconstrained space, ``[D]``.
+        knots: of the prior's margins, see :class:`PriorMargins`, ``[D, K]``.
+        ways: places of the ways, in which the prior is standard normal, ``[W, D]``.
+        gate: how much of the mean, at each temperature of the evidence, is that of importance
+            sampling from the prior, ``[temperatures, D]``.
     """
 
     ways: Tensor
-    centre: Tensor
-    width: Tensor
+    knots: Tensor
 
-    def __init__(self, places: Tensor) -> None:
+    def __init__(self, places: Tensor, prior: Tensor | None = None) -> None:
         super().__init__()
         number, self.dimensions = places.shape
-        self.register_buffer("centre", places.mean(0))
-        self.register_buffer("width", places.std(0).clamp(min=1e-6))
-        self.register_buffer("ways", (places - self.centre) / self.width)
+        self.register_buffer("knots", prior_knots(places if prior is None else prior))
+        self.register_buffer("ways", PriorMargins(self.knots).inv(places))
         moments = 2 * self.dimensions + 1
         triangle = self.dimensions * (self.dimensions + 1) // 2
-        self.body = layers((number + len(TEMPERATURES) * moments + 1, HIDDEN, HIDDEN))
+        self.body = nn.Sequential(
+            nn.Linear(number + len(TEMPERATURES) * moments + 1, HIDDEN),
+            nn.ReLU(),
+            nn.Dropout(DROPOUT),
+            nn.Linear(HIDDEN, HIDDEN),
+            nn.ReLU(),
+            nn.Dropout(DROPOUT),
+        )
         self.head = nn.Linear(HIDDEN, COMPONENTS * (1 + self.dimensions + triangle))
+        nn.init.normal_(self.head.weight, std=0.01)
+        nn.init.normal_(self.head.bias, std=0.1)
+        self.gate = nn.Parameter(torch.zeros(len(TEMPERATURES), self.dimensions))
 
-    def features(self, log_evidence: Tensor, steps: Tensor) -> Tensor:
+    def features(self, log_evidence: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
         """What the network reads ``[..., F]`` of evidence ``[..., W]`` of so many steps ``[...]``.
 
         Besides the evidence itself: what importance sampling from the prior would give for mean
-        and spread, also with evidence tempered, where few ways have all the weight.
+        and spread, also with evidence tempered, where few ways have all the weight. These means
+        once more, ``[..., temperatures, D]``.
         """
         relative = log_evidence - log_evidence.amax(-1, keepdim=True)
-        parts = [relative.clamp(min=LEAST_EVIDENCE) / 10.0]
+        parts, means = [relative.clamp(min=LEAST_EVIDENCE) / 10.0], []
         for temperature in TEMPERATURES:
             weights = torch.softmax(relative / temperature, -1)
             mean = weights @ self.ways
             spread = (weights @ self.ways.square() - mean.square()).clamp(min=0).sqrt()
             effective = 1 / weights.square().sum(-1, keepdim=True)
             parts += [mean, spread, effective / len(self.ways)]
+            means.append(mean)
         parts.append(torch.log1p(steps.to(relative))[..., None] / 5.0)
-        return torch.cat(parts, -1)
+        return torch.cat(parts, -1), torch.stack(means, -2)
+
+    def reads(self, places: Tensor) -> bool:
+        """Whether it learned to read evidence about ways at these places ``[W, D]``."""
+        if self.ways.shape != places.shape:
+            return False
+        own = PriorMargins(self.knots)(self.ways)
+        return torch.allclose(own, places.to(own), atol=1e-3)
 
     def density(self, log_evidence: Tensor, steps: Tensor) -> dist.TorchDistribution:
         """``q`` over places ``[..., D]`` in unconstrained space."""
         size = self.dimensions
-        features = self.features(log_evidence, steps)
+        features, means = self.features(log_evidence, steps)
         out = self.head(self.body(features)).unflatten(-1, (COMPONENTS, -1))
         logits, mean, triangle = out.split([1, size, size * (size + 1) // 2], -1)
-        # A component starts where importance sampling says that the posterior is.
-        weights = torch.softmax(log_evidence - log_evidence.amax(-1, keepdim=True), -1)
-        mean = mean + (weights @ self.ways)[..., None, :]
+        mean = mean + (self.gate * means).sum(-2)[..., None, :]
         rows, columns = torch.tril_indices(size, size)
         lower = mean.new_zeros(*triangle.shape[:-1], size, size)
         lower[..., rows, columns] = triangle
-        diagonal = nn.functional.softplus(lower.diagonal(dim1=-2, dim2=-1)) + 1e-3
-        lower = torch.tril(lower, -1) + torch.diag_embed(diagonal)
-        scale = self.width[:, None] * lower
-        return dist.MixtureSameFamily(
+        # Without anything learned it is one, as the prior's.
+        diagonal = nn.functional.softplus(lower.diagonal(dim1=-2, dim2=-1) + SOFTPLUS_ONE) + 1e-3
+        mixture = dist.MixtureSameFamily(
             dist.Categorical(logits=logits.squeeze(-1)),
-            dist.MultivariateNormal(self.centre + self.width * mean, scale_tril=scale),
+            dist.MultivariateNormal(
+                mean, scale_tril=torch.tril(lower, -1) + torch.diag_embed(diagonal)
+            ),
         )
+        return dist.TransformedDistribution(mixture, [PriorMargins(self.knots)])
 
     def forward(
         self, sites: Mapping[str, dist.transforms.Transform], log_evidence: Tensor, steps: Tensor
@@ -189,9 +218,9 @@ class AmortizedGuide(nn.Module):
                 pyro.sample(name, dist.Delta(value, log_density=-stretch))
 
 
-def reference_places(human: HumanModel) -> Tensor:
-    """Places ``[W, D]`` of the ways that evidence is about; always the same of a human model."""
-    builder = ViewTableBuilder(human, guide_screening())
+def reference_places(human: HumanModel, number: int = WAYS) -> Tensor:
+    """Places ``[W, D]`` of ways from the prior; always the same of a human model."""
+    builder = ViewTableBuilder(human, Screening(ways=number))
     return unconstrained(scalar_sites(human), builder.draw_ways())
 
 
@@ -201,11 +230,7 @@ def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:
     Raises:
         InputError: this is one.
     """
-    own = AmortizedGuide(reference_places(human))
-    device = network.ways.device
-    if network.ways.shape != own.ways.shape or not torch.allclose(
-        network.ways, own.ways.to(device), atol=1e-3
-    ):
+    if not network.reads(reference_places(human)):
         raise InputError(
             f"the network is for another human model than {type(human).__name__} in "
             f"{human.domain.name}; see load_guide"
@@ -236,11 +261,14 @@ def sample_amortized(
     sampler.prune(options.prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
     density = guide.density(evidence.log_evidence, steps)
-    for _ in range(options.stages):
+    for stage in range(options.stages):
         sampler.propose(density, options.proposals)
         found = sampler.weighted()
         if found.effective >= options.enough:
             break
+        # The network says nothing about the residual; draws do, once there are some.
+        if stage >= PLAIN_STAGES and not sampler.proposes_residual:
+            sampler.learn_residual(found.tempered(LEARNED_FROM))
     return found
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.amortized import (
+    PRIOR_DRAWS,
     AmortizedGuide,
     guide_screening,
     log_evidence,
@@ -46,7 +47,8 @@ class GuideOptions:
         rounds: numbers of rounds after which evidence is looked at, increasing.
         steps: gradient steps.
         batch: examples in a gradient step, of a person and a number of rounds each.
-        learning_rate: of Adam at the start; it falls to nothing on a cosine.
+        learning_rate: of AdamW at the start; it falls to nothing on a cosine.
+        weight_decay: of AdamW.
         held_out: share of the people who only tell when to stop.
         together: people who are simulated at once.
     """
@@ -56,6 +58,7 @@ class GuideOptions:
     steps: int = 4000
     batch: int = 256
     learning_rate: float = 1e-3
+    weight_decay: float = 0.1
     held_out: float = 0.1
     together: int = 20
 
@@ -172,7 +175,7 @@ def _optimize(
     human: HumanModel, examples: Examples, options: GuideOptions, report: Report
 ) -> tuple[AmortizedGuide, dict[str, float]]:
     sites = scalar_sites(human)
-    guide = AmortizedGuide(reference_places(human))
+    guide = AmortizedGuide(reference_places(human), reference_places(human, PRIOR_DRAWS))
     held_out = max(1, round(options.held_out * len(examples)))
     learned = len(examples) - held_out
     numbers = examples.steps.shape[1]
@@ -186,10 +189,13 @@ def _optimize(
         return -torch.as_tensor(trace.log_prob_sum()) / len(person)
 
     test = torch.cartesian_prod(torch.arange(learned, len(examples)), torch.arange(numbers)).T
-    optimizer = torch.optim.Adam(guide.parameters(), options.learning_rate)
+    optimizer = torch.optim.AdamW(
+        guide.parameters(), options.learning_rate, weight_decay=options.weight_decay
+    )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.steps)
     best, kept = float("inf"), copy.deepcopy(guide.state_dict())
     for step in range(options.steps):
+        guide.train()
         optimizer.zero_grad()
         value = loss(
             torch.randint(learned, (options.batch,)), torch.randint(numbers, (options.batch,))
@@ -199,6 +205,7 @@ def _optimize(
         optimizer.step()
         schedule.step()
         if step % 50 == 49 or step == options.steps - 1:
+            guide.eval()
             with torch.no_grad():
                 found = float(loss(*test))
             if found < best:

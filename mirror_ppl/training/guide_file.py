@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from mirror_ppl.checks import require_kind
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import AssetError
@@ -20,7 +18,7 @@ from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import fingerprint, read_tensors, save_tensors
 
-FORMAT = "mirror_ppl guide 1"
+FORMAT = "mirror_ppl guide 2"
 FIRST = next(iter(VARIANTS))
 
 
@@ -84,12 +82,12 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
             )
     try:
         card = json.loads(metadata["card"])
-        guide = AmortizedGuide(reference_places(human))
-        same = torch.allclose(guide.ways, tensors["ways"], atol=1e-3)
+        places = reference_places(human)
+        guide = AmortizedGuide(places)
         guide.load_state_dict(tensors)
     except (KeyError, RuntimeError, ValueError) as error:
         raise AssetError(f"{path}: does not fit this program ({error})") from error
-    if not same:
+    if not guide.reads(places):
         raise AssetError(f"{path}: is for another prior; train a guide for this one")
     return guide.eval(), card
 
