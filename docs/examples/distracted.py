@@ -7,7 +7,7 @@ In a round in which they are, they see nothing by themselves::
     distracted_p ~ Beta(1, 4)                 share of rounds
     away_p,b     ~ Bernoulli(distracted_p)    in round b
 
-How such a class comes about is told in ``docs/extending.md``.
+``docs/extending.md`` explains how to write such a class.
 """
 
 import pyro

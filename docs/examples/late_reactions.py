@@ -7,7 +7,7 @@ With probability ``late``, an action follows the belief of one step before::
     late_p ~ Beta(1, 4)
     a_t    ~ (1 - late) pi(zH_t) + late pi(zH_{t-1})         pi: the package's own choice of actions
 
-How such a class comes about is told in ``docs/extending.md``.
+``docs/extending.md`` explains how to write such a class.
 """
 
 import pyro
