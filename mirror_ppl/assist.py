@@ -88,6 +88,8 @@ class Options:
     """Seed of the rounds and of everything random."""
     jobs: int = 2
     """Processes that share the work."""
+    scheduler: str | None = None
+    """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
 
     def __post_init__(self) -> None:
         check_numbers(self, "rounds", "people", "draws", "horizon", "patience", jobs=1)
@@ -111,10 +113,11 @@ def main(options: Options) -> None:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
     from mirror_ppl.communication.objectives import beliefs_have_density, require_density
-    from mirror_ppl.evaluation.assistance import COMMUNICATORS, RATES_FROM, PlannerOptions
-    from mirror_ppl.evaluation.assistance_cells import Pairing, run_cells
+    from mirror_ppl.evaluation.assistance import COMMUNICATORS, PlannerOptions
+    from mirror_ppl.evaluation.assistance_cells import Pairing, play_all, turns
     from mirror_ppl.evaluation.assistance_summary import summarize_assistance
     from mirror_ppl.files import lock_of, output_folder, write_together
+    from mirror_ppl.jobs import Runner
 
     chosen = options.communicator or COMMUNICATORS
     for name in chosen:
@@ -167,19 +170,19 @@ def main(options: Options) -> None:
             file=sys.stderr,
         )
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
-    # Rates of random messages are those of a planner, which plays then, too.
-    playing = len({*chosen} | ({RATES_FROM} if "random" in chosen else set()))
+    cells = turns(chosen, number)
     with ExitStack() as stack:
         for path in outputs:
             own = [parts.name] if parts is not None and path == kept else []
             results = output_folder(path.parent, [path.name], lock_of(path), own)
             stack.enter_context(results)
-        progress = stack.enter_context(Progress("assist", number * playing))
-        played = run_cells(pairing, chosen, number, options.jobs, parts, progress.update)
+        progress = stack.enter_context(Progress("assist", len(cells)))
+        runner = Runner(parts, jobs=options.jobs, scheduler=options.scheduler, progress=progress)
+        everything = play_all(pairing, cells, runner)
+        played = {name: everything[name] for name in chosen}
         summary = summarize_assistance(played, options.seed)
         write_together(_contents(options, posterior, played, summary))
-        if parts is not None:
-            pairing.forget(parts)
+        runner.clean()
     _show(summary, posterior.attributes, number, options.rounds)
     for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
         if path is not None:
@@ -203,7 +206,7 @@ def _contents(
             "options": {
                 name: value
                 for name, value in asdict(options).items()
-                if name not in ("json", "log", "jobs")
+                if name not in ("json", "log", "jobs", "scheduler")
             },
             "posterior": dict(posterior.attributes),
             "communicators": summary,

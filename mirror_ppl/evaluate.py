@@ -16,7 +16,7 @@ from mirror_ppl.limits import check_numbers
 from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
-    from mirror_ppl.evaluation.sweep import Outcome
+    from mirror_ppl.jobs import Outcome
 
 PROGRAM = "python -m mirror_ppl.evaluate"
 DESCRIPTION = """Compare MIRROR with its parts and its rivals on simulated people. prediction: how
@@ -82,8 +82,6 @@ class Options:
             for name in ("played", "draws"):
                 if getattr(self, name) != getattr(Options, name):  # which has the default
                     raise OptionError(f"--{name} is of assistance and relevance, not of prediction")
-        if self.scheduler is not None and not self.scheduler.strip():
-            raise OptionError("--scheduler must be an address, such as tcp://host:8786")
         if self.told is not None and not 0 <= self.told <= 1:
             raise OptionError(f"--told must be from 0 to 1, not {self.told}")
         if not self.domain:
@@ -108,9 +106,9 @@ def main(options: Options) -> int:
     """
     from mirror_ppl.evaluation.study import assist, identities, predict
     from mirror_ppl.evaluation.study_report import REPORTS
-    from mirror_ppl.evaluation.sweep import run_cells
     from mirror_ppl.evaluation.tables import comma_separated, page
     from mirror_ppl.files import json_text, output_folder, write_together
+    from mirror_ppl.jobs import Runner
 
     cells = _cells(options)
     work = predict if options.study == "prediction" else assist
@@ -119,18 +117,16 @@ def main(options: Options) -> int:
     names = [path.with_suffix(kind).name for kind in kinds]
     results = output_folder(path.parent, names, parts=["parts"])
     with results as folder, Progress(options.study, len(cells)) as progress:
-        parts = folder / "parts"
-        outcomes = run_cells(
-            cells,
-            work,
-            parts,
+        runner = Runner(
+            folder / "parts",
             identities(options.domain),
             options.jobs,
             options.scheduler,
-            progress.update,
-            progress.resume,
+            keep_going=True,
+            progress=progress,
         )
-        rows = [row for outcome in outcomes for row in outcome.rows]
+        outcomes = runner.run(cells, work)
+        rows = [row for outcome in outcomes for row in outcome.result or ()]
         failed = [outcome for outcome in outcomes if outcome.error is not None]
         report = REPORTS[options.study](rows) if rows else None
         if report is not None:

@@ -155,13 +155,22 @@ def test_a_stopped_run_goes_on_where_it_was(posterior, tmp_path, monkeypatch):
     )
 
 
-def test_parts_of_something_else_are_not_used(posterior, tmp_path, monkeypatch):
+def test_damaged_parts_are_played_anew(posterior, tmp_path, monkeypatch):
     args = ("--posterior", posterior, *SMALL, "--communicator", "none")
     outputs = ("--json", tmp_path / "a.json")
-    parts = tmp_path / ".a.json.parts"
-    parts.mkdir()
-    (parts / "none-0.json").write_text("{")
-    (parts / "none-1.json").write_text('{"identity": "of another run", "played": {}}')
+
+    def stops(*args):
+        raise Stopped
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mirror_ppl.evaluation.assistance_summary.summarize_assistance", stops)
+        with pytest.raises(Stopped):
+            command(assist, *args, *outputs)
+    parts = sorted((tmp_path / ".a.json.parts").iterdir())
+    assert len(parts) == 2
+    parts[0].write_text("{")
+    whole = json.loads(parts[1].read_text())
+    parts[1].write_text(json.dumps(whole | {"result": {"none": {"task": [1.0]}}}))
     assert command(assist, *args, *outputs) == 0
     assert results_of(tmp_path / "a.json")["communicators"]["none"]["cost"] == 0
     assert content(tmp_path) == ["a.json"]

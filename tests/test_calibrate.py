@@ -48,7 +48,7 @@ def test_it_tells_and_writes_what_it_found(small, tmp_path, capsys):
     words = "reach", "in sight", "otherwise", "not rejected for any of 3", "calibration.nc"
     for word in (*words, "Of 60 people, only gross faults would show"):
         assert word in out
-    assert "60/60" in err
+    assert "12/12 people " in err
     assert names(tmp_path / "out") == RESULTS
     calibration = Calibration.load(tmp_path / "out" / "calibration.nc")
     assert calibration.people == 60 and calibration.draws == 19

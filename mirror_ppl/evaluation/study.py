@@ -26,7 +26,7 @@ from mirror_ppl.evaluation.learners import (
     is_own,
     learn,
 )
-from mirror_ppl.evaluation.sweep import Rows
+from mirror_ppl.evaluation.tables import Rows
 from mirror_ppl.inference.results.summary import score
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.loading import file_of, load_human_model

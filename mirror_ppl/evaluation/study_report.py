@@ -21,8 +21,7 @@ from mirror_ppl.evaluation.study_summary import (
     relevance,
     summarize_study,
 )
-from mirror_ppl.evaluation.sweep import Rows
-from mirror_ppl.evaluation.tables import TextTable
+from mirror_ppl.evaluation.tables import Rows, TextTable
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.study import plot_curves, plot_relevance
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mirror_ppl.evaluation.sweep import Rows
+from mirror_ppl.evaluation.tables import Rows
 
 RESAMPLES = 2000
 LEVELS = (0.05, 0.95)
