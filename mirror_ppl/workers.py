@@ -94,7 +94,8 @@ def cluster(address: str) -> ExitStack:
         try:
             # A client that cannot connect would stay behind as what xarray asks for its locks.
             LoopRunner().run_sync(reach)
-            client = stack.enter_context(Client(address, timeout="10s"))
+            # xarray would ask the default client for locks of files that are written here.
+            client = stack.enter_context(Client(address, timeout="10s", set_as_default=False))
         except (OSError, ValueError) as error:
             raise OptionError(f"--scheduler {address} cannot be reached: {error}") from error
         stack.enter_context(parallel_config(backend="dask", client=client))

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from running import command
+from running import command, command_on_cluster
 
 from mirror_ppl import assist, fit
 from mirror_ppl.arviz import az
@@ -119,6 +119,17 @@ def test_alone_or_among_others_a_communicator_plays_the_same(posterior, done, tm
     assert list(alone) == ["random"]
     among = results_of(done / "a.json")["communicators"]["random"]
     assert alone["random"]["net_by_person"] == among["net_by_person"][:1]
+
+
+@pytest.mark.slow
+def test_a_cluster_plays_the_same(posterior, done, tmp_path):
+    chosen = ("--communicator", "mirror", "random", "--json", tmp_path / "a.json")
+    run = command_on_cluster(tmp_path, assist, "--posterior", posterior, *SMALL, *chosen)
+    assert run.returncode == 0, run.stderr
+    there = results_of(tmp_path / "a.json")["communicators"]
+    here = results_of(done / "a.json")["communicators"]
+    for name in ("mirror", "random"):
+        assert there[name]["net_by_person"] == here[name]["net_by_person"]
 
 
 # --- resuming ---------------------------------------------------------------------------------
