@@ -288,7 +288,7 @@ with tempfile.TemporaryDirectory() as folder:
         save_inference_data(own.data, path)
         files.append(read_fit(path, "heldout"))
 comparison = compare_fits(files, names, "heldout")
-plot_comparison(comparison)
+plot_comparison(comparison.table())
 
 # %% [markdown]
 # What these people *see* is what sets them apart from the robot. Without it, no policy implant

@@ -35,7 +35,7 @@ from mirror_ppl.training.guide_file import shipped_guide
 
 CODE = (
     *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
-    *(f"{name}/**/*.py" for name in ("inference", "models", "people")),
+    *(f"{name}/**/*.py" for name in ("inference", "likelihood", "models", "people")),
     *(f"evaluation/{name}.py" for name in ("assistance", "learners", "oracle", "study")),
     "evaluation/reachable_oracle.py",
     "cross_entropy.py",
