@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.assist`: pair communicators with people, and see who helps how much."""
+"""`python -m mirror_ppl.assist`: pair communicators with people, and compare net returns."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
     from mirror_ppl.evaluation.assistance import Played
+    from mirror_ppl.evaluation.assistance_cells import Pairing
     from mirror_ppl.inference.results.posterior_file import PosteriorFile
 
 FAR_BELOW = -10
-"""Ways from silence to the oracle of which less is told."""
+"""Shares of the way from silence to the oracle below which no number is printed."""
 KL, LEARNED = "mirror-kl", "mirror-self-model"
 PROGRAM = "python -m mirror_ppl.assist"
-DESCRIPTION = """Let communicators speak to the simulated people of a posterior while they drive,
-and print for each what the people gained, what the messages cost and what they were about. All play
-the same rounds with the same random numbers. With --json or --log, a run that is stopped goes on
-where it was when the same command is given again."""
+DESCRIPTION = """Let communicators send messages to the simulated people of a posterior in their
+rounds, and print for each the people's returns, the cost of messages and what they were about. All
+play the same rounds with the same random numbers. With --json or --log, a run that is stopped goes
+on where it was when the same command is given again."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +113,8 @@ def main(options: Options) -> None:
     Raises:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
-    from mirror_ppl.communication.objectives import beliefs_have_density, require_density
-    from mirror_ppl.evaluation.assistance import COMMUNICATORS, PlannerOptions
-    from mirror_ppl.evaluation.assistance_cells import Pairing, play_all, turns
+    from mirror_ppl.evaluation.assistance import COMMUNICATORS
+    from mirror_ppl.evaluation.assistance_cells import play_all, turns
     from mirror_ppl.evaluation.assistance_summary import summarize_assistance
     from mirror_ppl.files import lock_of, output_folder, write_together
     from mirror_ppl.jobs import Runner
@@ -132,43 +132,9 @@ def main(options: Options) -> None:
         raise PosteriorError(
             f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
         )
-    planner = PlannerOptions.of(
-        posterior.attributes["domain"],
-        horizon=options.horizon,
-        discount=options.discount,
-        branch=options.branch,
-        patience=options.patience,
-        sure=options.sure,
-        kl_weight=options.kl_weight,
-        kl_measure=options.kl_measure,
-    )
-    pairing = Pairing(
-        posterior=options.posterior,
-        human_model=options.human_model,
-        self_model=options.self_model,
-        draws=options.draws,
-        setting=posterior.attributes["setting"],
-        population=source["population"],
-        people_seed=int(source["seed"]),
-        people=len(posterior.people),
-        rounds=options.rounds,
-        planner=planner,
-        seed=options.seed,
-        keep_log=options.log is not None,
-    )
+    pairing = _pairing(options, posterior, source)
     pairing.check()
-    if KL in chosen and not beliefs_have_density(pairing.human):
-        if KL in options.communicator:
-            require_density(pairing.human)
-        chosen = tuple(name for name in chosen if name != KL)
-        name = type(pairing.human).__name__
-        print(f"{KL} is left out: beliefs of {name} have no density", file=sys.stderr)
-    if not options.communicator and pairing.domain.as_believed is not pairing.domain:
-        chosen = tuple(name for name in chosen if name != LEARNED)
-        print(
-            f"{LEARNED} is left out: the robot was taught wrong in {pairing.domain.name}",
-            file=sys.stderr,
-        )
+    chosen = _possible(options, chosen, pairing)
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
     cells = turns(chosen, number)
     with ExitStack() as stack:
@@ -187,6 +153,56 @@ def main(options: Options) -> None:
     for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
         if path is not None:
             print(f"{path}: {what}")
+
+
+def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, Any]) -> Pairing:
+    """Who is paired in which rounds."""
+    from mirror_ppl.evaluation.assistance import PlannerOptions
+    from mirror_ppl.evaluation.assistance_cells import Pairing
+
+    planner = PlannerOptions.of(
+        posterior.attributes["domain"],
+        horizon=options.horizon,
+        discount=options.discount,
+        branch=options.branch,
+        patience=options.patience,
+        sure=options.sure,
+        kl_weight=options.kl_weight,
+        kl_measure=options.kl_measure,
+    )
+    return Pairing(
+        posterior=options.posterior,
+        human_model=options.human_model,
+        self_model=options.self_model,
+        draws=options.draws,
+        setting=posterior.attributes["setting"],
+        population=source["population"],
+        people_seed=int(source["seed"]),
+        people=len(posterior.people),
+        rounds=options.rounds,
+        planner=planner,
+        seed=options.seed,
+        keep_log=options.log is not None,
+    )
+
+
+def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tuple[str, ...]:
+    """Communicators without those that cannot plan for these people, unless they are asked for."""
+    from mirror_ppl.communication.objectives import beliefs_have_density, require_density
+
+    if KL in chosen and not beliefs_have_density(pairing.human):
+        if KL in options.communicator:
+            require_density(pairing.human)
+        chosen = tuple(name for name in chosen if name != KL)
+        name = type(pairing.human).__name__
+        print(f"{KL} is left out: beliefs of {name} have no density", file=sys.stderr)
+    if not options.communicator and pairing.domain.as_believed is not pairing.domain:
+        chosen = tuple(name for name in chosen if name != LEARNED)
+        print(
+            f"{LEARNED} is left out: the robot was taught wrong in {pairing.domain.name}",
+            file=sys.stderr,
+        )
+    return chosen
 
 
 def _contents(

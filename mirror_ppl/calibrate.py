@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.calibrate`: are posteriors as sure of people as they have a right to be?"""
+"""`python -m mirror_ppl.calibrate`: simulation-based calibration of an engine's posteriors."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from mirror_ppl.models.human import HumanModel
 
 PROGRAM = "python -m mirror_ppl.calibrate"
-DESCRIPTION = """Simulation-based calibration: people are drawn from the human model's prior, play
-rounds, and their implants are inferred. Where inference is right, the truth is as likely to be at
-any place among the posterior draws. Prints a table for each implant and number of rounds, and
-writes ranks.png, ecdf.png, coverage.png and calibration.nc. The exit status is 1 if calibration is
-rejected. A run that is stopped goes on where it was when the same command is given again."""
+DESCRIPTION = """Simulation-based calibration: simulates people from the human model's prior, fits
+them, and tests that ranks of the truth among posterior draws are uniform. Prints a table for each
+implant and number of rounds, and writes ranks.png, ecdf.png, coverage.png and calibration.nc. The
+exit status is 1 if calibration is rejected. A run that is stopped goes on where it was when the
+same command is given again."""
 REJECTED = 1
 WIDTH = 80
 FEW_PEOPLE = 100

@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from mirror_ppl.jobs import Outcome
 
 PROGRAM = "python -m mirror_ppl.evaluate"
-DESCRIPTION = """Compare MIRROR with its parts and its rivals on simulated people. prediction: how
-well each predicts held-out actions, by the number of rounds that it learned from. assistance: the
-net return of people who are spoken to by communicators that plan with each. relevance: which share
-of what those tell is relevant. Writes rows of every person (CSV), tables to read (Markdown), a
-summary (JSON) and a figure. A run that is stopped goes on where it was when the same command is
-given again; the exit status is 1 if something failed."""
+DESCRIPTION = """Compare MIRROR with its ablations and baselines on simulated people. prediction:
+how well each predicts held-out actions, by the number of rounds that it learned from. assistance:
+the net return of people who receive messages from communicators that plan with each. relevance: the
+share of the communicated items that is relevant. Writes rows of every person (CSV), tables to read
+(Markdown), a summary (JSON) and a figure. A run that is stopped goes on where it was when the same
+command is given again; the exit status is 1 if something failed."""
 FAILED = 1
 QUICK = ("driving",)
 """Worlds of short rounds, of which more is learned in the same time."""
 SEEDS, FEW_SEEDS = (5, 2), (2, 1)
 """Of prediction and of the others, in those worlds and otherwise."""
 TOLD = 0.03
-"""Of an item at a step, in rounds from which it is learned how to help."""
+"""Probability that an item is communicated at a step, in rounds that models learn from."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ class Options:
     rounds: tuple[int, ...] = (1, 2, 5, 10, 20)
     """Numbers of rounds that are learned from, from 1 to 20; the most only, for relevance."""
     played: int = 5
-    """Rounds of each person in which they are spoken to; of assistance and relevance."""
+    """Rounds of each person in which they receive messages; of assistance and relevance."""
     draws: int = 64
     """Posterior draws that are planned with; of assistance and relevance."""
     told: float | None = None
-    """Chance that an item that can be communicated is told, at each step of the rounds that are
-    learned from. Unless given .03 of assistance and relevance, so that everybody can learn what
-    people make of messages, and none of prediction."""
+    """Probability that an item that can be communicated is, at each step of the rounds that models
+    learn from. Unless given .03 of assistance and relevance, so that all models can learn how
+    people use messages, and 0 of prediction."""
     out: Path = Path("runs/evaluate")
     """Folder for the results; made if it is not there. Tables are of the last command: what is to
     be in one table is asked for at once, and what was done before is not done again."""
@@ -151,7 +151,7 @@ def main(options: Options) -> int:
 
 
 def _told(options: Options) -> float:
-    """How much is told in the rounds that are learned from."""
+    """How much is communicated in the rounds that models learn from."""
     if options.told is not None:
         return options.told
     return 0.0 if options.study == "prediction" else TOLD

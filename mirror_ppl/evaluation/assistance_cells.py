@@ -27,6 +27,7 @@ from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.people import simulated_people
 
 
 @dataclass(frozen=True)
@@ -85,15 +86,10 @@ class Pairing:
 
     def listener(self, number: int, inferred: bool = True) -> Listener:
         """The person of that number, with their rounds, and what was inferred of them."""
-        listener = listeners(
-            self.domain,
-            self.setting,
-            self.population,
-            self.people,
-            self.people_seed,
-            self.rounds,
-            self.seed,
-        )[number]
+        everybody = simulated_people(
+            self.domain.name, self.setting, self.population, self.people, self.people_seed
+        )
+        listener = listeners(everybody, self.people, self.setting, self.rounds, self.seed)[number]
         if not inferred:
             return listener
         own = slice(number, number + 1)
