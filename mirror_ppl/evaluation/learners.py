@@ -27,7 +27,7 @@ from mirror_ppl.baselines import (
 from mirror_ppl.baselines.inputs import Sight
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains import DOMAINS, get_domain
+from mirror_ppl.domains import DOMAINS
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, listeners
@@ -210,7 +210,7 @@ def _parts(group: Group, rounds: int) -> tuple[Demonstrations, Demonstrations]:
 
 
 def _trained(group: Group, train: Demonstrations, networks: RecurrentNetworks) -> Trained:
-    # What rewards tell of the world is nothing about people, so baselines get to know it, too.
+    # What rewards say of the world is nothing about people, so baselines get to know it, too.
     human = load_human_model(None, group.self_model)
     human.learn_world(train)
     return Trained(networks, human.self_model, group.setting, human.known_world({}))
@@ -259,7 +259,7 @@ LEARNERS: dict[str, Learn] = {
 }
 """Everything that can be compared, in the order in which it is shown. Guides are `exact` but for
 those of other names; ``mirror-population`` has a prior learned from others.
-Baselines are told what the setting lets people see, which MIRROR has to find out, but for those that
+Baselines get what the setting lets people see, which MIRROR has to find out, but for those that
 read ``everything``, as the human model is given it."""
 SLOW = {
     "mirror-nuts": DOMAINS,

@@ -177,7 +177,7 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
     if any(one.mirror for one in shares):
         caption += (
             "; below it how far mirror's share (of 1) is ahead person by person, the 90% interval "
-            "of that, and in how many it is (ties count half), over people who got messages from both"
+            "of that, and in how many it is (ties count half), over people with messages from both"
         )
     return TextTable(title, caption, ("model", "rounds", *names), rows)
 
