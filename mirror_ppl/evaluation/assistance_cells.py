@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
-from mirror_ppl import __version__
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.evaluation.assistance import (
@@ -28,6 +27,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulated_people
+from mirror_ppl.version import __version__
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from mirror_ppl import __version__
 from mirror_ppl.checks import whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
@@ -37,6 +36,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.version import __version__
 
 PRIOR_PEOPLE = 4000
 """Drawn to know the prior's widths and entropies to a few percent."""
