@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from time import perf_counter
 
@@ -39,6 +40,8 @@ from mirror_ppl.people import simulate
 CHANGES = ("none", "factor", "observed", "scale", "act")
 """What is changed of a toy: nothing, a factor, an observed site or a scale in ``prior``, or a
 factor in ``act``."""
+STEPS = 6
+"""Of the toy's rounds, the first ones of drivers': without compilation each step counts."""
 MEASURED, ERROR = 1.0, 0.01
 """The answer to the questionnaire, and its standard deviation."""
 
@@ -47,8 +50,12 @@ MEASURED, ERROR = 1.0, 0.01
 class Options:
     """What to measure."""
 
+    changes: tuple[str, ...] = CHANGES
+    """What is changed of the toy."""
     people: int = 10
-    """Number of people who answer the questionnaire."""
+    """Number of people who answer the questionnaire; 0 leaves it out."""
+    rounds: int = 20
+    """Rounds of each of them."""
     steps: int = 1000
     """Steps of svi for the questionnaire, beside those it takes unless told."""
     draws: int = 1000
@@ -135,20 +142,32 @@ class Questionnaire(HumanModel):
         return implants
 
 
+def begun(rounds: Demonstrations, steps: int) -> Demonstrations:
+    """The first steps of rounds."""
+    variables = rounds.variables()
+    cut = {"ego": steps + 1, **dict.fromkeys(rounds.observations, steps + 1)}
+    variables = {
+        name: value[:, :, : cut.get(name, steps)] if value.dim() > 2 else value  # noqa: PLR2004
+        for name, value in variables.items()
+    }
+    variables["length"] = variables["length"].clamp(max=steps)
+    return Demonstrations.from_variables(rounds.domain, rounds.setting, rounds.people, variables)
+
+
 def toys(options: Options, self_model: SelfModel) -> Iterator[dict]:
     """Rows of the first case."""
-    rounds = simulate("driving", "fog", "paper", 1, 3, 100)
+    rounds = begun(simulate("driving", "fog", "paper", 1, 3, 100), STEPS)
     engines = {
         "importance": (toy, InferenceOptions("importance", options.draws)),
         "svi": (toy, InferenceOptions("svi", options.draws)),
-        "nuts": (toy, InferenceOptions("nuts", options.draws, NUTSOptions(300))),
+        "nuts": (toy, InferenceOptions("nuts", options.draws // 5, NUTSOptions(60))),
         "svi, own model()": (own_program, InferenceOptions("svi", options.draws)),
         "nuts, own model()": (
             own_program,
-            InferenceOptions("nuts", options.draws // 4, NUTSOptions(100)),
+            InferenceOptions("nuts", options.draws // 5, NUTSOptions(60)),
         ),
     }
-    for change in CHANGES:
+    for change in options.changes:
         exact = exact_mean(change, rounds, self_model)
         for name, (kind, engine) in engines.items():
             start = perf_counter()
@@ -172,7 +191,7 @@ def _standard_error(draws: Tensor) -> float:
 
 def questionnaires(options: Options, self_model: SelfModel) -> Iterator[dict]:
     """Rows of the second case: the smallest and the largest of the people's medians."""
-    rounds = simulate("driving", "fog", "paper", options.people, 20, 100)
+    rounds = simulate("driving", "fog", "paper", options.people, options.rounds, 100)
     engines = {
         "importance": InferenceOptions("importance", options.draws),
         "svi": InferenceOptions("svi", options.draws),
@@ -198,10 +217,14 @@ def main() -> None:
     """Run the benchmark."""
     options = tyro.cli(Options, description=__doc__)
     self_model = load_self_model(shipped_weights("driving"))[0]
-    table = pd.DataFrame([*toys(options, self_model), *questionnaires(options, self_model)])
-    print(table.to_string(index=False, float_format=lambda value: f"{value:.3f}"))
-    if options.output is not None:
-        table.to_csv(options.output, index=False, float_format="%.4f")
+    rows = []
+    asked = questionnaires(options, self_model) if options.people else ()
+    for row in chain(toys(options, self_model), asked):
+        numbers = {n: f"{v:.3f}" for n, v in row.items() if isinstance(v, float)}
+        print({**row, **numbers}, flush=True)
+        rows.append(row)
+        if options.output is not None:
+            pd.DataFrame(rows).to_csv(options.output, index=False, float_format="%.4f")
 
 
 if __name__ == "__main__":
