@@ -3,9 +3,9 @@
 import sys
 from collections.abc import Sequence
 
-from mirror_ppl import __version__
 from mirror_ppl.console import guarded
 from mirror_ppl.errors import OptionError
+from mirror_ppl.version import __version__
 
 PROGRAM = "python -m mirror_ppl"
 

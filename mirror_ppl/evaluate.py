@@ -211,7 +211,7 @@ def _origin(options: Options) -> dict[str, Any]:
 
     import torch
 
-    from mirror_ppl import __version__
+    from mirror_ppl.version import __version__
 
     return {
         "command": _command(options),

@@ -1,17 +1,16 @@
 """Human models with all that Pyro counts besides the sites of the package's own."""
 
 import sys
-from pathlib import Path
 
 import pyro
 import pyro.distributions as dist
 import torch
+from paths import EXAMPLES
 from pyro import poutine
 
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.variants import VARIANTS
 
-EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
 sys.path.insert(0, str(EXAMPLES))
 from distracted import DistractedPerson  # noqa: E402
 from late_reactions import LatePerson  # noqa: E402

@@ -15,7 +15,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from mirror_ppl import __version__
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.evaluation.assistance import (
@@ -34,6 +33,7 @@ from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.version import __version__
 from mirror_ppl.workers import run_tasks
 
 

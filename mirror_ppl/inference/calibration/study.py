@@ -28,7 +28,6 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from mirror_ppl import __version__
 from mirror_ppl.checks import whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
@@ -42,6 +41,7 @@ from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.netcdf import read_netcdf
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.version import __version__
 from mirror_ppl.workers import run_tasks
 
 PRIOR_PEOPLE = 4000

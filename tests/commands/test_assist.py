@@ -1,9 +1,9 @@
 """`python -m mirror_ppl.assist`: what it writes and prints and refuses, and that it resumes."""
 
 import json
-from pathlib import Path
 
 import pytest
+from paths import EXAMPLES
 from running import command
 
 from mirror_ppl import assist, fit
@@ -271,7 +271,7 @@ def test_outputs_that_would_overwrite_are_refused(posterior, tmp_path, capsys):
 def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     posterior, tmp_path, capsys
 ):
-    example = Path(__file__).parents[1] / "docs" / "examples" / "late_reactions.py"
+    example = EXAMPLES / "late_reactions.py"
     late = ("--human-model", f"{example}:LatePerson")
     demos = ("--demos", posterior.parents[1] / "some.nc")
     small = ("--steps", "3", "--draws", "6", "--out", tmp_path)
