@@ -58,6 +58,7 @@ def test_simulated_actions_have_the_probabilities_of_the_program(world, setting,
         program = poutine.condition(human.model, data=sites)
         trace = poutine.trace(program).get_trace(rounds)
     limit = norm.isf(ERROR / 2 / (STEPS * len(human.domain.actions)))
+    surprise, variance = 0.0, 0.0
     for step in range(rounds.shape[2]):
         real = rounds.mask[:, 0, step]
         expected = trace.nodes[f"action_{step}"]["fn"].probs[:, 0][real].double()
@@ -66,6 +67,12 @@ def test_simulated_actions_have_the_probabilities_of_the_program(world, setting,
         # Normal as long as there are enough of each.
         enough = error > 3
         assert ((done - expected).sum(0).abs() < limit * error)[enough].all(), step
+        log = expected.clamp(min=1e-30).log()
+        mean = (expected * log).sum(-1)
+        surprise += ((done * log).sum(-1) - mean).sum()
+        variance += ((expected * log.square()).sum(-1) - mean.square()).sum()
+    # And they are as probable as draws from these are, which tells how strictly people choose.
+    assert abs(surprise) < limit * variance.sqrt()
 
 
 @pytest.mark.parametrize(("world", "setting", "name"), FORWARD_WORLDS)
