@@ -120,5 +120,5 @@ class _ValuesAlone(TorchFunctionMode):
         if func in FROM_SHAPE_OF_FIRST:
             args = (detach_provenance(args[0]), *args[1:])
         elif func in FROM_SHAPE_OF_OTHERS:
-            args = (args[0], *detach_provenance(args[1:]))
+            args = (args[0], *map(detach_provenance, args[1:]))
         return func(*args, **(kwargs or {}))

@@ -37,7 +37,7 @@ RESIDUAL = {"residual_in", "residual_out"}
 CHOICE = {"consistency", "lapse"}
 TERMINALS = tuple(f"notices_terminal {number}" for number in range(1, 7))
 RULES = {"rule_type_a", "rule_type_b"}
-SEARCH = {"quickness", "evenness"}
+SEARCH = {"notice_mean", "notice_concentration"}
 FOUND = {f"found_{stage}": set(TERMINALS) for stage in range(3)}
 """What each latent of rounds depends on."""
 PARENTS = {
@@ -119,7 +119,7 @@ class Everything(ToyHuman):
         doubled = pyro.deterministic("doubled", 2 * rate)
         with pyro.poutine.scale(scale=1 + reach):
             pyro.sample("scaled", dist.Normal(0.0, 1.0))
-        with pyro.poutine.mask(mask=reach > 1):
+        with pyro.poutine.mask(mask=reach > 1):  # pyright: ignore[reportArgumentType]
             pyro.sample("masked", dist.Normal(0.0, 1.0))
         pyro.sample("child", dist.Normal(doubled, 1.0))
         pyro.sample("indexed", dist.Normal(torch.arange(9.0)[reach], 1.0))

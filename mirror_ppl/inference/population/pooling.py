@@ -3,7 +3,7 @@
 The population is a Pyro program above the human model. Every site of one number a person gets
 hyper-parameters, unless its prior depends on other sites already (how soon each terminal is
 noticed, given the person's mean over terminals) or is knowledge of the world
-(`HumanModel.of_the_world`); the others, and weights of the residual, keep their prior::
+(`WorldKnowledge.world_sites`); the others, and weights of the residual, keep their prior::
 
     concentration_d ~ LogNormal(log(n_d), 1)      discrete site d, of n_d values: large where
     chances_d  ~ Dirichlet(concentration_d p_d)     people differ as much as its prior p_d says
@@ -42,6 +42,7 @@ from mirror_ppl.inference.population.sampler import (
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
+from mirror_ppl.models.world_knowledge import world_sites
 from mirror_ppl.progress import Report, silent
 
 POOLINGS = ("none", "partial")
@@ -112,7 +113,7 @@ class Pooling:
         nodes = {
             name: node
             for name, node in nodes.items()
-            if name not in human.of_the_world and not parents[name]
+            if name not in world_sites(human) and not parents[name]
         }
         self.sites = {name: site for name, site in scalar_sites(human).items() if name in nodes}
         drawn = unconstrained(self.sites, values_of(nodes), PRIOR_DRAWS)
