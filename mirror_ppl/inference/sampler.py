@@ -209,7 +209,7 @@ class Sampler:
     def add_prior_draws(self, policy: Draws, joint: Tensor) -> None:
         """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
         place = unconstrained(self.sites, policy, len(joint))
-        # All of it is given: priors may hang on any of these sites.
+        # All of it is given: priors may depend on any of these sites.
         own = (*self.sites, *self.supports)
         _, log_priors = _completed(self.human, self.table, policy, len(joint), own)
         self._add(policy, joint, place, log_priors)

@@ -27,7 +27,7 @@ def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
 
     Raises:
         HumanModelError: spans are not as :meth:`HumanModel.spans` says: they overlap, a site is
-            read outside of its span, values that are said to be alike are not, or the distribution
+            read outside of its span, values that are said to show the same do not, or the distribution
             of a site depends on another one.
     """
     domain = human.domain

@@ -159,7 +159,7 @@ class ViewTableBuilder:
             attended = self._proposal.values(
                 self._weights(),
                 seed,
-                {name: fact.view(1, 1) for name, fact in self.human.covariates(so_far).items()},
+                {name: value.view(1, 1) for name, value in self.human.covariates(so_far).items()},
                 self.human.log_proposal(so_far, actions[0, real]),
             )
             each = len(attended)
@@ -280,9 +280,9 @@ class ViewTableBuilder:
             log_kept=_stacked([one.log_kept for one in attended], torch.inf),
             sights=torch.cat([pad(part, [0, most - part.shape[1]]) for part in sights])[None],
             rounds=torch.cat(rounds).to(self.alive.device)[None],
-            facts={
-                name: torch.cat([one.facts[name] for one in attended], 1)
-                for name in attended[0].facts
+            covariates={
+                name: torch.cat([one.covariates[name] for one in attended], 1)
+                for name in attended[0].covariates
             },
         )
 
@@ -302,7 +302,7 @@ class ViewTableBuilder:
 
     @cached_property
     def fixed_prior(self) -> Tensor | None:
-        """Log prior ``[M]`` of each combination; ``None`` if it hangs on the other implants."""
+        """Log prior ``[M]`` of each combination; ``None`` if it depends on the other implants."""
         return fixed_prior(self.human, self.grid)
 
     @cached_property
@@ -341,7 +341,7 @@ class ViewTableBuilder:
         with self._deciding(self.draw_ways()):
             implants = self.human.prior()
             chances = log_weighted_latents(
-                self.human, implants, values, attended.log_weights[None, None], attended.facts
+                self.human, implants, values, attended.log_weights[None, None], attended.covariates
             )
         return likelihoods + chances[:, 0]
 

@@ -121,10 +121,10 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         notice_concentration = pyro.sample(
             NOTICE_CONCENTRATION, dist.LogNormal(median.log(), spread)
         )
-        alike = (notice_concentration * notice_mean, notice_concentration * (1 - notice_mean))
+        shape = (notice_concentration * notice_mean, notice_concentration * (1 - notice_mean))
         return (
             {NOTICE_MEAN: notice_mean, NOTICE_CONCENTRATION: notice_concentration}
-            | implant_priors.notice_implants(self.domain, like, *alike)
+            | implant_priors.notice_implants(self.domain, like, *shape)
             | {READS: pyro.sample(READS, dist.Categorical(like.new_full((2,), 0.5)))}
         )
 

@@ -89,7 +89,7 @@ def by_combination(human, rounds, draws):
         heard = {name: mask[:, :steps] for name, mask in told.items()}
         stage = seen["ego"][0, :, 0]
         lengths = [int((stage == number).sum()) for number in range(3)]
-        facts = {
+        covariates = {
             name: fact.view(1, 1)
             for name, fact in human.covariates(
                 {name: value[0] for name, value in seen.items()}
@@ -99,7 +99,7 @@ def by_combination(human, rounds, draws):
         for guess, *found in product((0, 1), *(range(length + 1) for length in lengths)):
             chance = torch.full((number,), 0.5).log()
             for place, (time, length) in enumerate(zip(found, lengths, strict=True)):
-                terminal = 1 + int(facts[f"sought_{place}"])
+                terminal = 1 + int(covariates[f"sought_{place}"])
                 p = draws[f"notices_terminal {terminal}"].flatten()
                 if time < length:
                     chance = chance + p.log()
@@ -232,7 +232,7 @@ def test_the_sum_has_the_gradient_of_its_differences(defuser):
 
 def looked_for(table, terminal):
     """Whether a terminal is lit in the first round."""
-    return int(table.attention.facts["sought_0"][0, 0]) == terminal - 1
+    return int(table.attention.covariates["sought_0"][0, 0]) == terminal - 1
 
 
 def test_somebody_without_rounds_has_a_table(defuser):

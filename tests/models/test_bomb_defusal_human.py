@@ -76,14 +76,14 @@ def test_it_is_the_package_s_own_model_of_bomb_defusal(defuser):
 
 def test_what_is_looked_for_is_known_of_the_stages_that_were_reached(defuser):
     observation, states = course([WAIT, 1, 2, WAIT], rounds=5)
-    facts = defuser.covariates(observation)
+    covariates = defuser.covariates(observation)
     for stage in range(3):
-        assert torch.equal(facts[f"sought_{stage}"], states[0].live[:, stage])
+        assert torch.equal(covariates[f"sought_{stage}"], states[0].live[:, stage])
     # Of later stages it is taken to be as at the last one.
     early = {name: value[:, :3] for name, value in observation.items()}
-    facts = defuser.covariates(early)
-    assert torch.equal(facts["sought_1"], states[0].live[:, 1])
-    assert torch.equal(facts["sought_2"], states[0].live[:, 1])
+    covariates = defuser.covariates(early)
+    assert torch.equal(covariates["sought_1"], states[0].live[:, 1])
+    assert torch.equal(covariates["sought_2"], states[0].live[:, 1])
 
 
 def test_terminals_share_a_mean_as_far_as_they_are_alike(defuser):
@@ -104,11 +104,11 @@ def test_terminals_share_a_mean_as_far_as_they_are_alike(defuser):
 
 
 def test_finding_is_geometric_with_the_probability_of_what_is_looked_for(defuser):
-    """By the facts of the round: 0.1 of terminal 1, 0.5 of terminal 2."""
+    """By the covariates of the round: 0.1 of terminal 1, 0.5 of terminal 2."""
     some = implants(defuser, **{"notices_terminal 1": 0.1, "notices_terminal 2": 0.5})
     ways = {name: value[None] for name, value in some.items()}
-    facts = {f"sought_{stage}": torch.tensor([[stage % 2]]) for stage in range(3)}
-    found = site_probabilities(defuser, ways, facts=facts)
+    covariates = {f"sought_{stage}": torch.tensor([[stage % 2]]) for stage in range(3)}
+    found = site_probabilities(defuser, ways, covariates=covariates)
     for stage, p in enumerate((0.1, 0.5, 0.1)):
         expected = p * (1 - p) ** torch.arange(60.0)
         torch.testing.assert_close(found[f"found_{stage}"][:60], expected, rtol=1e-4, atol=1e-7)
@@ -250,11 +250,11 @@ def test_what_was_done_tells_when_it_was_found(defuser):
     later = found["found_1"]
     assert later[3:].tolist() == [0.0] * 58 and (later[:2] < 0).all()
     proposal = Proposal(defuser, *(2 * [{n: v[None] for n, v in implants(defuser).items()}]), 64)
-    facts = {name: fact.view(1, 1) for name, fact in defuser.covariates(observation).items()}
-    chosen = proposal.values(None, 0, facts, found)
+    covariates = {name: value.view(1, 1) for name, value in defuser.covariates(observation).items()}
+    chosen = proposal.values(None, 0, covariates, found)
     weights = torch.bincount(chosen.values["found_0"], minlength=61)
     assert int(weights.argmax()) == 4
-    assert chosen.facts.keys() == facts.keys()
+    assert chosen.covariates.keys() == covariates.keys()
 
 
 def test_who_is_in_a_round_has_not_found_what_they_wait_for(defuser):

@@ -1,4 +1,4 @@
-"""Partial pooling: people are alike, and how alike is inferred with them.
+"""Partial pooling: a hierarchical prior, inferred together with the people.
 
 The population is a Pyro program above the human model. Every site of one number a person gets
 hyper-parameters, unless its prior depends on other sites already (how soon each terminal is
@@ -140,8 +140,8 @@ class Pooling:
         chances = {}
         for name, prior in self.prior_chances.items():
             size = prior.new_tensor(float(len(prior)))
-            alike = dist.LogNormal(size.log(), torch.full_like(size, CONCENTRATION_WIDTH))
-            concentration = pyro.sample(f"{name}_concentration", alike)
+            prior_of = dist.LogNormal(size.log(), torch.full_like(size, CONCENTRATION_WIDTH))
+            concentration = pyro.sample(f"{name}_concentration", prior_of)
             chances[name] = pyro.sample(f"{name}_chances", dist.Dirichlet(concentration * prior))
         mean, spread = {}, {}
         for name, centre, width in zip(self.sites, self.centre, self.width, strict=True):
