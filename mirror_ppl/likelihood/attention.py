@@ -89,7 +89,7 @@ def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[s
 
 def site_probabilities(
     human: HumanModel,
-    ways: Mapping[str, Tensor],
+    policies: Mapping[str, Tensor],
     weights: Tensor | None = None,
     covariates: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:
@@ -97,16 +97,16 @@ def site_probabilities(
 
     Args:
         human: the model of people.
-        ways: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
+        policies: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
         weights: of each of them ``[W]``; alike unless given.
         covariates: of the round, see `HumanModel.covariates`.
     """
-    number = len(next(iter(ways.values())))
+    number = len(next(iter(policies.values())))
     with (
         torch.random.fork_rng(devices=[]),
         poutine.block(),
-        poutine.condition(data=dict(ways)),
-        pyro.plate("way", number, dim=-3),
+        poutine.condition(data=dict(policies)),
+        pyro.plate("policy", number, dim=-3),
         pyro.plate("person", 1, dim=-2),
     ):
         torch.manual_seed(0)

@@ -34,7 +34,7 @@ def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
 
 
 @dataclass(frozen=True)
-class Alike:
+class EquivalentCombinations:
     """G sets of C combinations of one person.
 
     Attributes:
@@ -55,7 +55,7 @@ class Alike:
     end: Tensor
 
     @classmethod
-    def of(cls, table: ViewTable, log_prior: Tensor | None) -> Alike:
+    def of(cls, table: ViewTable, log_prior: Tensor | None) -> EquivalentCombinations:
         """Of the possible combinations of a table of one person.
 
         Args:
@@ -88,7 +88,7 @@ class Alike:
     def __len__(self) -> int:
         return len(self.first)
 
-    def kept(self, sets: Tensor) -> Alike:
+    def kept(self, sets: Tensor) -> EquivalentCombinations:
         """Only some sets ``[G]``, as truth values."""
         some = sets.repeat_interleave(self.sizes)
         chance = self.share.diff(prepend=self.share.new_zeros(1))

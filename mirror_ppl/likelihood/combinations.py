@@ -156,7 +156,7 @@ def log_priors(
 
 
 def _log_prior(node: Any, value: Tensor) -> Tensor:
-    """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 where all draws have the same."""
+    """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 if draws do not differ."""
     fn = node["fn"]
     plain = node["mask"] is None and isinstance(node["scale"], (int, float))
     if len(fn.batch_shape) > BATCH or not plain:  # depends on other discrete sites, perhaps

@@ -27,8 +27,8 @@ def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
 
     Raises:
         HumanModelError: spans are not as :meth:`HumanModel.spans` says: they overlap, a site is
-            read outside of its span, values that are said to show the same do not, or the distribution
-            of a site depends on another one.
+            read outside of its span, values that are said to show the same do not, or a site
+            depends on another one.
     """
     domain = human.domain
     device = next(human.parameters()).device

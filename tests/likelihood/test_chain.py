@@ -202,11 +202,11 @@ def test_what_is_given_up_changes_nothing_of_the_rest(defuser):
 
 def test_screening_counts_what_the_table_does(defuser):
     """Ways are scored as the table of the same rounds has it, without merging moments."""
-    builder = ViewTableBuilder(defuser, Screening(margin=1e6, ways=3, resolution=0))
+    builder = ViewTableBuilder(defuser, Screening(margin=1e6, policies=3, resolution=0))
     for one_round in rounds_of(recorded(), 0):
         builder.add(*one_round)
     table = builder.table()
-    policy = {name: value for name, value in builder.ways.items() if name not in table.sites}
+    policy = {name: value for name, value in builder.policies.items() if name not in table.sites}
     joints = log_joints(defuser, table, policy)[:, 0]
     torch.testing.assert_close(builder.score + builder.log_prior, joints)
 
