@@ -269,7 +269,7 @@ for name in names:
     files.append(read_fit(Path(folder.name, name, "posterior.nc"), "heldout"))
 folder.cleanup()
 comparison = compare_fits(files, names, "heldout")
-plot_comparison(comparison)
+plot_comparison(comparison.table())
 
 # %% [markdown]
 # What these people *see* is what sets them apart from the robot. Without it, no policy implant
