@@ -37,7 +37,7 @@ from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
 from mirror_ppl.inference.margins import PriorMargins, prior_knots
 from mirror_ppl.inference.sampler import Sampler, Weighted
-from mirror_ppl.likelihood.combination_sets import Alike
+from mirror_ppl.likelihood.combination_sets import EquivalentCombinations
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
@@ -77,7 +77,7 @@ class AmortizedOptions:
 
 def guide_screening() -> Screening:
     """The screening that an amortized guide needs: its ways are what the network reads."""
-    return Screening(ways=WAYS)
+    return Screening(policies=WAYS)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Evidence:
 
     Attributes:
         log_evidence: of each way ``[W]``.
-        alike: combinations of what the person sees, those still possible.
+        combinations: of what the person sees, those still possible.
         joint: log joint of these G sets under each way, ``[W, G]``.
         ways: the ways, draws ``[W, 1, 1, ...]`` of the sites that perception does not read.
         table: views of the rounds.
@@ -94,7 +94,7 @@ class Evidence:
     """
 
     log_evidence: Tensor
-    alike: Alike
+    combinations: EquivalentCombinations
     joint: Tensor
     ways: dict[str, Tensor]
     table: ViewTable
@@ -110,11 +110,13 @@ def log_evidence(builder: ViewTableBuilder) -> Tensor:
 def evidence_of(builder: ViewTableBuilder) -> Evidence:
     """What a person's rounds so far say."""
     table = builder.table()
-    alike = Alike.of(table, builder.fixed_prior)
-    prior = alike.log_prior if alike.fixed else builder.log_prior[:, alike.first]
-    joint = builder.score[:, alike.first] + prior
-    ways = {name: way for name, way in builder.ways.items() if name not in table.sites}
-    return Evidence(joint.logsumexp(-1), alike, joint, ways, table, int(table.steps.sum()))
+    combinations = EquivalentCombinations.of(table, builder.fixed_prior)
+    prior = (
+        combinations.log_prior if combinations.fixed else builder.log_prior[:, combinations.first]
+    )
+    joint = builder.score[:, combinations.first] + prior
+    ways = {name: way for name, way in builder.policies.items() if name not in table.sites}
+    return Evidence(joint.logsumexp(-1), combinations, joint, ways, table, int(table.steps.sum()))
 
 
 class AmortizedGuide(nn.Module):
@@ -220,8 +222,8 @@ class AmortizedGuide(nn.Module):
 
 def reference_places(human: HumanModel, number: int = WAYS) -> Tensor:
     """Places ``[W, D]`` of ways from the prior; always the same of a human model."""
-    builder = ViewTableBuilder(human, Screening(ways=number))
-    return unconstrained(scalar_sites(human), builder.draw_ways())
+    builder = ViewTableBuilder(human, Screening(policies=number))
+    return unconstrained(scalar_sites(human), builder.draw_policies())
 
 
 def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:
@@ -256,7 +258,7 @@ def sample_amortized(
     """
     options = options or AmortizedOptions()
     evidence = evidence_of(builder)
-    sampler = Sampler(human, evidence.table, evidence.alike, sites)
+    sampler = Sampler(human, evidence.table, evidence.combinations, sites)
     sampler.add_prior_draws(evidence.ways, evidence.joint)
     sampler.prune(options.prune_margin)
     steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
