@@ -125,7 +125,7 @@ def test_the_command_refuses_it_in_one_line(capsys):
 def test_the_command_refines(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     some = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    save_demonstrations(some.select_people([0]).select_rounds([0, 1]), tmp_path / "one.nc")
+    save_demonstrations("one.nc", some.select_people([0]).select_rounds([0, 1]))
     given = ("--demos", "one.nc", "--train-rounds", 1, "--draws", 4, "--explore", 0)
     assert command(fit, *given, "--refine", 2) == 0
     assert not list(tmp_path.glob("**/*checkpoint*"))
