@@ -180,7 +180,7 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
 def _described(options: Options, settings: Any, quality: dict[str, float], measured: str) -> dict:
     import torch
 
-    from mirror_ppl import __version__
+    from mirror_ppl.version import __version__
 
     return {
         "command": _command(options),

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mirror_ppl import __version__
 from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
@@ -33,6 +32,7 @@ from mirror_ppl.models.measured import require_measurable
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.version import __version__
 
 ENGINES: Mapping[str, Engine] = {
     engine.name: engine

@@ -1,8 +1,8 @@
 """The map from standard normal numbers to a prior's margins, as a guide reads and proposes them.
 
-Some sites of a prior have long tails in unconstrained space (the probability of noticing a
-terminal, say, whose logit is sometimes -40). No mixture of a few Gaussians is near them, but each
-is a standard normal number, stretched: piecewise linearly, between quantiles of prior draws.
+Some sites of a prior have long tails in unconstrained space: the logit of the probability of
+noticing a terminal is sometimes -40. No mixture of a few Gaussians is near such a prior. Each of
+its margins is a standard normal number, mapped piecewise linearly between quantiles of draws.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class PriorMargins(Transform):
     """From ``[..., D]`` standard normal numbers to places in unconstrained space.
 
     Args:
-        knots: of each dimension, increasing, ``[D, K]``; beyond them the outer slopes go on.
+        knots: of each dimension, increasing, ``[D, K]``. The first and last slopes go on beyond
+            them.
     """
 
     bijective = True

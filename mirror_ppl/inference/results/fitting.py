@@ -8,7 +8,6 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mirror_ppl import __version__
 from mirror_ppl.checks import as_path, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
@@ -24,6 +23,7 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.version import __version__
 
 if TYPE_CHECKING:
     import arviz as az

@@ -87,7 +87,7 @@ def test_places_are_apart():
     assert there.mirror is None
 
 
-def test_few_rounds_of_mirror_are_against_the_most_of_rivals():
+def test_few_rounds_of_mirror_are_against_the_most_of_baselines():
     rows = [
         row("mirror", 2, nll=0.2),
         row("mirror", 1, nll=0.25),
@@ -96,7 +96,7 @@ def test_few_rounds_of_mirror_are_against_the_most_of_rivals():
         row("logistic", 20, nll=0.0),
     ]
     (claim,) = few_against_many(rows, "nll", -1)
-    assert (claim.rounds, claim.rival, claim.rival_rounds) == (1, "bc", 20)
+    assert (claim.rounds, claim.baseline, claim.baseline_rounds) == (1, "bc", 20)
     assert claim.paired.ahead.mean == pytest.approx(0.1)
 
 

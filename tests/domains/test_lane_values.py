@@ -3,12 +3,12 @@
 import itertools
 import math
 import re
-from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from paths import DOCS
 
 from mirror_ppl.domains.base import total_reward
 from mirror_ppl.domains.driving import (
@@ -21,7 +21,7 @@ from mirror_ppl.domains.driving import (
 )
 from mirror_ppl.domains.lane_values import action_values
 
-PAGE = Path(__file__).parents[1] / "docs" / "driving.md"
+PAGE = DOCS / "driving.md"
 DOMAIN = Driving()
 
 small = st.integers(-9, 9)

@@ -2,13 +2,13 @@
 
 import itertools
 import math
-from pathlib import Path
 
 import pyro
 import pyro.distributions as dist
 import pytest
 import torch
 from example_course import gone_through
+from paths import EXAMPLES
 from test_views import ragged
 
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, RoundSoFar, Standing
@@ -419,7 +419,7 @@ def test_rounds_that_come_in_are_those_that_were_there(self_model, recordings):
 
 
 def example(self_model):
-    path = Path(__file__).parents[1] / "docs" / "examples" / "distracted.py"
+    path = EXAMPLES / "distracted.py"
     return load_human_model(f"{path}:DistractedPerson", self_model)
 
 

@@ -1,6 +1,6 @@
-"""The search for the settings of the rivals: which suit each domain.
+"""The search for the settings of the baselines: which suit each domain.
 
-    python -m benchmarks.rivals
+    python -m benchmarks.baselines
 
 In each domain, whatever people see, ten simulated people of other seeds than those of the
 comparisons are learned from 5 and 20 rounds. One option after another is varied, the others being

@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex
 from scipy.stats import binom
 from test_ranks import RARELY, gaussian, judged
 
-from mirror_ppl.inference.calibration.ranks import LEVELS, collect
+from mirror_ppl.inference.calibration.ranks import LEVELS, collect, join_rounds
 from mirror_ppl.inference.calibration.uniformity import ecdf_band, rank_edges
 from mirror_ppl.plots.calibration import plot_coverage, plot_ecdf, plot_ranks
 from mirror_ppl.plots.reading import BLUE, ORANGE
@@ -21,12 +21,12 @@ ODD = r"$\no$"
 @pytest.fixture
 def half_wrong(rng):
     """Right posteriors but for the second site after nine rounds."""
-    parts = {1: [judged(rng, 400, sites=(ODD, "y"))], 9: [judged(rng, 400, sites=(ODD, "y"))]}
+    parts = {number: judged(rng, 400, sites=(ODD, "y")) for number in (1, 9)}
     narrow = judged(rng, 400, width=0.5, sites=("y",))
     for name in ("rank", "place"):
-        parts[9][0][name][1] = narrow[name][0]
+        parts[9][name][1] = narrow[name][0]
     prior = {site: rng.normal(size=4000) for site in (ODD, "y")}
-    return replace(collect(parts, prior, (), {}), failure_rate=RARELY)
+    return replace(collect([join_rounds(parts)], prior, (), {}), failure_rate=RARELY)
 
 
 def grids(figure, number):

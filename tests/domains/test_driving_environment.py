@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -14,6 +13,7 @@ import pytest
 import torch
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
+from paths import DOCS
 
 import mirror_ppl  # noqa: F401  registers the environment
 from mirror_ppl.domains.driving import Driving, DrivingState
@@ -21,7 +21,7 @@ from mirror_ppl.domains.driving_environment import DrivingEnv
 from mirror_ppl.errors import UnknownNameError
 
 NAME = "mirror_ppl/Driving-v0"
-PAGE = Path(__file__).parents[1] / "docs" / "driving.md"
+PAGE = DOCS / "driving.md"
 SETTINGS = Driving.settings
 
 

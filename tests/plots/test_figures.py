@@ -7,6 +7,7 @@ import arviz as az
 import numpy as np
 import pytest
 import xarray as xr
+from paths import ROOT
 
 from mirror_ppl.errors import DemonstrationsError, OutputError, UnknownNameError
 from mirror_ppl.plots.driving import (
@@ -422,3 +423,9 @@ def test_predictive_check_draws(data):
 def test_unknown_person(data, call):
     with pytest.raises(UnknownNameError, match='unknown person "anne"; known: anna, ben; .*"anna"'):
         call(data, "anne")
+
+
+def test_figures_import_nothing_of_what_calls_them():
+    """They are functions of data: evaluation and commands call them."""
+    for path in (ROOT / "mirror_ppl" / "plots").glob("*.py"):
+        assert "from mirror_ppl.evaluation" not in path.read_text(), path

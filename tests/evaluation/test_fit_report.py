@@ -59,13 +59,15 @@ def test_what_is_not_to_be_trusted_is_told(capsys):
         capsys, people=doubtful
     )
     few = [person(1) | {"effective_draws": 30}, person(2) | {"effective_draws": 19}]
-    assert "fewer than 20 draws count of person-02" in shown(capsys, people=few)
+    assert "Fewer than 20 effective draws under the population for person-02" in shown(
+        capsys, people=few
+    )
     few[1]["rounds"] = 0  # who did nothing is not at odds with it
-    assert "draws count" not in shown(capsys, people=few)
+    assert "effective draws" not in shown(capsys, people=few)
     assert "relied on" not in shown(capsys)
 
 
-def test_what_is_open_is_told_and_which_rounds_would_tell(capsys):
+def test_posterior_entropy_and_the_most_informative_scenario_are_printed(capsys):
     def opened(entropy, expected):
         return {
             "open": {"together": entropy},
@@ -78,16 +80,16 @@ def test_what_is_open_is_told_and_which_rounds_would_tell(capsys):
         person(2) | {"identifiability": opened(2.0, 0.4)},
     ]
     out = shown(capsys, people=people)
-    assert "Open about what they see: 1.50 nats on average, of which 0.50 hang on" in out
-    assert 'a round more of "two cars" would tell most, 0.20' in out
+    assert "perceptual implants: 1.50 nats on average (0.50 shared with the policy implants)" in out
+    assert 'scenario: "two cars" (expected information gain 0.20 nats)' in out
 
     people[0]["identifiability"] = opened(0.006, 0.0)
     people[1]["identifiability"] = opened(0.001, 0.0)
-    assert "Open about what they see: 0.00 nats on average" in shown(capsys, people=people)
+    assert "perceptual implants: 0.00 nats on average" in shown(capsys, people=people)
     for one in people:
         one["identifiability"] = opened(0.5, 0.0)
         one["identifiability"]["scenarios"]["one car"]["expected"] = 0.004
-    assert "would tell most" not in shown(capsys, people=people)
+    assert "informative" not in shown(capsys, people=people)
 
 
 def test_people_who_notice_things_have_no_reach(capsys):
@@ -96,7 +98,7 @@ def test_people_who_notice_things_have_no_reach(capsys):
     nothing = {"together": 0.0}
     some["identifiability"] = {"open": nothing, "hangs_on_policy": nothing, "scenarios": {}}
     out = shown(capsys, people=[some])
-    assert "Nothing is open about what they see, but for how soon they notice things" in out
+    assert "perceptual implants: none, not counting how soon they notice things" in out
     assert "What each person notices (probability at a step) and" in shown(capsys, people=[some])
     assert "What each person sees (cells) and" in shown(capsys)
 

@@ -1,15 +1,15 @@
 """Notebooks: they run from top to bottom, match their paired scripts, and hold their outputs."""
 
 import re
-from pathlib import Path
 
 import jupytext
 import matplotlib
 import nbformat
 import pytest
 from nbclient import NotebookClient
+from paths import ROOT
 
-FOLDER = Path(__file__).parents[1] / "notebooks"
+FOLDER = ROOT / "notebooks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
 LARGEST = 2_000_000
 """Bytes that a notebook may have, with its outputs."""

@@ -1,10 +1,10 @@
 """`python -m mirror_ppl.assist`: what it writes and prints and refuses, and that it resumes."""
 
 import json
-from pathlib import Path
 
 import pytest
-from running import command
+from paths import EXAMPLES
+from running import command, command_on_cluster
 
 from mirror_ppl import assist, fit
 from mirror_ppl.arviz import az
@@ -121,6 +121,17 @@ def test_alone_or_among_others_a_communicator_plays_the_same(posterior, done, tm
     assert alone["random"]["net_by_person"] == among["net_by_person"][:1]
 
 
+@pytest.mark.slow
+def test_a_cluster_plays_the_same(posterior, done, tmp_path):
+    chosen = ("--communicator", "mirror", "random", "--json", tmp_path / "a.json")
+    run = command_on_cluster(tmp_path, assist, "--posterior", posterior, *SMALL, *chosen)
+    assert run.returncode == 0, run.stderr
+    there = results_of(tmp_path / "a.json")["communicators"]
+    here = results_of(done / "a.json")["communicators"]
+    for name in ("mirror", "random"):
+        assert there[name]["net_by_person"] == here[name]["net_by_person"]
+
+
 # --- resuming ---------------------------------------------------------------------------------
 
 
@@ -155,13 +166,22 @@ def test_a_stopped_run_goes_on_where_it_was(posterior, tmp_path, monkeypatch):
     )
 
 
-def test_parts_of_something_else_are_not_used(posterior, tmp_path, monkeypatch):
+def test_damaged_parts_are_played_anew(posterior, tmp_path, monkeypatch):
     args = ("--posterior", posterior, *SMALL, "--communicator", "none")
     outputs = ("--json", tmp_path / "a.json")
-    parts = tmp_path / ".a.json.parts"
-    parts.mkdir()
-    (parts / "none-0.json").write_text("{")
-    (parts / "none-1.json").write_text('{"identity": "of another run", "played": {}}')
+
+    def stops(*args):
+        raise Stopped
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mirror_ppl.evaluation.assistance_summary.summarize_assistance", stops)
+        with pytest.raises(Stopped):
+            command(assist, *args, *outputs)
+    parts = sorted((tmp_path / ".a.json.parts").iterdir())
+    assert len(parts) == 2
+    parts[0].write_text("{")
+    whole = json.loads(parts[1].read_text())
+    parts[1].write_text(json.dumps(whole | {"result": {"none": {"task": [1.0]}}}))
     assert command(assist, *args, *outputs) == 0
     assert results_of(tmp_path / "a.json")["communicators"]["none"]["cost"] == 0
     assert content(tmp_path) == ["a.json"]
@@ -271,7 +291,7 @@ def test_outputs_that_would_overwrite_are_refused(posterior, tmp_path, capsys):
 def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     posterior, tmp_path, capsys
 ):
-    example = Path(__file__).parents[1] / "docs" / "examples" / "late_reactions.py"
+    example = EXAMPLES / "late_reactions.py"
     late = ("--human-model", f"{example}:LatePerson")
     demos = ("--demos", posterior.parents[1] / "some.nc")
     small = ("--steps", "3", "--draws", "6", "--out", tmp_path)

@@ -5,7 +5,6 @@ import re
 import shlex
 from collections import defaultdict
 from dataclasses import asdict
-from pathlib import Path
 
 import pyro
 import pyro.distributions as dist
@@ -13,6 +12,7 @@ import pytest
 import torch
 import tyro
 from example_course import gone_through
+from paths import ROOT
 from pyro import poutine
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
@@ -40,7 +40,6 @@ from mirror_ppl.people import PEOPLE
 from mirror_ppl.training import views as training_views
 from mirror_ppl.training.self_model import SelfModelOptions
 
-ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 EXAMPLE = "docs/examples/late_reactions.py:LatePerson"
 

@@ -2,7 +2,7 @@
 
 import pytest
 from PIL import Image
-from running import command
+from running import command, command_on_cluster
 
 from mirror_ppl import calibrate
 from mirror_ppl.inference.calibration.study import Calibration
@@ -48,7 +48,7 @@ def test_it_tells_and_writes_what_it_found(small, tmp_path, capsys):
     words = "reach", "in sight", "otherwise", "not rejected for any of 3", "calibration.nc"
     for word in (*words, "Of 60 people, only gross faults would show"):
         assert word in out
-    assert "60/60" in err
+    assert "12/12 people " in err
     assert names(tmp_path / "out") == RESULTS
     calibration = Calibration.load(tmp_path / "out" / "calibration.nc")
     assert calibration.people == 60 and calibration.draws == 19
@@ -64,6 +64,18 @@ def test_processes_share_the_people(small, tmp_path):
     assert command(calibrate, *other, "--jobs", 2) == 0
     shared = Calibration.load(tmp_path / "shared" / "calibration.nc")
     assert shared.data.equals(alone.data)
+
+
+@pytest.mark.slow
+def test_a_cluster_finds_the_same(small, tmp_path):
+    """Its workers get the human model of a user's file, which they cannot import."""
+    assert command(calibrate, *small, "--people", 10) == 0
+    here = Calibration.load(tmp_path / "out" / "calibration.nc")
+    other = [tmp_path / "there" if part == tmp_path / "out" else part for part in small]
+    done = command_on_cluster(tmp_path, calibrate, *other, "--people", 10)
+    assert done.returncode == 0, done.stderr
+    assert Calibration.load(tmp_path / "there" / "calibration.nc").data.equals(here.data)
+    assert names(tmp_path / "there") == RESULTS
 
 
 def test_wrong_posteriors_end_with_status_1(small, monkeypatch, capsys):

@@ -14,6 +14,7 @@ import xarray as xr
 from example_recordings import NAN, RAGGED, fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from paths import DOCS
 
 import mirror_ppl.data
 from mirror_ppl.data import (
@@ -364,7 +365,7 @@ def test_importing_the_type_does_not_wait_for_xarray():
 
 
 def test_the_documented_example_runs_and_is_a_valid_recording(tmp_path, monkeypatch, capsys):
-    page = Path(__file__).parents[1] / "docs" / "demonstrations.md"
+    page = DOCS / "demonstrations.md"
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
     assert len(blocks) == 4
     monkeypatch.chdir(tmp_path)
@@ -383,7 +384,7 @@ def test_the_documented_example_runs_and_is_a_valid_recording(tmp_path, monkeypa
 
 
 def test_the_documented_table_lists_every_variable_and_its_dimensions():
-    page = (Path(__file__).parents[1] / "docs" / "demonstrations.md").read_text()
+    page = (DOCS / "demonstrations.md").read_text()
     rows = re.findall(r"^\| (\S+) \| ([a-z_*, ]+) \|", page.split("## Variables")[1], re.MULTILINE)
     documented = {name.replace("`", "").replace("*", ""): dims for name, dims in rows}
     for name, dims in schema.variable_dimensions(DRIVING).items():

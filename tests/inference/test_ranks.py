@@ -9,7 +9,14 @@ import xarray as xr
 from scipy.stats import beta, binom, chisquare, norm
 
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.calibration.ranks import LEVELS, Calibration, collect, judge, ranks
+from mirror_ppl.inference.calibration.ranks import (
+    LEVELS,
+    Calibration,
+    collect,
+    join_rounds,
+    judge,
+    ranks,
+)
 
 RARELY = 1e-5
 """Failure rate of what a test may not get wrong, whatever the seed."""
@@ -18,7 +25,9 @@ RARELY = 1e-5
 def gaussian(rng, people, draws=100, width=1.0, shift=0.0, sites=("x",)):
     """Posteriors of means, each seen once with noise; prior and noise have variance 1."""
     prior = {site: rng.normal(size=4000) for site in sites}
-    return collect({1: [judged(rng, people, draws, width, shift, sites)]}, prior, (), {})
+    return collect(
+        [join_rounds({1: judged(rng, people, draws, width, shift, sites)})], prior, (), {}
+    )
 
 
 def judged(rng, people, draws=100, width=1.0, shift=0.0, sites=("x",)):
@@ -56,7 +65,7 @@ def test_right_coverage_is_nominal_whatever_the_values(rng, sure):
     truth = rng.integers(3, size=number)
     draws = np.repeat(truth[None], 7, 0) if sure else rng.integers(3, size=(7, number))
     judged = judge({"x": truth}, {"x": draws}, ["x"], rng)
-    whole = collect({1: [judged]}, {"x": np.arange(3)}, ["x"], {})
+    whole = collect([join_rounds({1: judged})], {"x": np.arange(3)}, ["x"], {})
     for level, held in zip(LEVELS, whole.coverage.values[0, 0], strict=True):
         assert binom.cdf(held * number, number, level) > RARELY
         assert binom.sf(held * number - 1, number, level) > RARELY
@@ -69,9 +78,9 @@ def test_numbers_by_hand(rng):
         "n": np.array([[1, 2], [1, 2], [1, 0], [1, 1]]),
         "x": np.array([[0.0, 0], [1, 10], [2, 20], [3, 30]]) + 1,
     }
-    parts = [judge(truth, draws, ["n"], rng, np.array([0.2, np.nan]))]
+    judged = judge(truth, draws, ["n"], rng, np.array([0.2, np.nan]))
     prior = {"n": np.array([0, 0, 1, 2]), "x": np.arange(101.0)}
-    data = collect({3: parts}, prior, ["n"], {"domain": "none"})
+    data = collect([join_rounds({3: judged})], prior, ["n"], {"domain": "none"})
     np.testing.assert_array_equal(data.data["rank"].sel(site="x")[0], [0, 1])
     assert data.data["rank"].sel(site="n").values[0, 0] == 0
     assert data.data["rank"].sel(site="n").values[0, 1] in (2, 3, 4)

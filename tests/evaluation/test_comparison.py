@@ -413,7 +413,7 @@ def dots(ax):
 
 def test_the_figure_shows_every_difference(paths):
     comparison = compared(*paths)
-    figure = plot_comparison(comparison)
+    figure = plot_comparison(comparison.table(), comparison.by)
     (ax,) = figure.axes
     names = dict(zip(ax.get_yticks(), (t.get_text() for t in ax.get_yticklabels()), strict=True))
     assert list(names.values()) == ["a", "b", "c"]
@@ -451,11 +451,11 @@ def test_the_figure_shows_every_difference(paths):
 
 def test_any_name_can_be_drawn_and_many_people_fit(tmp_path, paths, monkeypatch):
     label = "a $very_{long name [of] \\a " * 8
-    figure = plot_comparison(compared(*paths[:2], labels=[label, r"$\nothing$"]))
+    figure = plot_comparison(compared(*paths[:2], labels=[label, r"$\nothing$"]).table())
     figure.savefig(tmp_path / "x.png")
     few = figure.get_size_inches()[1]
     monkeypatch.setattr("mirror_ppl.plots.comparison.MOST", 0.2)  # as if there were many people
-    crowded = plot_comparison(compared(*paths[:2]))
+    crowded = plot_comparison(compared(*paths[:2]).table())
     assert crowded.get_size_inches()[1] < few
     assert not len(crowded.axes[0].get_yticks(minor=True))
 

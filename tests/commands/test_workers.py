@@ -133,7 +133,7 @@ def test_calibration_names_the_line_of_a_faulty_model(tmp_path, capsys, jobs):
 
 
 def test_a_worker_that_is_killed_is_one_line():
-    with pytest.raises(MirrorError, match="a worker process was ended from outside"):
+    with pytest.raises(MirrorError, match="its process was killed"):
         list(run_tasks([partial(square, 1), _kill_oneself], 2))
 
 

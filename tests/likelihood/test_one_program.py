@@ -2,13 +2,13 @@
 
 import math
 import sys
-from pathlib import Path
 
 import pyro
 import pyro.distributions as dist
 import pytest
 import torch
 from example_person import self_model
+from paths import EXAMPLES
 from pyro import poutine
 from pyro.infer import Predictive, TraceEnum_ELBO, config_enumerate
 from pyro.infer.inspect import get_dependencies
@@ -24,7 +24,6 @@ from mirror_ppl.models.toy import ToyHuman, toy_posterior
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.people import simulate
 
-EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
 sys.path.insert(0, str(EXAMPLES))
 from distracted import DistractedPerson  # noqa: E402
 from late_reactions import LatePerson  # noqa: E402
