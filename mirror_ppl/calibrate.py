@@ -17,7 +17,7 @@ from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
     from mirror_ppl.data import Demonstrations
-    from mirror_ppl.inference.amortized import AmortizedGuide
+    from mirror_ppl.inference.amortized_guide import AmortizedGuide
     from mirror_ppl.inference.calibration.ranks import Calibration
     from mirror_ppl.inference.engines import InferenceOptions, Inferred
     from mirror_ppl.models.human import HumanModel

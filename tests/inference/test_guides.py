@@ -18,14 +18,8 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
 from mirror_ppl.inference import importance
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
-from mirror_ppl.inference.amortized import (
-    AmortizedGuide,
-    AmortizedOptions,
-    evidence_of,
-    guide_screening,
-    reference_places,
-    sample_amortized,
-)
+from mirror_ppl.inference.amortized import AmortizedOptions, evidence_of, sample_amortized
+from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, reference_places
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.nuts import NUTSOptions

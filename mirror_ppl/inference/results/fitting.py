@@ -13,7 +13,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
-from mirror_ppl.inference.amortized import AmortizedGuide
+from mirror_ppl.inference.amortized_guide import AmortizedGuide
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.results.posterior_predictive import predict_people
