@@ -39,7 +39,6 @@ class PriorMargins(Transform):
     """
 
     bijective = True
-    sign = 1
     domain = constraints.independent(constraints.real, 1)
     codomain = constraints.independent(constraints.real, 1)
 
@@ -52,6 +51,11 @@ class PriorMargins(Transform):
         return isinstance(other, PriorMargins) and torch.equal(self.knots, other.knots)
 
     __hash__ = Transform.__hash__
+
+    @property
+    def sign(self) -> int:
+        """Of the slope."""
+        return 1
 
     def _call(self, x: Tensor) -> Tensor:
         return _interpolated(x, self.normal, self.knots)[0]

@@ -9,7 +9,8 @@ import mirror_ppl
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference import automatic, importance
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
-from mirror_ppl.inference.amortized import AmortizedGuide, AmortizedOptions, reference_places
+from mirror_ppl.inference.amortized import AmortizedOptions
+from mirror_ppl.inference.amortized_guide import AmortizedGuide, reference_places
 from mirror_ppl.inference.automatic import AutomaticOptions
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import InferenceOptions, infer

@@ -18,14 +18,8 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
 from mirror_ppl.inference import importance
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
-from mirror_ppl.inference.amortized import (
-    AmortizedGuide,
-    AmortizedOptions,
-    evidence_of,
-    guide_screening,
-    reference_places,
-    sample_amortized,
-)
+from mirror_ppl.inference.amortized import AmortizedOptions, evidence_of, sample_amortized
+from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, reference_places
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.nuts import NUTSOptions
@@ -221,8 +215,8 @@ def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
         torch.manual_seed(0)
         sampler.draw(100)
     pruned.prune(0.5)
-    kept = torch.isin(whole.alike.first, pruned.alike.first)
-    assert 0 < int(kept.sum()) < len(whole.alike)
+    kept = torch.isin(whole.combinations.first, pruned.combinations.first)
+    assert 0 < int(kept.sum()) < len(whole.combinations)
     torch.manual_seed(1)
     policy, joint = whole._policies[0], whole._joints[0]
     assert torch.equal(pruned._joints[0], joint[:, kept])

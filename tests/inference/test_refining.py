@@ -1,117 +1,131 @@
-"""Refining: variational inference that starts where another guide ended."""
+"""Refining: what a network proposes, fitted to a person's own rounds before draws are weighted."""
 
-from functools import partial
+import math
 
 import pytest
 import torch
 from running import command
+from scipy import stats
 
 from mirror_ppl import fit
-from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference import batches, svi
+from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
+from mirror_ppl.errors import InputError
+from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
+from mirror_ppl.inference.amortized_guide import (
+    AmortizedGuide,
+    guide_screening,
+    reference_places,
+)
+from mirror_ppl.inference.automatic import AutomaticOptions
+from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import InferenceOptions, infer
-from mirror_ppl.inference.marginal_elbo import elbo_of
-from mirror_ppl.inference.svi import SVIOptions, continuous_guide, own_parameters
-from mirror_ppl.likelihood.compiled import compile
-from mirror_ppl.models.variants import PerceptualOnly, PolicyOnly
+from mirror_ppl.likelihood.tables import person_builders
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.toy import RATES, ToyHuman, toy_posterior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training.guide_file import network_for
+
+STEPS = 40
 
 
 @pytest.fixture(scope="module")
-def human():
-    return PerceptualOnly(load_self_model(shipped_weights("driving"))[0])
+def toy():
+    return ToyHuman(load_self_model(shipped_weights("driving"))[0])
 
 
 @pytest.fixture(scope="module")
-def recordings():
-    whole = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    return whole.select_people([0, 1, 2]).select_rounds(range(3))
+def recordings(toy):
+    generator = torch.Generator().manual_seed(3)
+    return play_rounds(toy, prior_people(toy, 4, generator), 3, "fog", generator)
 
 
-def test_the_guide_starts_at_the_draws(human):
-    recordings = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    policy = PolicyOnly(human.self_model)
-    two = recordings.select_people([0, 1]).select_rounds([0])
-    guide = continuous_guide(compile(policy, two))
-    before = {name: value.detach().clone() for name, value in guide.state_dict().items()}
-    draws = {
-        "consistency": torch.tensor([[2.0, 3.0], [2.0, 6.0]])[..., None],
-        "lapse": torch.tensor([[0.1, 0.5], [0.1, 0.5]])[..., None],
-    }
-    draws |= {name: torch.zeros(2, 2, 1, 9, 9) for name in ("residual_in", "residual_out")}
-    guide.start_at(draws)
-    loc, scale = guide._get_loc_and_scale("consistency")
-    torch.testing.assert_close(loc.flatten(), draws["consistency"].log().mean(0).flatten())
-    spread = draws["consistency"].log().std(0).flatten().clamp(min=0.01)
-    torch.testing.assert_close(scale.flatten(), spread)
-    loc, _ = guide._get_loc_and_scale("lapse")
-    assert loc.flatten().tolist() == pytest.approx([-2.1972, 0.0], abs=1e-4)
-    # Of weights the prior is better than draws.
-    after = guide.state_dict()
-    weights = [name for name in before if "residual" in name]
-    assert weights and all(torch.equal(after[name], before[name]) for name in weights)
+@pytest.fixture(scope="module")
+def network(toy):
+    """Not trained, so it has much to learn from a person's own rounds."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return AmortizedGuide(reference_places(toy)).eval()
 
 
-def test_refining_starts_near_the_end(human):
-    """The bound of a single draw at the fresh start has a standard deviation of 27 nats."""
-    whole = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    rounds = whole.select_people(range(5)).select_rounds(range(20))
-    found = infer(human, rounds, InferenceOptions(draws=50, refine=30), seed=0)
-    options = InferenceOptions("svi", 50, settings=SVIOptions(steps=150))
-    fresh = infer(human, rounds, options, seed=0)
-    assert len(found.losses) == 30
-    assert found.pareto_k is None
-    compiled = compile(human, rounds)
-    with own_parameters(0):
-        guide, elbo = continuous_guide(compiled), elbo_of(compiled)
-        begun = sum(elbo.loss(compiled.program, guide) for _ in range(60)) / 60
-    ended = sum(fresh.losses[-20:]) / 20
-    assert begun - ended > 20
-    assert sum(found.losses[:10]) / 10 - ended < 0.3 * (begun - ended)
-    assert found.draws["consistency"].shape == (50, 5, 1)
-    assert found.draws.keys() == fresh.draws.keys()
+def test_refined_draws_have_the_exact_posterior_and_more_of_them_count(toy, recordings, network):
+    effective = {0: [], STEPS: []}
+    exact = toy_posterior(toy, recordings)
+    before = [value.clone() for value in network.state_dict().values()]
+    for person, builder in enumerate(person_builders(toy, recordings, guide_screening())):
+        for refine, counts in effective.items():
+            torch.manual_seed(person)
+            options = AmortizedOptions(512, stages=1, refine=refine)
+            found = sample_amortized(toy, network, builder, options)
+            counts.append(found.effective)
+            assert found.pareto_k < 0.7
+            for site in RATES:
+                value = (found.log_weights.exp() * found.policy[site].flatten()).sum()
+                variance = exact.variance(site)[person] / (found.effective / 2)
+                off = abs(float(value - exact.mean(site)[person]))
+                assert off < -stats.norm.ppf(5e-7) * float(variance.sqrt())
+    gain = torch.tensor(effective[STEPS]) / torch.tensor(effective[0])
+    assert gain.min() > 0.95
+    assert gain.mean() > 1.2
+    # The network itself is as it was.
+    assert all(map(torch.equal, before, network.state_dict().values()))
 
 
-def test_refining_of_many_is_done_in_batches(human, recordings, monkeypatch):
-    monkeypatch.setattr(batches, "PEOPLE_AT_ONCE", 2)
-    found = infer(human, recordings, InferenceOptions(draws=8, refine=2), seed=0)
-    assert found.draws["lapse"].shape == (8, 3, 1)
+@pytest.mark.parametrize(
+    ("engine", "settings"),
+    [("auto", AutomaticOptions(enough=0, pareto_k=math.inf)), ("amortized", AmortizedOptions())],
+)
+def test_engines_refine_each_person_alone(toy, recordings, network, engine, settings):
+    options = InferenceOptions(engine, 50, settings, refine=2)
+    unrefined = InferenceOptions(engine, 50, settings)
+    together = infer(toy, recordings.select_people([0, 1]), options, 0, network)
+    alone = infer(toy, recordings.select_people([0]), options, 0, network)
+    plain = infer(toy, recordings.select_people([0]), unrefined, 0, network)
+    assert together.engines == ("amortized",) * 2
+    assert together.pareto_k is not None
+    for name, value in alone.draws.items():
+        assert torch.equal(together.draws[name][:, :1], value)
+    assert not torch.equal(alone.draws["in_sight"], plain.draws["in_sight"])
 
 
-def test_refining_continues(human, recordings, tmp_path, monkeypatch):
-    monkeypatch.setattr(svi, "SVIOptions", partial(SVIOptions, checkpoint_every=2))
-    options = InferenceOptions(draws=8, refine=4)
-    file = tmp_path / "fit.checkpoint"
-    first = infer(human, recordings, options, 0, checkpoint=(file, "run"))
-    assert (tmp_path / "fit.checkpoint.refined").exists()
-    again = infer(human, recordings, options, 0, checkpoint=(file, "run"))
-    assert again.losses == first.losses
+def test_weights_of_a_residual_have_a_guide_beside_it():
+    human = HumanModel(load_self_model(shipped_weights("driving"))[0])
+    some = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    some = some.select_people([0]).select_rounds([0])
+    options = InferenceOptions("amortized", 10, refine=2)
+    found = infer(human, some, options, 0, network_for("amortized", None, human))
+    assert found.draws["residual_out"].shape[:3] == (10, 1, 1)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"engine": "svi", "refine": 3},
-            "refining is for the engines auto, importance and amortized, not svi",
-        ),
+        ({"engine": "svi"}, "refining is for the engines auto and amortized, not svi"),
+        ({"engine": "importance"}, "refining is for the engines auto and amortized, not imp"),
         ({"refine": -1}, "refine must be at least 0, not -1"),
     ],
 )
 def test_what_cannot_be_refined(options, message):
     with pytest.raises(ValueError, match=message):
-        InferenceOptions(**options)
+        InferenceOptions(**{"refine": 3} | options)
+
+
+def test_without_a_network_nothing_is_refined(toy, recordings):
+    with pytest.raises(InputError, match="refining needs its network, not None"):
+        infer(toy, recordings, InferenceOptions(refine=3), 0)
 
 
 def test_the_command_refuses_it_in_one_line(capsys):
     assert command(fit, "--guide", "nuts", "--refine", 5) == 2
-    assert "--refine is for --guide auto, importance and amortized" in capsys.readouterr().err
+    assert "--refine is for --guide auto and amortized" in capsys.readouterr().err
     assert command(fit, "--refine", -5) == 2
     assert "--refine must be at least 0, not -5" in capsys.readouterr().err
 
 
-def test_the_command_refines(tmp_path, monkeypatch, capsys):
+def test_the_command_refines(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    given = ("--train-rounds", 1, "--draws", 4, "--explore", 0, "--human-model", "perceptual-only")
+    some = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    save_demonstrations("one.nc", some.select_people([0]).select_rounds([0, 1]))
+    given = ("--demos", "one.nc", "--train-rounds", 1, "--draws", 4, "--explore", 0)
     assert command(fit, *given, "--refine", 2) == 0
     assert not list(tmp_path.glob("**/*checkpoint*"))

@@ -9,7 +9,7 @@ from mirror_ppl.domains.bomb_defusal import WAIT
 from mirror_ppl.domains.bomb_panel import OLD_RULES, STAGES, read_panel, right_button
 from mirror_ppl.errors import AssetError
 from mirror_ppl.evaluation.self_model import self_model_quality
-from mirror_ppl.inference.amortized import AmortizedGuide
+from mirror_ppl.inference.amortized_guide import AmortizedGuide
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
