@@ -7,10 +7,13 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_person import self_model
+from example_programs import PROGRAMS
 from pyro.infer import SVI, Trace_ELBO
 from pyro.infer.autoguide import AutoNormal
-from test_one_program import PROGRAMS, exact_mean, recordings, self_model, toy
+from test_one_program import recordings
 
+from benchmarks.one_program import exact_mean, toy
 from mirror_ppl.communication.minds import Person
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference import batches
@@ -28,7 +31,7 @@ __all__ = ["recordings"]
 
 
 class Asked(ToyHuman):
-    """The factor of `test_one_program.toy`, added by the program and not by its prior."""
+    """The factor of `benchmarks.one_program.toy`, added by the program and not by its prior."""
 
     def prior(self):
         self.implants = super().prior()
@@ -73,7 +76,7 @@ def test_the_program_of_a_user_is_run(engine, recordings):
     found = infer(Asked(self_model()), recordings, options, 0).draws["in_sight"].flatten()
     # Draws of a chain depend on each other: as many as a third of them count.
     error = 0.03 if engine == "svi" else 4 * float(found.std()) / math.sqrt(50)
-    assert abs(found.mean() - exact_mean("factor", recordings)) < error
+    assert abs(found.mean() - exact_mean("factor", recordings, self_model())) < error
 
 
 def test_pyro_infers_it_too(recordings):
@@ -115,7 +118,7 @@ def test_it_is_fitted_and_predicted(recordings):
     options = InferenceOptions("svi", 20, SVIOptions(steps=5))
     fit = fit_people(Asked(self_model()), rounds, options, seed=1, train_rounds=1)
     assert set(fit.data.posterior.data_vars) >= {"reach", "in_sight", "otherwise"}
-    twin = toy("factor")
+    twin = toy("factor", self_model())
     expected = predict_rounds(twin, rounds, fit.posterior.draws)
     found = predict_rounds(Asked(self_model()), rounds, fit.posterior.draws)
     real = rounds.mask

@@ -7,9 +7,11 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from test_one_program import exact_mean, recordings, self_model, toy
+from example_person import self_model
+from test_one_program import recordings
 
 import mirror_ppl
+from benchmarks.one_program import exact_mean, toy
 from mirror_ppl.data import Demonstrations, concatenate, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import DemonstrationsError, InputError
 from mirror_ppl.inference.engines import InferenceOptions, infer
@@ -53,7 +55,7 @@ def test_a_measured_site_is_an_observed_site(engine, recordings):
     draws = infer(human, measured(recordings, answer=[0.7]), options, 0).draws
     found = draws["in_sight"].flatten()
     error = 4 * float(found.std()) / math.sqrt(400) if engine == "importance" else 0.03
-    assert abs(found.mean() - exact_mean("observed", recordings)) < error
+    assert abs(found.mean() - exact_mean("observed", recordings, self_model())) < error
     assert (draws["answer"] == 0.7).all()
     assert list(draws) == ["reach", "in_sight", "otherwise", "answer"]
 
@@ -64,7 +66,7 @@ def test_unmeasured_it_is_a_site_like_others(recordings):
         draws = infer(human, some, options, 0).draws
         found = draws["in_sight"].flatten()
         error = 4 * float(found.std()) / math.sqrt(400)
-        assert abs(found.mean() - exact_mean("none", recordings)) < error
+        assert abs(found.mean() - exact_mean("none", recordings, self_model())) < error
         assert (draws["answer"].flatten() - found).std() == pytest.approx(0.05, rel=0.2)
 
 
@@ -136,7 +138,7 @@ def test_what_cannot_take_it_into_account_refuses_it(recordings):
         with pytest.raises(InputError, match="answer of people was measured, which the engine"):
             infer(human, some, options, 0)
     with pytest.raises(InputError, match="answer was measured, which infer"):
-        OnlinePosterior(toy("none")).add(some)
+        OnlinePosterior(toy("none", self_model())).add(some)
 
 
 # --- in recordings ----------------------------------------------------------------------------
