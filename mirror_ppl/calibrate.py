@@ -12,6 +12,7 @@ from mirror_ppl.console import console_for_tables, run
 from mirror_ppl.errors import OptionError
 from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers
+from mirror_ppl.models.world_knowledge import fit_world
 from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
@@ -109,7 +110,7 @@ def main(options: Options) -> int:
     check_contract(human)
     # What is so for everybody is learned first, as by a fit: people are drawn from what is open.
     name = f"{options.domain}_{setting}_paper.nc"
-    human.learn_world(load_demonstrations(asset_path(name)))
+    fit_world(human, load_demonstrations(asset_path(name)))
     network = network_for(guide, options.guide_file, human)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     what = [settings, setting, options.seed, trial]

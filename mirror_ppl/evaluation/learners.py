@@ -39,6 +39,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.models.world_knowledge import fit_world, planning_domain
 from mirror_ppl.people import simulate, simulated_people
 from mirror_ppl.training.guide_file import network_for
 
@@ -183,7 +184,7 @@ def _mirror(
     def learn(group: Group, rounds: int, seed: int) -> Posterior:
         human = load_human_model(variant, group.self_model)
         train = group.recordings().select_rounds(slice(rounds))
-        human.learn_world(train)
+        fit_world(human, train)
         network = network_for(engine, None, human)
         population = population_of(replace(group, seed=OTHERS)) if from_others else None
         options = InferenceOptions(engine)
@@ -198,7 +199,7 @@ def population_of(group: Group) -> Population:
     """The population that a group is from, as far as all their training rounds tell."""
     human = load_human_model(None, group.self_model)
     rounds = group.recordings(TRAINING)
-    human.learn_world(rounds)
+    fit_world(human, rounds)
     found = infer(human, rounds, InferenceOptions(pooling="partial"), group.seed)
     assert found.population is not None
     return found.population
@@ -212,8 +213,8 @@ def _parts(group: Group, rounds: int) -> tuple[Demonstrations, Demonstrations]:
 def _trained(group: Group, train: Demonstrations, networks: RecurrentNetworks) -> Trained:
     # What rewards say of the world is nothing about people, so baselines get to know it, too.
     human = load_human_model(None, group.self_model)
-    human.learn_world(train)
-    return Trained(networks, human.self_model, group.setting, human.known_world({}))
+    fit_world(human, train)
+    return Trained(networks, human.self_model, group.setting, planning_domain(human, {}))
 
 
 def _behaviour_cloning(sight: Sight) -> Learn:

@@ -35,7 +35,7 @@ from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
 from mirror_ppl.inference.refining import refined
 from mirror_ppl.inference.sampler import Sampler, Weighted
-from mirror_ppl.likelihood.combination_sets import Alike
+from mirror_ppl.likelihood.combination_sets import EquivalentCombinations
 from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
@@ -72,7 +72,7 @@ class Evidence:
 
     Attributes:
         log_evidence: of each way ``[W]``.
-        alike: combinations of what the person sees, those still possible.
+        combinations: of what the person sees, those still possible.
         joint: log joint of these G sets under each way, ``[W, G]``.
         ways: the ways, draws ``[W, 1, 1, ...]`` of the sites that perception does not read.
         table: views of the rounds.
@@ -80,7 +80,7 @@ class Evidence:
     """
 
     log_evidence: Tensor
-    alike: Alike
+    combinations: EquivalentCombinations
     joint: Tensor
     ways: dict[str, Tensor]
     table: ViewTable
@@ -96,11 +96,13 @@ def log_evidence(builder: ViewTableBuilder) -> Tensor:
 def evidence_of(builder: ViewTableBuilder) -> Evidence:
     """What a person's rounds so far say."""
     table = builder.table()
-    alike = Alike.of(table, builder.fixed_prior)
-    prior = alike.log_prior if alike.fixed else builder.log_prior[:, alike.first]
-    joint = builder.score[:, alike.first] + prior
-    ways = {name: way for name, way in builder.ways.items() if name not in table.sites}
-    return Evidence(joint.logsumexp(-1), alike, joint, ways, table, int(table.steps.sum()))
+    combinations = EquivalentCombinations.of(table, builder.fixed_prior)
+    prior = (
+        combinations.log_prior if combinations.fixed else builder.log_prior[:, combinations.first]
+    )
+    joint = builder.score[:, combinations.first] + prior
+    ways = {name: way for name, way in builder.policies.items() if name not in table.sites}
+    return Evidence(joint.logsumexp(-1), combinations, joint, ways, table, int(table.steps.sum()))
 
 
 @torch.no_grad()
@@ -122,7 +124,7 @@ def sample_amortized(
     """
     options = options or AmortizedOptions()
     evidence = evidence_of(builder)
-    sampler = Sampler(human, evidence.table, evidence.alike, sites)
+    sampler = Sampler(human, evidence.table, evidence.combinations, sites)
     sampler.add_prior_draws(evidence.ways, evidence.joint)
     sampler.prune(options.prune_margin)
     if options.refine and sampler.sites:

@@ -31,7 +31,7 @@ SOFTPLUS_ONE = 0.5413  # its softplus is 1
 
 def guide_screening() -> Screening:
     """The screening that an amortized guide needs: its ways are what the network reads."""
-    return Screening(ways=WAYS)
+    return Screening(policies=WAYS)
 
 
 class AmortizedGuide(nn.Module):
@@ -156,8 +156,8 @@ def sample_scalars(
 
 def reference_places(human: HumanModel, number: int = WAYS) -> Tensor:
     """Places ``[W, D]`` of ways from the prior; always the same of a human model."""
-    builder = ViewTableBuilder(human, Screening(ways=number))
-    return unconstrained(scalar_sites(human), builder.draw_ways())
+    builder = ViewTableBuilder(human, Screening(policies=number))
+    return unconstrained(scalar_sites(human), builder.draw_policies())
 
 
 def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:

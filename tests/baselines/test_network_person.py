@@ -128,7 +128,7 @@ def test_the_world_that_is_planned_in_can_be_another(generator):
     driving = get_domain("driving")
     other = get_domain("driving")
     human = NetworkPerson(SelfModel(driving), untrained(driving), "fog", other)
-    assert human.known_world(human.draws(1)) is other
+    assert human.planning_domain(human.draws(1)) is other
     assert NETWORK in human.draws(1)
 
 

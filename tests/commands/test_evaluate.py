@@ -31,6 +31,7 @@ from mirror_ppl.evaluation.study_summary import (
 from mirror_ppl.inference.engines import InferenceOptions, Inferred
 from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.world_knowledge import planning_domain
 from mirror_ppl.plots.study import STYLES, plot_curves, plot_relevance
 
 FOG = Group("driving", "fog", "paper", 2, 0)
@@ -135,7 +136,7 @@ def test_baselines_know_what_rewards_tell_of_the_world():
     assert person.number == 3
     more = learn("bc", group, 1, 0).person(1, 64)  # pyright: ignore[reportAttributeAccessIssue]
     assert more.number == learners.SAME_DRAWS < 64
-    world = person.human.known_world(person.draws)
+    world = planning_domain(person.human, person.draws)
     assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
     assert world.rules != OLD_RULES  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -215,8 +215,8 @@ def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
         torch.manual_seed(0)
         sampler.draw(100)
     pruned.prune(0.5)
-    kept = torch.isin(whole.alike.first, pruned.alike.first)
-    assert 0 < int(kept.sum()) < len(whole.alike)
+    kept = torch.isin(whole.combinations.first, pruned.combinations.first)
+    assert 0 < int(kept.sum()) < len(whole.combinations)
     torch.manual_seed(1)
     policy, joint = whole._policies[0], whole._joints[0]
     assert torch.equal(pruned._joints[0], joint[:, kept])

@@ -127,7 +127,7 @@ def test_sites_that_hang_on_others_keep_their_prior():
     """How soon each terminal is noticed follows how quick somebody is, in a population, too."""
     human = load_human_model(None, load_self_model(shipped_weights("bomb_defusal"))[0])
     pooling = Pooling(human)
-    assert list(pooling.sites) == ["quickness", "evenness", "consistency", "lapse"]
+    assert list(pooling.sites) == ["notice_mean", "notice_concentration", "consistency", "lapse"]
     # Which rules hold is known of the world, and better by the day; it is not about people.
     assert list(pooling.supports) == ["reads_type"]
     number = 2000
@@ -135,11 +135,11 @@ def test_sites_that_hang_on_others_keep_their_prior():
         name: place.expand(1) for name, place in zip(pooling.sites, pooling.centre, strict=True)
     }
     spread = {name: torch.full((1,), 0.01) for name in pooling.sites}
-    mean["quickness"] = torch.tensor([0.05]).logit()
+    mean["notice_mean"] = torch.tensor([0.05]).logit()
     chances = {name: prior[None] for name, prior in pooling.prior_chances.items()}
     new = pooling.newcomers(Population(chances, mean, spread).spaced(number), 1, 0)
-    quickness, notices = new["quickness"], new["notices_terminal 3"]
-    assert quickness.mean() == pytest.approx(0.05, abs=0.002)
+    notice_mean, notices = new["notice_mean"], new["notices_terminal 3"]
+    assert notice_mean.mean() == pytest.approx(0.05, abs=0.002)
     # Beta with this mean, and a concentration of about 100 or more.
     assert notices.mean() == pytest.approx(0.05, abs=4.5 * 0.03 / number**0.5)
 

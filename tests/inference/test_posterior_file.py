@@ -260,7 +260,7 @@ def test_draws_of_another_version_or_model(tmp_path, draws, name, other, told):
 
 def test_draws_for_another_domain_than_theirs(tmp_path, draws):
     """Before anything else, as models are called alike in all domains."""
-    path = write(tmp_path / "x.nc", draws, domain="search_rescue", human_model="Searcher")
+    path = write(tmp_path / "x.nc", draws, domain="search_rescue", human_model="BombDefusalHuman")
     with pytest.raises(PosteriorError, match="is of domain search_rescue, not driving; fit again"):
         load_posterior(path).draws(human())
 

@@ -78,13 +78,13 @@ def test_expected_counts_are_of_what_was_done(human, played, table):
     found = sampler.weighted()
     even = torch.zeros(20)
     counts = expected_counts(
-        human, table, found.policy, even, sampler.alike.first, sampler.alike.log_prior
+        human, table, found.policy, even, sampler.combinations.first, sampler.combinations.log_prior
     )
     steps = int(played.mask.sum())
     assert float(counts.sum()) == pytest.approx(steps, rel=1e-4)
     by_action = counts.sum(0)
     assert float(by_action[1]) == pytest.approx(int((played.actions == 1).sum()), rel=1e-4)
-    one = sampler.alike.first[:1]
+    one = sampler.combinations.first[:1]
     counts = expected_counts(human, table, found.policy, even, one, torch.zeros(1))
     torch.testing.assert_close(counts, counts.round(), rtol=0, atol=1e-4)
     # In moments of the views that this combination has, and in no others.

@@ -10,7 +10,7 @@ from test_views import Few
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.sampler import Sampler
-from mirror_ppl.likelihood.combination_sets import Alike, fixed_prior
+from mirror_ppl.likelihood.combination_sets import EquivalentCombinations, fixed_prior
 from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
 from mirror_ppl.likelihood.enumeration import combination_values, log_joints
 from mirror_ppl.likelihood.tables import build_view_table
@@ -68,7 +68,7 @@ def test_sets_are_those_that_have_seen_the_same(self_model, one):
     table = build_view_table(human, one)
     prior = prior_of(human)
     assert prior is not None
-    alike = Alike.of(table, prior)
+    alike = EquivalentCombinations.of(table, prior)
     rows = [tuple(row) for row in table.index[0].T.tolist()]
     sets = {}
     for number, row in enumerate(rows):
@@ -95,7 +95,7 @@ def test_members_are_drawn_by_their_prior(self_model, one):
     human = Few(self_model)
     prior = prior_of(human)
     assert prior is not None
-    whole = Alike.of(build_view_table(human, one), prior)
+    whole = EquivalentCombinations.of(build_view_table(human, one), prior)
     for alike in (whole, whole.kept(torch.arange(len(whole)) > 0)):
         torch.manual_seed(0)
         sets = torch.arange(len(alike)).repeat_interleave(4000)

@@ -287,12 +287,12 @@ def test_a_table_of_many_is_that_of_each(per_item, recordings):
     """Also where they differ in rounds, lengths and what is left of them after screening."""
     rounds = ragged(recordings, [[15, 6], [], [9]])
     implants = {name: value[0] for name, value in drawn(per_item, 1, 3).items()}
-    together = build_view_table(per_item, rounds, screening=Screening(ways=4))
+    together = build_view_table(per_item, rounds, screening=Screening(policies=4))
     found = combination_scores(together, log_likelihoods(per_item, implants, together))
     for person in range(3):
         alone = rounds.select_people([person])
         own = {name: value[person : person + 1] for name, value in implants.items()}
-        table = build_view_table(per_item, alone, screening=Screening(ways=4))
+        table = build_view_table(per_item, alone, screening=Screening(policies=4))
         expected = combination_scores(table, log_likelihoods(per_item, own, table))
         torch.testing.assert_close(found[person : person + 1], expected, rtol=1e-4, atol=1e-4)
     assert together.attention is not None
@@ -325,7 +325,7 @@ def test_thinning_hardly_moves_likelihoods(per_item, recordings):
     likely |= {site: torch.linspace(0.1, 0.6, 16).view(16, 1, 1) for site in NOTICES}
     policy = {name: value for name, value in likely.items() if not name.startswith("assumes")}
     found = []
-    for screening in (None, Screening(margin=1e9, ways=16, resolution=0)):
+    for screening in (None, Screening(margin=1e9, policies=16, resolution=0)):
         table = build_view_table(per_item, rounds, screening=screening, likely=likely)
         found.append(log_joints(per_item, table, policy)[:, 0])
     assert (found[0] - found[1]).abs().mean() < found[0].std(0).mean() / 5

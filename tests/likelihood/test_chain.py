@@ -19,8 +19,9 @@ from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, restricted, rounds_of
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.models.bomb_defusal import BombDefusalHuman
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
-from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 
 WORLD = BombDefusal()
@@ -32,9 +33,9 @@ TELLING = (1, 4)
 
 
 @pytest.fixture(scope="module")
-def searcher():
+def defuser():
     torch.manual_seed(0)
-    human = Searcher(SelfModel(WORLD))
+    human = BombDefusalHuman(SelfModel(WORLD))
     with torch.no_grad():  # actions that hang on beliefs, as those of a trained self-model do
         for weight in human.self_model.q_network.parameters():
             weight.mul_(2.0)
@@ -88,7 +89,7 @@ def by_combination(human, rounds, draws):
         heard = {name: mask[:, :steps] for name, mask in told.items()}
         stage = seen["ego"][0, :, 0]
         lengths = [int((stage == number).sum()) for number in range(3)]
-        facts = {
+        covariates = {
             name: fact.view(1, 1)
             for name, fact in human.covariates(
                 {name: value[0] for name, value in seen.items()}
@@ -98,7 +99,7 @@ def by_combination(human, rounds, draws):
         for guess, *found in product((0, 1), *(range(length + 1) for length in lengths)):
             chance = torch.full((number,), 0.5).log()
             for place, (time, length) in enumerate(zip(found, lengths, strict=True)):
-                terminal = 1 + int(facts[f"sought_{place}"])
+                terminal = 1 + int(covariates[f"sought_{place}"])
                 p = draws[f"notices_terminal {terminal}"].flatten()
                 if time < length:
                     chance = chance + p.log()
@@ -124,7 +125,7 @@ def by_combination(human, rounds, draws):
     return predicted, total
 
 
-class Late(Searcher):
+class Late(BombDefusalHuman):
     """Does what they would have done one step before: a belief holds the one before it, too."""
 
     @property
@@ -142,10 +143,10 @@ class Late(Searcher):
         return super().act(implants, belief.chunk(2, -1)[1], values)
 
 
-@pytest.mark.parametrize("kind", [Searcher, Late])
+@pytest.mark.parametrize("kind", [BombDefusalHuman, Late])
 @pytest.mark.parametrize("told", [False, True])
-def test_the_sum_is_that_over_all_combinations(searcher, told, kind):
-    rounds, human = recorded(told=told), kind(searcher.self_model)
+def test_the_sum_is_that_over_all_combinations(defuser, told, kind):
+    rounds, human = recorded(told=told), kind(defuser.self_model)
     draws = draw_prior(human, 1, 4, 0)
     draws["reads_type"] = torch.tensor([0, 0, 1, 0]).view(4, 1, 1)
     predicted, total = by_combination(human, rounds, draws)
@@ -160,66 +161,66 @@ def test_the_sum_is_that_over_all_combinations(searcher, told, kind):
         torch.testing.assert_close(found[:, place, :steps], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_people_of_different_rounds_are_joined(searcher):
+def test_people_of_different_rounds_are_joined(defuser):
     """Each as by themselves; padding of the shorter ones changes nothing."""
     one, other = (
         recorded(),
         recorded(((2, 2), (WAIT, 3, WAIT, WAIT, WAIT, WAIT, WAIT, 1, 1)), person="other"),
     )
     both = concatenate([one, other])
-    draws = draw_prior(searcher, 2, 3, 1)
+    draws = draw_prior(defuser, 2, 3, 1)
     draws["reads_type"] = torch.zeros_like(draws["reads_type"])
-    table = build_view_table(searcher, both)
-    predicted = predict_actions(searcher, table, draws)
+    table = build_view_table(defuser, both)
+    predicted = predict_actions(defuser, table, draws)
     policy = {name: value for name, value in draws.items() if name not in table.sites}
-    joints = log_joints(searcher, table, policy)
+    joints = log_joints(defuser, table, policy)
     for place, alone in enumerate((one, other)):
         own = {name: value[:, place : place + 1] for name, value in draws.items()}
-        single = build_view_table(searcher, alone)
+        single = build_view_table(defuser, alone)
         steps, rounds = alone.shape[2], alone.shape[1]
         real = alone.mask[0]
-        expected = predict_actions(searcher, single, own)[:, 0]
+        expected = predict_actions(defuser, single, own)[:, 0]
         found = predicted[:, place, :rounds, :steps]
         torch.testing.assert_close(found[:, real], expected[:, real], rtol=1e-4, atol=1e-5)
         mine = {name: value for name, value in own.items() if name not in table.sites}
-        expected = log_joints(searcher, single, mine)[:, 0]
+        expected = log_joints(defuser, single, mine)[:, 0]
         torch.testing.assert_close(joints[:, place], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_what_is_given_up_changes_nothing_of_the_rest(searcher):
+def test_what_is_given_up_changes_nothing_of_the_rest(defuser):
     """Of those who read the type and those who do not, after the first are given up."""
     rounds = recorded()
-    draws = draw_prior(searcher, 1, 3, 2)
-    table = build_view_table(searcher, rounds)
+    draws = draw_prior(defuser, 1, 3, 2)
+    table = build_view_table(defuser, rounds)
     policy = {name: value for name, value in draws.items() if name not in table.sites}
-    whole = log_joints(searcher, table, policy)
+    whole = log_joints(defuser, table, policy)
     less = restricted(table, torch.tensor([[False, True]]))
     assert less.moments.shape[1] < table.moments.shape[1]
-    torch.testing.assert_close(log_joints(searcher, less, policy)[..., 1], whole[..., 1])
-    assert (log_joints(searcher, less, policy)[..., 0] < -1e5).all()
+    torch.testing.assert_close(log_joints(defuser, less, policy)[..., 1], whole[..., 1])
+    assert (log_joints(defuser, less, policy)[..., 0] < -1e5).all()
 
 
-def test_screening_counts_what_the_table_does(searcher):
+def test_screening_counts_what_the_table_does(defuser):
     """Ways are scored as the table of the same rounds has it, without merging moments."""
-    builder = ViewTableBuilder(searcher, Screening(margin=1e6, ways=3, resolution=0))
+    builder = ViewTableBuilder(defuser, Screening(margin=1e6, policies=3, resolution=0))
     for one_round in rounds_of(recorded(), 0):
         builder.add(*one_round)
     table = builder.table()
-    policy = {name: value for name, value in builder.ways.items() if name not in table.sites}
-    joints = log_joints(searcher, table, policy)[:, 0]
+    policy = {name: value for name, value in builder.policies.items() if name not in table.sites}
+    joints = log_joints(defuser, table, policy)[:, 0]
     torch.testing.assert_close(builder.score + builder.log_prior, joints)
 
 
-def test_the_sum_has_the_gradient_of_its_differences(searcher):
+def test_the_sum_has_the_gradient_of_its_differences(defuser):
     """By how probably terminals are noticed."""
-    table = build_view_table(searcher, recorded())
-    draws = draw_prior(searcher, 1, 1, 3)
+    table = build_view_table(defuser, recorded())
+    draws = draw_prior(defuser, 1, 1, 3)
     site = next(f"notices_terminal {k}" for k in range(1, 7) if looked_for(table, k))
 
     def likelihood(value):
         given = {**draws, site: value}
         with conditioned(given, 1, 1):
-            return log_likelihoods(searcher, searcher.prior(), table).sum()
+            return log_likelihoods(defuser, defuser.prior(), table).sum()
 
     value = draws[site].clone().requires_grad_()
     (slope,) = torch.autograd.grad(likelihood(value), value)
@@ -231,13 +232,13 @@ def test_the_sum_has_the_gradient_of_its_differences(searcher):
 
 def looked_for(table, terminal):
     """Whether a terminal is lit in the first round."""
-    return int(table.attention.facts["sought_0"][0, 0]) == terminal - 1
+    return int(table.attention.covariates["sought_0"][0, 0]) == terminal - 1
 
 
-def test_somebody_without_rounds_has_a_table(searcher):
+def test_somebody_without_rounds_has_a_table(defuser):
     nobody = recorded().select_rounds([])
-    table = build_view_table(searcher, nobody)
-    assert predict_actions(searcher, table, draw_prior(searcher, 1, 2, 0)).shape[:2] == (2, 1)
+    table = build_view_table(defuser, nobody)
+    assert predict_actions(defuser, table, draw_prior(defuser, 1, 2, 0)).shape[:2] == (2, 1)
 
 
 @pytest.mark.parametrize(
@@ -257,17 +258,17 @@ def test_somebody_without_rounds_has_a_table(searcher):
         ),
     ],
 )
-def test_spans_that_cannot_be_are_refused(searcher, change, message, monkeypatch):
-    spans = Searcher.spans
-    monkeypatch.setattr(Searcher, "spans", lambda self, seen: change(spans(self, seen)))
+def test_spans_that_cannot_be_are_refused(defuser, change, message, monkeypatch):
+    spans = BombDefusalHuman.spans
+    monkeypatch.setattr(BombDefusalHuman, "spans", lambda self, seen: change(spans(self, seen)))
     with pytest.raises(HumanModelError, match=message):
-        build_view_table(searcher, recorded())
+        build_view_table(defuser, recorded())
 
 
-class ReadsLater(Searcher):
+class ReadsLater(BombDefusalHuman):
     """Still sees at the second stage what they look for there if they found it at the first."""
 
-    spans = Searcher.spans
+    spans = BombDefusalHuman.spans
 
     def sees(self, implants, observation, step):
         seen = super().sees(implants, observation, step)
@@ -275,7 +276,7 @@ class ReadsLater(Searcher):
         return {**seen, "visual": seen["visual"] | (also & self.domain.sought(observation))}
 
 
-class TooFew(Searcher):
+class TooFew(BombDefusalHuman):
     """Says that whatever is found later than at once is not found."""
 
     def spans(self, observation):
@@ -285,10 +286,10 @@ class TooFew(Searcher):
         }
 
 
-class Hangs(Searcher):
+class Hangs(BombDefusalHuman):
     """Finds what counts later than at the stage before."""
 
-    spans = Searcher.spans
+    spans = BombDefusalHuman.spans
 
     def round_latents(self, implants):
         sites = super().round_latents(implants)
@@ -305,44 +306,61 @@ class Hangs(Searcher):
         (Hangs, '"mood" of round_latents depends on another of its sites'),
     ],
 )
-def test_spans_that_are_not_so_are_found(searcher, kind, message):
+def test_spans_that_are_not_so_are_found(defuser, kind, message):
     with pytest.raises(HumanModelError, match=message):
-        check_contract(kind(searcher.self_model))
+        check_contract(kind(defuser.self_model))
 
 
-class Sees(Searcher):
+class Sees(BombDefusalHuman):
     """Has sight of its own, of which nobody says when it is read."""
+
+    spans = HumanModel.spans
 
     def sees(self, implants, observation, step):
         return super().sees(implants, observation, step)
 
 
-class Perceives(Searcher):
+class Perceives(BombDefusalHuman):
     """Perceives in a way of their own, of which nobody says what it reads."""
+
+    spans = HumanModel.spans
 
     def perceive(self, implants, knowledge, observation, told, step):
         return super().perceive(implants, knowledge, observation, told, step)
 
 
 @pytest.mark.parametrize("kind", [Sees, Perceives])
-def test_who_may_break_spans_is_summed_out_as_elsewhere(searcher, kind):
+def test_who_may_break_spans_is_summed_out_as_elsewhere(defuser, kind):
     """By values that stand for all; exactly where there are few of them."""
-    human, rounds = kind(searcher.self_model), recorded(((WAIT, 2, 1, 3),), told=False)
-    assert searcher.chained and not human.chained
+    human, rounds = kind(defuser.self_model), recorded(((WAIT, 2, 1, 3),), told=False)
+    assert defuser.chained and not human.chained
     check_contract(human)
     assert not isinstance(build_view_table(human, rounds).attention, Chain)
 
 
-def test_merging_moments_hardly_changes_anything(searcher):
+@pytest.mark.parametrize("name", ["round_latents", "sees", "perceive"])
+def test_who_changes_what_spans_are_about_declares_them(name):
+    """Also where a class beside the one with spans changes it."""
+    own = {name: getattr(HumanModel, name)}
+    message = f"Own overrides {name} and inherits spans: declare .spans = BombDefusalHuman.spans."
+    with pytest.raises(HumanModelError, match=message):
+        type("Own", (BombDefusalHuman,), own)
+    with pytest.raises(HumanModelError, match=message):
+        type("Own", (type("Beside", (HumanModel,), own), BombDefusalHuman), {})
+    declared = type("Own", (BombDefusalHuman,), {**own, "spans": HumanModel.spans})
+    type("Derived", (declared,), own)
+
+
+def test_merging_moments_hardly_changes_anything(defuser):
     """Moments whose log-probabilities fall on the same points of a grid of .03 are one."""
     rounds = recorded()
-    draws = draw_prior(searcher, 1, 8, 5)
+    draws = draw_prior(defuser, 1, 8, 5)
     tables = [
-        build_view_table(searcher, rounds, screening=Screening(margin=1e6, resolution=width))
+        build_view_table(defuser, rounds, screening=Screening(margin=1e6, resolution=width))
         for width in (0, 0.03)
     ]
     assert tables[1].belief.shape[1] < tables[0].belief.shape[1]
     policy = {name: value for name, value in draws.items() if name not in tables[0].sites}
-    exact, merged = (log_joints(searcher, table, policy) for table in tables)
+    exact, merged = (log_joints(defuser, table, policy) for table in tables)
     # Twelve steps, each up to half a grid's width off under the ways that are compared.
     assert (exact - merged).abs().max() < 12 * 0.03

@@ -323,14 +323,14 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, rec
     human, screening = Few(self_model), Screening(margin=margin, resolution=0.0)
     rounds = recordings.select_rounds(range(4))
     whole = build_view_table(human, rounds)
-    with pyro.plate("way", screening.ways, dim=-3), pyro.plate("person", 1, dim=-2):
+    with pyro.plate("policy", screening.policies, dim=-3), pyro.plate("person", 1, dim=-2):
         torch.manual_seed(screening.seed)
         ways = human.prior()
     likelihood = log_likelihoods(human, ways, whole)
     expected = torch.ones(rounds.num_people, 14, dtype=torch.bool)
-    score = torch.zeros(screening.ways, rounds.num_people, 14)
+    score = torch.zeros(screening.policies, rounds.num_people, 14)
     for number in range(4):
-        score += likelihood.gather(-1, whole.index[:, number].expand(screening.ways, -1, -1))
+        score += likelihood.gather(-1, whole.index[:, number].expand(screening.policies, -1, -1))
         best = score.amax(0).masked_fill(~expected, -math.inf)
         distance = best.amax(-1, keepdim=True) - best
         # Rounding may decide either way at the very margin; nobody is there here.
@@ -365,27 +365,27 @@ def test_a_memory_that_is_not_used_leaves_the_likelihoods_as_they_are(self_model
 def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordings, kind):
     human, rounds = kind(self_model), ragged(recordings, [[15, 9]])
     resolution = 0.1
-    screening = Screening(margin=math.inf, resolution=resolution, alike=8)
+    screening = Screening(margin=math.inf, resolution=resolution, merge_policies=8)
     whole, merged = ViewTableBuilder(human, None), ViewTableBuilder(human, screening)
     for one_round in rounds_of(rounds, 0):
         whole.add(*one_round)
         merged.add(*one_round)
     tables = [builder.table() for builder in (whole, merged)]
-    ways = merged.draw_ways()
+    policies = merged.draw_policies()
     scores = []
     for table in tables:
         with (
-            pyro.condition(data=ways),
-            pyro.plate("way", screening.ways, dim=-3),
+            pyro.condition(data=policies),
+            pyro.plate("policy", screening.policies, dim=-3),
             pyro.plate("person", 1, dim=-2),
         ):
             likelihoods = log_likelihoods(human, human.prior(), table)
         scores.append(combination_scores(table, likelihoods)[:, 0])
     torch.testing.assert_close(scores[1], merged.score, rtol=1e-4, atol=1e-3)
     off = (scores[1] - scores[0]).abs().amax(-1)
-    # Under the ways that it looks at, both are within half a step of one point, at every moment.
-    assert off[: screening.alike].max() <= (15 + 9) * resolution
-    assert off.max() > 1e-3 and off[screening.alike :].mean() < 0.5
+    # Under policies that are compared, both are within half a step of one point, at every moment.
+    assert off[: screening.merge_policies].max() <= (15 + 9) * resolution
+    assert off.max() > 1e-3 and off[screening.merge_policies :].mean() < 0.5
     assert (tables[1].index != NO_VIEW).all()
     number = [table.belief.shape[1] for table in tables]
     assert number[1] < 0.3 * number[0]

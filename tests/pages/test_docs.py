@@ -235,8 +235,8 @@ def test_priors_are_told_as_they_are(self_model):
 def test_shortcuts_are_told_with_their_tolerances():
     text = page("docs/human_model.md")
     assert f"more than {Screening().margin:.0f} nats" in text
-    assert f"of {Screening().ways} ways" in text
-    assert f"under each of {Screening().alike} of those ways" in text
+    assert f"of {Screening().policies} policies" in text
+    assert f"under each of {Screening().merge_policies} of those policies" in text
     assert f"a grid of {Screening().resolution} nats" in text
     assert f"the same at {SVIOptions().prune_margin:.0f} nats" in text
     assert SVIOptions().prune_margin == ImportanceOptions().prune_margin

@@ -179,7 +179,7 @@ def test_an_oracle_tells_what_is_worth_it():
     assert oracle.value.tolist() == pytest.approx([12 - 3 * 0.3 - 0.5], abs=1e-4)
 
 
-def test_quickness_is_learned_from_rounds(seed):
+def test_the_mean_of_noticing_is_learned_from_rounds(seed):
     """Of 36 rounds: within 4.5 standard errors, about 1 / sqrt(times found) on a logarithm."""
     truth = participants(20, seed)
     start = draw_starts(20, 36, seed, "test", domain=WORLD, fates=truth.fates)

@@ -22,6 +22,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.models.world_knowledge import fit_world
 from mirror_ppl.progress import Report, silent
 from mirror_ppl.version import __version__
 
@@ -125,7 +126,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     checkpoint = None if checkpoint is None else as_path(checkpoint, "checkpoint")
     train, test = split_rounds(demonstrations, train_rounds)
     people = train.num_people
-    human.learn_world(train)
+    fit_world(human, train)
     run = None
     if checkpoint is not None:
         run = (

@@ -2,9 +2,9 @@
 
 Implements the implants of the supplement's section C for bomb defusal::
 
-    quickness  ~ Beta(1, 9)                    how probably they notice a terminal at a step
-    evenness   ~ LogNormal(log 100, 1)         how little terminals differ in that
-    notices_k  ~ Beta(evenness * quickness, evenness * (1 - quickness))    terminal k
+    m          ~ Beta(1, 9)                    notice_mean: of noticing a terminal at a step
+    c          ~ LogNormal(log 100, 1)         notice_concentration: how little terminals differ
+    notices_k  ~ Beta(c m, c (1 - m))          probability of noticing terminal k at a step
     reads      ~ Bernoulli                     whether they can read the type of the bomb
     rule_j     ~ Categorical(permutations)     policy: which button they press for that of the robot
     guess_b    ~ Bernoulli                     in each round: the type they take it for
@@ -13,8 +13,8 @@ Implements the implants of the supplement's section C for bomb defusal::
 
 and ``a_t`` is chosen by the robot's action values at ``zH_t`` as everywhere, with buttons exchanged
 by the rule of the type that ``zH_t`` is of. By the same rules the robot's own reward model is
-wrong. What was recorded of rewards tells which hold (:meth:`Searcher.learn_world`), so they are an
-implant of the reward, too::
+wrong. Recorded rewards tell which hold (:meth:`BombDefusalHuman.fit_world`), so they are an implant
+of the reward, too::
 
     r_t ~ Normal(r(s_t, rule^-1(a_t)), 1)    r the reward as the robot was taught it
 """
@@ -38,26 +38,30 @@ from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
+from mirror_ppl.models.world_knowledge import WorldKnowledge
 
-QUICKNESS, EVENNESS = "quickness", "evenness"
+NOTICE_MEAN, NOTICE_CONCENTRATION = "notice_mean", "notice_concentration"
 READS, RULE, GUESS, FOUND, SOUGHT = "reads_type", "rule_", "guess", "found_", "sought_"
-"""Names of sites, and of the fact what is looked for at a stage."""
+"""Names of sites, and of the covariate: what is looked for at a stage."""
 SEARCHING = (1.0, 9.0)
-"""Of the prior of how probably a terminal is noticed at a step: a Beta density of mean 0.1."""
-EVEN = (100.0, 1.0)
-"""Of the prior of how alike terminals are to somebody: as if they had been searched so often
-before; median, and standard deviation of its logarithm."""
+"""Prior of the mean probability of noticing a terminal at a step: a Beta density of mean 0.1."""
+CONCENTRATION = (100.0, 1.0)
+"""Prior of the concentration around that mean, in searches that would tell as much: its median, and
+the standard deviation of its logarithm."""
 SAME = 0.5
 """Prior probability that the robot's rules for a type hold."""
 WAITS, MOST_WAITS, BLIND = 2.0, 8.0, 4.0
 """In nats, what it takes to explain a wait although it was found, several of them at most, and a
 press although it was not."""
+RULE_NAMES = [" ".join(pressed) for pressed in permutations(BUTTONS)]
+"""Of each rule: what they press where the robot would press each of the buttons in turn."""
+RULE_NAMES[0] += " (as the robot)"
 EVEN_ODDS = 0.5
 REWARD_SCALE = 1.0
 """Standard deviation of recorded rewards, in units of reward."""
 
 
-class Searcher(HumanModel):
+class BombDefusalHuman(HumanModel, WorldKnowledge):
     """Finds what counts sooner or later, guesses what nobody says, and knows the rules.
 
     Args:
@@ -66,13 +70,14 @@ class Searcher(HumanModel):
     Attributes:
         kinds: types of bombs, as sites name them.
         rule_logits: of each permutation of buttons, by type, ``[2, 24]``; the prior until
-            :meth:`learn_world` was called.
+            :meth:`fit_world` was called.
         exchanges: these permutations, ``[24, 4, 4]``: the button that somebody presses, and that
             which the robot would.
     """
 
     kinds = tuple(kind.lower().replace(" ", "_") for kind in KINDS)
-    of_the_world = tuple(RULE + kind.lower().replace(" ", "_") for kind in KINDS)
+    world_sites = tuple(RULE + kind.lower().replace(" ", "_") for kind in KINDS)
+    value_names = dict.fromkeys(world_sites, RULE_NAMES)
     rule_logits: Tensor
     exchanges: Tensor
 
@@ -92,13 +97,6 @@ class Searcher(HumanModel):
         assert isinstance(world, BombDefusal)
         return world
 
-    @property
-    def value_names(self) -> dict[str, list[str]]:
-        """Of each rule: what they press where the robot would press each of the buttons in turn."""
-        same, *others = (" ".join(pressed) for pressed in permutations(BUTTONS))
-        names = [f"{same} (as the robot)", *others]
-        return {RULE + kind: names for kind in self.kinds}
-
     def _prior_of_rules(self) -> Tensor:
         number = len(self.exchanges)
         prior = self.exchanges.new_full((len(KINDS), number), (1 - SAME) / (number - 1))
@@ -106,7 +104,7 @@ class Searcher(HumanModel):
         return prior.log()
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample how quick they are, whether they read the type, their rules and choices."""
+        """Sample how they notice terminals, whether they read the type, their rules and choices."""
         like = next(self.self_model.parameters())
         return (
             self.perceptual_implants()
@@ -115,16 +113,18 @@ class Searcher(HumanModel):
         )
 
     def perceptual_implants(self) -> dict[str, Tensor]:
-        """Sample how quick they are at each terminal, and whether they read the type."""
+        """Sample how probably they notice each terminal, and whether they read the type."""
         like = next(self.self_model.parameters())
         success, failure = like.new_tensor(SEARCHING)
-        quickness = pyro.sample(QUICKNESS, dist.Beta(success, failure))
-        median, spread = like.new_tensor(EVEN)
-        evenness = pyro.sample(EVENNESS, dist.LogNormal(median.log(), spread))
-        alike = (evenness * quickness, evenness * (1 - quickness))
+        notice_mean = pyro.sample(NOTICE_MEAN, dist.Beta(success, failure))
+        median, spread = like.new_tensor(CONCENTRATION)
+        notice_concentration = pyro.sample(
+            NOTICE_CONCENTRATION, dist.LogNormal(median.log(), spread)
+        )
+        shape = (notice_concentration * notice_mean, notice_concentration * (1 - notice_mean))
         return (
-            {QUICKNESS: quickness, EVENNESS: evenness}
-            | implant_priors.notice_implants(self.domain, like, *alike)
+            {NOTICE_MEAN: notice_mean, NOTICE_CONCENTRATION: notice_concentration}
+            | implant_priors.notice_implants(self.domain, like, *shape)
             | {READS: pyro.sample(READS, dist.Categorical(like.new_full((2,), 0.5)))}
         )
 
@@ -258,7 +258,7 @@ class Searcher(HumanModel):
         return (exchange @ presses[..., None]).squeeze(-1)
 
     @torch.no_grad()
-    def learn_world(self, demonstrations: Demonstrations) -> None:
+    def fit_world(self, demonstrations: Demonstrations) -> None:
         """Learn which rules hold from recorded rewards: the posterior becomes the prior.
 
         What is right in the world is so for everybody, so all rounds of all people tell. The
@@ -291,7 +291,7 @@ class Searcher(HumanModel):
             logits[number] += (under * scores[some]).sum((1, 2))
         self.rule_logits.copy_(logits - logits.logsumexp(-1, keepdim=True))
 
-    def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
+    def planning_domain(self, draws: Mapping[str, Tensor]) -> Domain:
         """The bomb by the rules that are likeliest to hold."""
         rules = []
         for kind, logits, row in zip(

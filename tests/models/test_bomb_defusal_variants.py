@@ -3,18 +3,23 @@
 import pytest
 import torch
 from example_course import beliefs_of, gone_through
-from test_searcher import WORLD, course, implants
+from test_bomb_defusal_human import WORLD, course, implants
 
 from mirror_ppl.domains.bomb_panel import RULES
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.models.bomb_defusal import RULE, BombDefusalHuman
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import sample_sites
-from mirror_ppl.models.searcher import RULE, Searcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.people import simulate
 
-SEARCH = {"quickness", "evenness", "reads_type", *(f"notices_terminal {k}" for k in range(1, 7))}
+SEARCH = {
+    "notice_mean",
+    "notice_concentration",
+    "reads_type",
+    *(f"notices_terminal {k}" for k in range(1, 7)),
+}
 CHOICE = {"consistency", "lapse"}
 RESIDUAL = {"residual_in", "residual_out"}
 RULES_OF = {"rule_type_a", "rule_type_b"}
@@ -86,9 +91,9 @@ def test_policy_alone_sees_all_at_once_and_presses_by_the_rules(robot):
 
 def test_what_rewards_tell_of_the_world_needs_no_implant_of_it(robot):
     human = variant("perceptual-only", robot)
-    assert isinstance(human, Searcher) and type(human) is not Searcher
-    human.learn_world(simulate("bomb_defusal", "labelled", "paper", 3, rounds=20, seed=0))
-    world = human.known_world({})
+    assert isinstance(human, BombDefusalHuman) and type(human) is not BombDefusalHuman
+    human.fit_world(simulate("bomb_defusal", "labelled", "paper", 3, rounds=20, seed=0))
+    world = human.planning_domain({})
     assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -96,5 +101,5 @@ def test_draws_of_rules_go_before_what_was_learned(robot):
     """Of the drawn permutation, not of the likeliest one."""
     human = variant("mirror", robot)
     other = torch.full((3, 1, 1), 5)
-    drawn = human.known_world({RULE + kind: other for kind in human.kinds})
-    assert drawn.rules != human.known_world({}).rules
+    drawn = human.planning_domain({RULE + kind: other for kind in human.kinds})
+    assert drawn.rules != human.planning_domain({}).rules

@@ -7,13 +7,13 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.human import HumanModel, Implants
-from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.variants import NoImplants
 from mirror_ppl.models.view import View
 
 
-class PerceptualSearcher(Searcher):
+class BombDefusalPerceptualOnly(BombDefusalHuman):
     """Searches and guesses, but decides as the robot does: by its rules, without a residual."""
 
     def prior(self) -> dict[str, Tensor]:
@@ -26,12 +26,13 @@ class PerceptualSearcher(Searcher):
         return HumanModel.act(self, implants, belief, values)
 
 
-class KnowingSearcher(Searcher):
+class BombDefusalPolicyOnly(BombDefusalHuman):
     """Knows the rules, and sees all that there is at once: nothing is left to be searched."""
 
     round_latents = HumanModel.round_latents
     covariates = HumanModel.covariates
     log_proposal = HumanModel.log_proposal
+    spans = HumanModel.spans
 
     def prior(self) -> dict[str, Tensor]:
         """Sample their rules, and how they decide."""
@@ -50,7 +51,7 @@ class KnowingSearcher(Searcher):
         return HumanModel.perceive(self, implants, knowledge, observation, told, step)
 
 
-class KnowingRobot(NoImplants):
+class BombDefusalNoImplants(NoImplants):
     """The robot itself, but for how strictly it chooses: sees everything, also the type."""
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:

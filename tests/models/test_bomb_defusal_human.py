@@ -23,10 +23,10 @@ from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.networks import Gaussian
-from mirror_ppl.models.searcher import Searcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -39,9 +39,9 @@ RESIDUAL = {"residual_in": (49, 8), "residual_out": (9, 5)}
 
 
 @pytest.fixture(scope="module")
-def searcher():
+def defuser():
     torch.manual_seed(0)
-    return Searcher(SelfModel(WORLD))
+    return BombDefusalHuman(SelfModel(WORLD))
 
 
 def course(actions, seed=0, rounds=1):
@@ -54,7 +54,7 @@ def course(actions, seed=0, rounds=1):
     return {name: torch.stack([o[name] for o in observed], 1) for name in observed[0]}, states
 
 
-def implants(searcher, seed=0, **values):
+def implants(defuser, seed=0, **values):
     """Sites of one person with given values."""
     given = {name: torch.tensor([[value]]) for name, value in values.items()}
     with (
@@ -63,59 +63,59 @@ def implants(searcher, seed=0, **values):
         pyro.plate("person", 1, dim=-2),
     ):
         torch.manual_seed(seed)
-        return searcher.prior()
+        return defuser.prior()
 
 
-def test_it_is_the_package_s_own_model_of_bomb_defusal(searcher):
-    assert type(load_human_model(None, searcher.self_model)) is Searcher
-    assert type(load_human_model("mirror", searcher.self_model)) is Searcher
+def test_it_is_the_package_s_own_model_of_bomb_defusal(defuser):
+    assert type(load_human_model(None, defuser.self_model)) is BombDefusalHuman
+    assert type(load_human_model("mirror", defuser.self_model)) is BombDefusalHuman
     assert type(load_human_model(None, SelfModel(get_domain("driving")))) is HumanModel
-    check_contract(searcher)
-    assert searcher.has_round_latents
+    check_contract(defuser)
+    assert defuser.has_round_latents
 
 
-def test_what_is_looked_for_is_known_of_the_stages_that_were_reached(searcher):
+def test_what_is_looked_for_is_known_of_the_stages_that_were_reached(defuser):
     observation, states = course([WAIT, 1, 2, WAIT], rounds=5)
-    facts = searcher.covariates(observation)
+    covariates = defuser.covariates(observation)
     for stage in range(3):
-        assert torch.equal(facts[f"sought_{stage}"], states[0].live[:, stage])
+        assert torch.equal(covariates[f"sought_{stage}"], states[0].live[:, stage])
     # Of later stages it is taken to be as at the last one.
     early = {name: value[:, :3] for name, value in observation.items()}
-    facts = searcher.covariates(early)
-    assert torch.equal(facts["sought_1"], states[0].live[:, 1])
-    assert torch.equal(facts["sought_2"], states[0].live[:, 1])
+    covariates = defuser.covariates(early)
+    assert torch.equal(covariates["sought_1"], states[0].live[:, 1])
+    assert torch.equal(covariates["sought_2"], states[0].live[:, 1])
 
 
-def test_terminals_share_a_mean_as_far_as_they_are_alike(searcher):
-    """Beta densities of mean ``quickness`` that are worth ``evenness`` searches."""
-    given = {"quickness": torch.tensor([[0.04]]), "evenness": torch.tensor([[50.0]])}
+def test_terminals_share_a_mean_as_far_as_they_are_alike(defuser):
+    """Beta densities of mean ``notice_mean`` that are worth ``notice_concentration`` searches."""
+    given = {"notice_mean": torch.tensor([[0.04]]), "notice_concentration": torch.tensor([[50.0]])}
     with (
         torch.random.fork_rng(),
         poutine.trace() as trace,
         poutine.condition(data=given),
         pyro.plate("person", 1, dim=-2),
     ):
-        searcher.prior()
+        defuser.prior()
     for terminal in range(1, 7):
         prior = trace.trace.nodes[f"notices_terminal {terminal}"]["fn"]
         assert float(prior.concentration1) == pytest.approx(2.0)
         assert float(prior.concentration0) == pytest.approx(48.0)
-    assert float(trace.trace.nodes["quickness"]["fn"].mean) == pytest.approx(0.1)
+    assert float(trace.trace.nodes["notice_mean"]["fn"].mean) == pytest.approx(0.1)
 
 
-def test_finding_is_geometric_with_the_probability_of_what_is_looked_for(searcher):
-    """By the facts of the round: 0.1 of terminal 1, 0.5 of terminal 2."""
-    some = implants(searcher, **{"notices_terminal 1": 0.1, "notices_terminal 2": 0.5})
+def test_finding_is_geometric_with_the_probability_of_what_is_looked_for(defuser):
+    """By the covariates of the round: 0.1 of terminal 1, 0.5 of terminal 2."""
+    some = implants(defuser, **{"notices_terminal 1": 0.1, "notices_terminal 2": 0.5})
     ways = {name: value[None] for name, value in some.items()}
-    facts = {f"sought_{stage}": torch.tensor([[stage % 2]]) for stage in range(3)}
-    found = site_probabilities(searcher, ways, facts=facts)
+    covariates = {f"sought_{stage}": torch.tensor([[stage % 2]]) for stage in range(3)}
+    found = site_probabilities(defuser, ways, covariates=covariates)
     for stage, p in enumerate((0.1, 0.5, 0.1)):
         expected = p * (1 - p) ** torch.arange(60.0)
         torch.testing.assert_close(found[f"found_{stage}"][:60], expected, rtol=1e-4, atol=1e-7)
     assert found["guess"].tolist() == [0.5, 0.5]
 
 
-def test_what_counts_is_seen_once_found_and_at_no_other_stage(searcher):
+def test_what_counts_is_seen_once_found_and_at_no_other_stage(defuser):
     observation, states = course([WAIT, WAIT, 1, WAIT, WAIT])
     sites = {f"found_{stage}": torch.tensor([[when]]) for stage, when in enumerate((2, 1, 60))}
     for reads in (0, 1):
@@ -124,7 +124,7 @@ def test_what_counts_is_seen_once_found_and_at_no_other_stage(searcher):
             now = {name: value[:, step] for name, value in observation.items()}
             own = {name: value[0] for name, value in sites.items()}
             own["reads_type"] = torch.tensor([reads])
-            visible = searcher.sees(own, now, step)
+            visible = defuser.sees(own, now, step)
             assert visible["verbal"].tolist() == [[bool(reads)]]
             shown = visible["visual"][0].nonzero().flatten().tolist()
             live = int(states[step].live[0, min(int(states[step].stage[0]), 2)])
@@ -134,7 +134,7 @@ def test_what_counts_is_seen_once_found_and_at_no_other_stage(searcher):
         assert seen == [False, False, True, False, True, True]
 
 
-def test_an_unknown_type_is_taken_for_what_is_guessed(searcher):
+def test_an_unknown_type_is_taken_for_what_is_guessed(defuser):
     observation, _ = course([WAIT, WAIT])
     now = {name: value[:, 0] for name, value in observation.items()}
     nothing = {"visual": torch.zeros(1, 6, dtype=torch.bool), "verbal": torch.zeros(1, 1).bool()}
@@ -142,20 +142,20 @@ def test_an_unknown_type_is_taken_for_what_is_guessed(searcher):
     for guess in (0, 1):
         own |= {"guess": torch.tensor([guess]), "reads_type": torch.tensor([0])}
         knowledge = WORLD.nothing_known(1)
-        view, knowledge = searcher.perceive(own, knowledge, now, nothing, 0)
+        view, knowledge = defuser.perceive(own, knowledge, now, nothing, 0)
         assert view.taken["verbal"].all() and not view.visible["verbal"].any()
         assert view.imagined["verbal"].flatten().tolist() == [guess]
         assert not view.taken["visual"].any()
         # It is believed as if it were told.
         told = {**nothing, "verbal": torch.ones(1, 1, dtype=torch.bool)}
         if guess == int(observation["verbal"][0, 0, 0, 0]):
-            heard, _ = searcher.perceive(own, WORLD.nothing_known(1), now, told, 0)
-            torch.testing.assert_close(searcher.evidence(heard, now), searcher.evidence(view, now))
-        heard, _ = searcher.perceive(own, knowledge, now, told, 1)
+            heard, _ = defuser.perceive(own, WORLD.nothing_known(1), now, told, 0)
+            torch.testing.assert_close(defuser.evidence(heard, now), defuser.evidence(view, now))
+        heard, _ = defuser.perceive(own, knowledge, now, told, 1)
         assert heard.visible["verbal"].all() and not heard.taken["verbal"].any()
 
 
-def test_beliefs_stay_as_they_are_while_there_is_no_news(searcher):
+def test_beliefs_stay_as_they_are_while_there_is_no_news(defuser):
     """News: the first look, the terminal once found, what is told, and the next stage."""
     actions = [WAIT] * 5 + [2] + [WAIT] * 4
     observation, _ = course(actions)
@@ -163,22 +163,22 @@ def test_beliefs_stay_as_they_are_while_there_is_no_news(searcher):
     own |= {"guess": torch.tensor([1]), "reads_type": torch.tensor([0])}
     told = {"visual": torch.zeros(1, 11, 6).bool(), "verbal": torch.zeros(1, 11, 1).bool()}
     told["verbal"][0, [4, 5]] = True
-    view = perceived(searcher, own, observation, told)
+    view = perceived(defuser, own, observation, told)
     assert view.still is not None
     news = (~view.still[0]).nonzero().flatten().tolist()
     assert news == [0, 2, 4, 6]
-    belief = beliefs_of(searcher, view, observation, torch.tensor([[*actions, WAIT]]))[0]
+    belief = beliefs_of(defuser, view, observation, torch.tensor([[*actions, WAIT]]))[0]
     assert (belief[1:] != belief[:-1]).any(-1).nonzero().flatten().tolist() == [1, 3, 5]
     # The same by the robot's own networks, of whole rounds.
-    model, done = searcher.self_model, torch.tensor([actions])
-    evidence = searcher.evidence(view, observation) + model.encoder.previous_actions(done)
+    model, done = defuser.self_model, torch.tensor([actions])
+    evidence = defuser.evidence(view, observation) + model.encoder.previous_actions(done)
     torch.testing.assert_close(model.believe(evidence, view.still)[0], belief)
 
 
 def test_who_is_asked_to_play_searches_for_what_each_stage_shows():
     """Terminal 1 is found at once, all others never: a stage ends if it shows terminal 1."""
     torch.manual_seed(0)
-    human = Searcher(Knowing(WORLD))
+    human = BombDefusalHuman(Knowing(WORLD))
     quick = {f"notices_terminal {k}": torch.tensor([[1e-6]]) for k in range(2, 7)}
     quick |= {"notices_terminal 1": torch.tensor([[1 - 1e-6]])}
     quick |= {"consistency": torch.tensor([[20.0]]), "lapse": torch.tensor([[1e-6]])}
@@ -194,20 +194,20 @@ def test_who_is_asked_to_play_searches_for_what_each_stage_shows():
     )
 
 
-def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(searcher, monkeypatch):
+def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(defuser, monkeypatch):
     """Where the robot would press b, they press ORDERS[rule][b]: values go with the buttons."""
     values = torch.tensor([0.5, 1.0, 2.0, 3.0, 4.0]).expand(1, 1, 5)
     belief = torch.zeros(1, 1, 48)
     for kind, rule in ((0, 1), (1, 9)):
         monkeypatch.setattr(
-            searcher, "believed_kind", lambda belief, kind=kind: torch.full((1, 1), float(kind))
+            defuser, "believed_kind", lambda belief, kind=kind: torch.full((1, 1), float(kind))
         )
-        some = implants(searcher, lapse=1e-9, consistency=1.0) | {
+        some = implants(defuser, lapse=1e-9, consistency=1.0) | {
             **{name: torch.zeros(1, 1, *shape) for name, shape in RESIDUAL.items()},
             "rule_type_a": torch.tensor([[1]]),
             "rule_type_b": torch.tensor([[9]]),
         }
-        found = searcher.act(some, belief, values).flatten()
+        found = defuser.act(some, belief, values).flatten()
         expected = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0])
         for robot in range(4):
             expected[1 + ORDERS[rule][robot]] = 1.0 + robot
@@ -217,49 +217,49 @@ def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(searcher, mon
 def test_rules_are_learned_from_rewards_and_planned_with():
     """Of forty rounds or so there is one set of rules that explains all rewards."""
     torch.manual_seed(0)
-    human = Searcher(SelfModel(WORLD))
+    human = BombDefusalHuman(SelfModel(WORLD))
     torch.testing.assert_close(human.rule_logits.exp().sum(-1), torch.ones(2))
     assert human.rule_logits.exp()[:, 0].tolist() == pytest.approx([0.5, 0.5])
     recorded = simulate("bomb_defusal", "labelled", people=3, rounds=20, seed=1)
-    human.learn_world(recorded)
+    human.fit_world(recorded)
     learned = [ORDERS[int(logits.argmax())] for logits in human.rule_logits]
     assert human.rule_logits.exp().amax(-1).min() > 0.99
     for kind in range(2):
         for symbol in range(4):
             assert learned[kind][OLD_RULES[kind][symbol]] == RULES[kind][symbol]
     some = implants(human)
-    assert human.known_world({name: value[None] for name, value in some.items()}).rules == RULES
+    assert human.planning_domain({name: value[None] for name, value in some.items()}).rules == RULES
     # Asked again it learns the same.
     before = human.rule_logits.clone()
-    human.learn_world(recorded)
+    human.fit_world(recorded)
     assert torch.equal(human.rule_logits, before)
     # Without rewards there is nothing to learn.
-    again = Searcher(human.self_model)
-    again.learn_world(replace(recorded, rewards=None))
+    again = BombDefusalHuman(human.self_model)
+    again.fit_world(replace(recorded, rewards=None))
     assert again.rule_logits.exp()[:, 0].tolist() == pytest.approx([0.5, 0.5])
 
 
-def test_what_was_done_tells_when_it_was_found(searcher):
+def test_what_was_done_tells_when_it_was_found(defuser):
     observation, _ = course([WAIT] * 4 + [2] + [WAIT] * 3)
     own = {name: value[0] for name, value in observation.items()}
     actions = torch.tensor([WAIT] * 4 + [2] + [WAIT] * 3)
-    found = searcher.log_proposal(own, actions)
+    found = defuser.log_proposal(own, actions)
     # Pressed at the fifth step: found just then, rather than before or after.
     assert int(found["found_0"].argmax()) == 4
     assert set(found) == {"found_0", "found_1"}
     later = found["found_1"]
     assert later[3:].tolist() == [0.0] * 58 and (later[:2] < 0).all()
-    proposal = Proposal(searcher, *(2 * [{n: v[None] for n, v in implants(searcher).items()}]), 64)
-    facts = {name: fact.view(1, 1) for name, fact in searcher.covariates(observation).items()}
-    chosen = proposal.values(None, 0, facts, found)
+    proposal = Proposal(defuser, *(2 * [{n: v[None] for n, v in implants(defuser).items()}]), 64)
+    covariates = {name: value.view(1, 1) for name, value in defuser.covariates(observation).items()}
+    chosen = proposal.values(None, 0, covariates, found)
     weights = torch.bincount(chosen.values["found_0"], minlength=61)
     assert int(weights.argmax()) == 4
-    assert chosen.facts.keys() == facts.keys()
+    assert chosen.covariates.keys() == covariates.keys()
 
 
-def test_who_is_in_a_round_has_not_found_what_they_wait_for(searcher):
+def test_who_is_in_a_round_has_not_found_what_they_wait_for(defuser):
     """A consistent person who waited four steps: most draws have not found it yet."""
-    some = implants(searcher, **{"notices_terminal 1": 0.2}, consistency=20.0, lapse=0.01)
+    some = implants(defuser, **{"notices_terminal 1": 0.2}, consistency=20.0, lapse=0.01)
     draws = {name: value.expand(40, *value.shape).clone() for name, value in some.items()}
     observation, _ = course([WAIT] * 4)
     rounds = RoundSoFar.begin(WORLD, {name: value[0, 0] for name, value in observation.items()})
@@ -267,16 +267,16 @@ def test_who_is_in_a_round_has_not_found_what_they_wait_for(searcher):
     for step in range(1, 5):
         now = {name: value[0, step] for name, value in observation.items()}
         rounds = rounds.then(quiet, WAIT, now)
-    person = Person(searcher, draws).in_round(rounds)
+    person = Person(defuser, draws).in_round(rounds)
     found = person.eyes["found_0"][person.eye]
     assert len(found) == 40 and found.unique().numel() > 1
 
 
-def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(searcher):
+def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(defuser):
     """Two courses reach the same belief, one of them a step later: there is one of it."""
-    some = implants(searcher)
+    some = implants(defuser)
     draws = {name: value.expand(2, *value.shape).clone() for name, value in some.items()}
-    person = Person(searcher, draws)
+    person = Person(defuser, draws)
     observation, _ = course([WAIT] * 3)
     now = {name: value[0, :1] for name, value in observation.items()}
     eyes = {f"found_{stage}": torch.tensor([0, 1]) for stage in range(3)}
@@ -312,9 +312,9 @@ def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(searcher):
 def test_a_person_s_probabilities_come_out_of_their_rounds():
     """With a self-model that presses when it knows and waits until then, by hand."""
     torch.manual_seed(0)
-    human = Searcher(Knowing(WORLD))
+    human = BombDefusalHuman(Knowing(WORLD))
     recorded = simulate("bomb_defusal", "labelled", people=1, rounds=12, seed=0)
-    human.learn_world(recorded)
+    human.fit_world(recorded)
     builder = ViewTableBuilder(human, Screening())
     for one_round in rounds_of(recorded, 0):
         builder.add(*one_round)
@@ -389,7 +389,7 @@ class Kind(torch.nn.Module):
 
 
 def test_of_rules_the_most_probable_one_is_told():
-    human = Searcher(load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")[0])
+    human = BombDefusalHuman(load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")[0])
     names = human.value_names["rule_type_b"]
     assert len(names) == len(set(names)) == len(human.exchanges)
     # What is pressed for the robot's second button by the rule of that name.
