@@ -57,6 +57,7 @@ def by_elbo(network: AmortizedGuide, groups: Sequence[Group], steps: int, turns:
             yield group
 
     torch.manual_seed(0)
+    network.train()
     training = ELBOTraining(network, noted(), LEARNING_RATE)
     for _ in range(steps):
         training.step()
