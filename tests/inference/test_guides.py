@@ -70,7 +70,7 @@ def options_of(guide):
 
 QUICK = {
     "importance": ImportanceOptions(256, 100.0),
-    "amortized": AmortizedOptions(256, 100.0),
+    "amortized": AmortizedOptions(256, ImportanceOptions(256, 100.0)),
 }
 """Settings of the engines that are calibrated here."""
 
