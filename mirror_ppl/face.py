@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from mirror_ppl.checks import require_kind, seed_number, whole_number
 from mirror_ppl.communication.communicator import Communicator as PlannedCommunicator
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.console import usable_device
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations

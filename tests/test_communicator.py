@@ -24,8 +24,8 @@ from mirror_ppl.communication import (
     ExpectedUtility,
     Gain,
     Person,
+    PlanningContext,
     SimulatorWorld,
-    Standing,
     Valued,
 )
 from mirror_ppl.communication.communicator import TIE, choose, gain_over_silence
@@ -111,8 +111,8 @@ class Asked:
     def __init__(self, worth=0.0):
         self.worth, self.given = worth, []
 
-    def at(self, standing, steps_left, seed):
-        self.given.append({"time": standing.past.time, "steps_left": steps_left, "seed": seed})
+    def at(self, context, steps_left, seed):
+        self.given.append({"time": context.past.time, "steps_left": steps_left, "seed": seed})
         return lambda candidates: Valued(self.worth * candidates[:, 0].sum(-1, True).float(), None)
 
     def __call__(self, value, allowed, seed):
@@ -220,12 +220,12 @@ def test_silence_to_somebody_who_sees_everything(assumes_clear, assumes_closing,
     ahead, behind = ["front-left", "front-right"], ["rear-left", "rear-right"]
     messages = [flags(visual=ahead[:1]), flags(visual=ahead[1:]), flags(visual=ahead)]
     messages += [flags(verbal=ahead[:1]), flags(verbal=ahead + behind)]
-    value = someone.objective.at(Standing.of(someone.person, past), 14, 0)
+    value = someone.objective.at(PlanningContext.of(someone.person, past), 14, 0)
     utility = value(torch.stack([plan(None), *map(plan, messages)])).utility
     expected = -torch.tensor([0.01, 0.01, 0.04, 0.03, 0.48])[:, None].expand(5, 4)
     torch.testing.assert_close(utility[1:] - utility[0], expected)
     # At first sight, to be shown what they see is no news either.
-    first = someone.objective.at(Standing.of(someone.person, begun(*scene)), 15, 0)
+    first = someone.objective.at(PlanningContext.of(someone.person, begun(*scene)), 15, 0)
     utility = first(torch.stack([plan(None), *map(plan, messages[:3])])).utility
     torch.testing.assert_close(utility[1:] - utility[0], expected[:3])
 
@@ -270,7 +270,7 @@ def test_who_was_told_need_not_be_told_again(name, speed, closing, news):
     message, now = flags(**{name: ["front-left"]}), (0, [5, 9, -9, -9], [speed, 1, -1, -1])
     first = begun(0, [5 - speed, 8, -8, -8], now[2])
     past = first.then(CHANNELS.split(message), 0, begun(*now).now)
-    value = communicator.objective.at(Standing.of(communicator.person, past), 14, 0)
+    value = communicator.objective.at(PlanningContext.of(communicator.person, past), 14, 0)
     utility = value(torch.stack([plan(None), plan(message)])).utility
     gain = utility[1] - utility[0] + CHANNELS.cost(message)
     assert (gain > 0.5).all() if news else (gain.abs() < 1e-5).all()
@@ -301,7 +301,7 @@ def test_a_car_in_the_fog_is_told_of(assumes_clear, lane):
 class Later:
     """To speak is worth 2 at the next step and 1 at others; to do both is worth no more."""
 
-    def at(self, standing, steps_left, seed):
+    def at(self, context, steps_left, seed):
         worth = torch.tensor([1.0, 2.0, 1.0])
 
         def value(candidates):

@@ -11,7 +11,7 @@ from pyro.infer import SVI, Trace_ELBO
 from pyro.infer.autoguide import AutoNormal
 from test_one_program import PROGRAMS, exact_mean, recordings, self_model, toy
 
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference import batches
 from mirror_ppl.inference.engines import InferenceOptions, infer

@@ -2,12 +2,11 @@
 
 import pytest
 import torch
-from example_course import beliefs_of, gone_through
+from example_course import beliefs_of, gone_through, perceived
 from test_searcher import WORLD, course, implants
 
 from mirror_ppl.domains.bomb_panel import RULES
 from mirror_ppl.likelihood.contract import check_contract
-from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.searcher import RULE, Searcher

@@ -9,13 +9,13 @@ import pytest
 import torch
 from example_course import gone_through
 from example_person import Averaging, Unused
+from mirror_ppl.likelihood.belief_nodes import _beginnings
 
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import roll_out
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.likelihood.belief_nodes import _beginnings
 from mirror_ppl.likelihood.combinations import MAX_COMBINATIONS
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import (

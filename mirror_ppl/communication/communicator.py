@@ -19,8 +19,8 @@ from torch import Tensor
 
 from mirror_ppl.checks import real_number, require_kind, require_methods, seed_number
 from mirror_ppl.communication.messages import Channels, Message
-from mirror_ppl.communication.minds import Person, Standing
 from mirror_ppl.communication.objectives import Objective, Value, Valued
+from mirror_ppl.communication.person import Person, PlanningContext
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
 from mirror_ppl.domains.base import Domain, Observation, Visibility
@@ -297,12 +297,12 @@ class Communicator:
         over = steps_left < 1 or bool(domain.over(domain.state_behind(now)))
         if over or not allowed.any():
             return self._silence(now, allowed, over)
-        standing = Standing.of(self.person, past)
-        allowed = standing.telling(allowed)
+        context = PlanningContext.of(self.person, past)
+        allowed = context.telling(allowed)
         if not allowed.any():
             return self._silence(now, allowed)
         seed = self.seed * (domain.horizon + 1) + past.time
-        value = self.objective.at(standing, steps_left, seed)
+        value = self.objective.at(context, steps_left, seed)
         found = self.search(value, allowed, seed)
         chosen = choose(found.valued, self.sure)
         found, chosen = slimmed(value, found, chosen, self.sure)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from mirror_ppl.communication.communicator import Communicator
-from mirror_ppl.communication.minds import Person
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective
+from mirror_ppl.communication.person import Person
+from mirror_ppl.communication.rollouts import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.search import Automatic
-from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.errors import UnknownNameError
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mirror_ppl import __version__
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.evaluation.assistance import (
     COMMUNICATORS,

@@ -119,9 +119,10 @@ def moments_along(
         before = actions[0, step - 1] if step else actions.new_tensor(action_count)
         now, heard = at_step(observation, step), messages_at(told, step)
         transitions.append(Transition(implants, before.expand(number), now, heard))
-    for step, state in zip(steps, state.through(transitions) if steps else (), strict=True):
-        moments[:, step] = state.belief * action_count + actions[0, step]
-    return state, moments
+    states = state.through(transitions) if steps else []
+    for step, now in zip(steps, states, strict=True):
+        moments[:, step] = now.belief * action_count + actions[0, step]
+    return [state, *states][-1], moments
 
 
 def views_of_moments(state: BeliefState, numbers: Tensor) -> tuple[RoundViews, Tensor]:

@@ -166,9 +166,7 @@ class ViewTableBuilder:
             candidates |= {name: value.repeat(number) for name, value in attended.values.items()}
             number = number * each
         steps = int(real.sum())
-        part, which = round_views(
-            self.human, candidates, number, observation, told, actions, steps
-        )
+        part, which = round_views(self.human, candidates, number, observation, told, actions, steps)
         if self.screening is not None and self.screening.resolution > 0:
             part, place = self._merged(part, self.screening)
             which = place[which]

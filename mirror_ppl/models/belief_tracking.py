@@ -103,6 +103,11 @@ class BeliefState:
         knowledge = human.domain.nothing_known(number, device=zero.device)
         return cls(human, zero, None, own, knowledge, memory=memory)
 
+    @property
+    def believed(self) -> Tensor:
+        """The belief of each person, ``[n, Z]``."""
+        return self.mean[self.belief]
+
     def at(self, rows: Tensor) -> BeliefState:
         """Of some of these people, or of some more than once."""
         knowledge = map_state(lambda part: part[rows], self.knowledge)
@@ -150,7 +155,8 @@ class BeliefState:
         state, states = replace(self, belief=self.belief[one]), []
         for place in range(steps):
             stays = None if still is None else still[:, place]
-            state = state._infer(*parts[..., place], evidence, stays)
+            done, given, which = parts[..., place].unbind()
+            state = state._infer(done, given, which, evidence, stays)
             states.append(replace(state, belief=state.belief[same], knowledge=knowledge[place]))
         return states
 
