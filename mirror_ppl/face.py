@@ -198,7 +198,9 @@ class Communicator(PlannedCommunicator):
             require_known(name, "setting", known)
         options = PlannerOptions.of(listener.human.domain.name, **settings)
         made = planner_of(planner, listener, options, seed_number(seed))
-        super().__init__(made.person, made.objective, made.search, made.sure, made.seed)
+        super().__init__(
+            made.person, made.objective, made.search, made.min_standard_errors, made.seed
+        )
 
 
 def load_recordings(

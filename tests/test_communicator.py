@@ -95,11 +95,11 @@ def test_a_gain_by_hand():
     assert silence == Gain(0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("sure", [-0.1, -3.0])
-def test_less_than_no_assurance_is_refused(sure):
+@pytest.mark.parametrize("least", [-0.1, -3.0])
+def test_less_than_no_assurance_is_refused(least):
     with pytest.raises(ValueError) as error:
-        Communicator(person(), ExpectedUtility(WORLD), sure=sure)
-    assert str(error.value) == f"sure must be at least 0, not {sure}"
+        Communicator(person(), ExpectedUtility(WORLD), min_standard_errors=least)
+    assert str(error.value) == f"min_standard_errors must be at least 0, not {least}"
 
 
 # --- what it asks for -------------------------------------------------------------------------
@@ -356,14 +356,14 @@ def rounds(generator):
 def test_nothing_is_kept_between_decisions(rounds, generator):
     """In whatever order rounds come, and whatever is drawn elsewhere, decisions are the same."""
     someone = Person(human(), varied_draws(6, generator))
-    communicator = Communicator(someone, ExpectedUtility(WORLD, 4, branch=0.3), seed=5)
+    communicator = Communicator(someone, ExpectedUtility(WORLD, 4, enumerate_above=0.3), seed=5)
     forward = [communicator.plan(past) for past in rounds]
     torch.manual_seed(1)
     state = torch.get_rng_state()
     backward = [communicator.plan(past) for past in reversed(rounds)][::-1]
     assert torch.equal(torch.get_rng_state(), state)
     fresh = Communicator(
-        Person(human(), someone.draws), ExpectedUtility(WORLD, 4, branch=0.3), seed=5
+        Person(human(), someone.draws), ExpectedUtility(WORLD, 4, enumerate_above=0.3), seed=5
     )
     for past, one, other in zip(rounds, forward, backward, strict=True):
         assert same(one, other)
@@ -373,7 +373,9 @@ def test_nothing_is_kept_between_decisions(rounds, generator):
 def test_another_seed_is_other_luck(rounds, generator):
     someone = Person(human(), varied_draws(6, generator))
     one, other = (
-        Communicator(someone, ExpectedUtility(WORLD, 4, branch=1), seed=seed).plan(rounds[0])
+        Communicator(someone, ExpectedUtility(WORLD, 4, enumerate_above=1), seed=seed).plan(
+            rounds[0]
+        )
         for seed in (0, 1)
     )
     assert not torch.equal(one.found.valued.utility[0], other.found.valued.utility[0])
@@ -397,7 +399,7 @@ def test_cross_entropy_finds_what_trying_everything_finds(seed):
     past, _ = random_round(3, generator)
     utility = ExpectedUtility(WORLD, 3)
     every, searched = (
-        Communicator(someone, utility, search, sure=0.0).plan(past)
+        Communicator(someone, utility, search, min_standard_errors=0.0).plan(past)
         for search in (Exhaustive(), CrossEntropy(1))
     )
     assert searched.gain.mean == pytest.approx(every.gain.mean, abs=1e-4)

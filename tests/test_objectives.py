@@ -207,7 +207,7 @@ def test_utilities_are_those_of_every_course(
     else:
         real, own = Learned(past, state), SelfModelWorld(self_model())
     expected, predicted = reference(someone, past, real, candidates, horizon, discount)
-    value = ExpectedUtility(own, horizon, discount, branch=0).at(
+    value = ExpectedUtility(own, horizon, discount, enumerate_above=0).at(
         PlanningContext.of(someone, past), 15 - time, 0
     )
     valued = value(candidates)
@@ -241,7 +241,7 @@ def test_what_can_no_longer_be_told_at_its_step_changes_nothing_but_its_cost(
     past = begun(0, positions, speeds)
     someone = person(3, front_own=[0, 2, 4], assumes_clear=clear, assumes_closing=closing)
     told, other = flags(**{name: [car]}), flags(verbal=["rear-left"])
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 3, 0.9, branch=0).at(
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 3, 0.9, enumerate_above=0).at(
         PlanningContext.of(someone, past), 15, 0
     )
     candidates = [plan(None, None), plan(None, told), plan(told, None), plan(None, told | other)]
@@ -304,7 +304,7 @@ def test_at_branch_one_each_draw_follows_a_single_course():
     rewards = [torch.zeros(1, 2), torch.zeros(1, 4), torch.arange(4.0).repeat_interleave(2)[None]]
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(200, consistency=0.3)
-    value = ExpectedUtility(HandSet(rewards), 3, branch=1).at(
+    value = ExpectedUtility(HandSet(rewards), 3, enumerate_above=1).at(
         PlanningContext.of(someone, past), 15, 0
     )
     followed = value(plan(None)[None]).utility[0]
@@ -318,8 +318,8 @@ def test_what_could_be_gained_beyond_the_steps_looked_at_counts_if_asked_for():
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(3, consistency=0.0)
 
-    def worth(beyond, steps_left, discount=1.0, branch=0):
-        objective = ExpectedUtility(HandSet(rewards), 2, discount, branch, beyond)
+    def worth(terminal_value, steps_left, discount=1.0, enumerate_above=0):
+        objective = ExpectedUtility(HandSet(rewards), 2, discount, enumerate_above, terminal_value)
         value = objective.at(PlanningContext.of(someone, past), steps_left, 0)
         return value(torch.stack([plan(None), plan(flags(verbal=["front-left"]))])).utility
 
@@ -328,10 +328,10 @@ def test_what_could_be_gained_beyond_the_steps_looked_at_counts_if_asked_for():
         expected = discount**2 * 101.5 - cost
         torch.testing.assert_close(worth(True, 15, discount), expected.expand(2, 3))
     assert torch.equal(worth(False, 15), -cost.expand(2, 3))
-    # At the end of the round there is nothing beyond.
+    # At the end of the round there is nothing to gain after it.
     assert torch.equal(worth(True, 2), -cost.expand(2, 3))
     # A single course each, kept by chance: its last step is the mean of both actions.
-    alone = worth(True, 15, branch=1)
+    alone = worth(True, 15, enumerate_above=1)
     torch.testing.assert_close(alone + cost, (alone + cost).round(), rtol=0, atol=1e-4)
     assert set(alone[0].tolist()) <= {101, 102}
 
@@ -340,7 +340,7 @@ def test_what_is_kept_by_chance_is_small_however_much_is_to_gain():
     """Four courses end at 100 to 103, each with a weight of 0 or 0.8 for its 0.25."""
     rewards = [torch.zeros(1, 2), torch.zeros(1, 4)]
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
-    objective = ExpectedUtility(HandSet(rewards), 2, branch=0.8, beyond=True)
+    objective = ExpectedUtility(HandSet(rewards), 2, enumerate_above=0.8, terminal_value=True)
     context = PlanningContext.of(person(2000, consistency=0.0), past)
     worth = objective.at(context, 15, 0)(plan(None)[None]).utility[0]
     assert abs(worth.mean() - 101.5) < 4.5 * worth.std() / len(worth) ** 0.5
@@ -393,7 +393,7 @@ def test_all_candidates_have_the_same_luck():
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(20, consistency=0.0)
     candidates = every_message(torch.ones(8, dtype=torch.bool))[:, None]
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0.4).at(
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4, enumerate_above=0.4).at(
         PlanningContext.of(someone, past), 15, 0
     )
     utility = value(candidates).utility
@@ -446,7 +446,7 @@ def test_messages_are_charged_at_the_step_at_which_they_are_sent(discount):
 def test_rewards_are_discounted_by_step(discount, total):
     past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
     world = HandSet([torch.ones(1, ACTIONS ** (h + 1)) for h in range(4)])
-    value = ExpectedUtility(world, 4, discount, branch=0).at(
+    value = ExpectedUtility(world, 4, discount, enumerate_above=0).at(
         PlanningContext.of(person(), past), 15, 0
     )
     assert value(plan(None)[None]).utility.item() == pytest.approx(total, abs=1e-5)
@@ -456,7 +456,9 @@ def test_draws_are_dealt_out_over_draws_of_the_world():
     past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
     own = torch.tensor([1.0, 10.0, 100.0])[:, None]
     world = HandSet([own.expand(3, ACTIONS ** (h + 1)) for h in range(2)])
-    value = ExpectedUtility(world, 2, branch=0).at(PlanningContext.of(person(7), past), 15, 0)
+    value = ExpectedUtility(world, 2, enumerate_above=0).at(
+        PlanningContext.of(person(7), past), 15, 0
+    )
     expected = torch.tensor([[2.0, 20, 200, 2, 20, 200, 2]])
     torch.testing.assert_close(value(plan(None)[None]).utility, expected)
 
@@ -467,8 +469,8 @@ def test_draws_are_dealt_out_over_draws_of_the_world():
         ({"horizon": 0}, "horizon must be at least 1, not 0"),
         ({"discount": 0.0}, "discount must be above 0 and at most 1, not 0.0"),
         ({"discount": 1.1}, "discount must be above 0 and at most 1, not 1.1"),
-        ({"branch": -0.1}, "branch must be from 0 to 1, not -0.1"),
-        ({"branch": 1.5}, "branch must be from 0 to 1, not 1.5"),
+        ({"enumerate_above": -0.1}, "enumerate_above must be from 0 to 1, not -0.1"),
+        ({"enumerate_above": 1.5}, "enumerate_above must be from 0 to 1, not 1.5"),
     ],
 )
 def test_impossible_options_are_refused(options, message):

@@ -407,7 +407,8 @@ def test_a_memory_that_is_not_used_leaves_decisions_as_they_are(generator):
     draws = varied_draws(6, generator)
     usual, same = (
         Communicator(
-            Person(model(self_model()), draws), ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0)
+            Person(model(self_model()), draws),
+            ExpectedUtility(SimulatorWorld(DOMAIN), 4, enumerate_above=0),
         ).plan(past)
         for model in (HumanModel, Unused)
     )

@@ -9,7 +9,6 @@ import pytest
 import torch
 from example_course import gone_through
 from example_person import Averaging, Unused
-from mirror_ppl.likelihood.belief_nodes import _beginnings
 
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
@@ -231,17 +230,6 @@ def test_values_of_shared_beginnings_are_those_of_the_belief(self_model, recordi
     assert close.shape[1] > 500
     for person in range(2):
         assert close[person, table.moments[person].clamp(min=0)].all()
-
-
-def test_beginnings_are_numbered():
-    bits = torch.randint(4, (40, 6))
-    bits[:5] = 0
-    bits[5:10, 3:] = 0
-    numbers = _beginnings(bits)
-    keys = [tuple(bits[row, : step + 1].tolist()) for row in range(40) for step in range(6)]
-    distinct = {key: number for key, number in zip(keys, numbers.flatten().tolist(), strict=True)}
-    assert [distinct[key] for key in keys] == numbers.flatten().tolist()
-    assert len(set(distinct.values())) == len(distinct)
 
 
 def test_padding_has_no_influence(self_model, recordings):

@@ -63,10 +63,10 @@ class ExpectedUtility:
     """``U(c) = E[ sum_{h<H} discount^h ( r_{t+h} - cost(c_{t+h}) ) ]``.
 
     The expectation is over posterior draws, draws of the world, and the person's actions. Of the
-    latter it is a tree in which branches less probable than ``branch`` are kept by chance, with a
-    weight that makes up for it: at 0 the expectation over actions is exact, at 1 each draw follows
-    a single course of actions. In between, what is probable is exact and the improbable cheap, and
-    the expectation is right at every value.
+    latter it is a tree in which courses less probable than ``enumerate_above`` are kept by chance,
+    with a weight that makes up for it: at 0 the expectation over actions is exact, at 1 each draw
+    follows a single course of actions. In between, what is probable is exact and the improbable
+    cheap, and the expectation is right at every value.
 
     Where what could be gained after the horizon counts, it is added up as what could be gained now
     and the advantages on the way, ``r_t + discount * V(s_{t+1}) - V(s_t)``. The sum is the same,
@@ -76,24 +76,24 @@ class ExpectedUtility:
         world: what is rolled forward.
         horizon: steps H that are looked ahead.
         discount: per step.
-        branch: probability of a course of actions below which it is kept by chance.
-        beyond: whether what could be gained at best after the last of these steps counts too,
-            where the round goes on.
+        enumerate_above: probability of a course of actions below which it is kept by chance.
+        terminal_value: whether what could be gained at best after the last of these steps counts
+            too, where the round goes on.
     """
 
     world: World
     horizon: int = 10
     discount: float = 1.0
-    branch: float = 0.1
-    beyond: bool = False
+    enumerate_above: float = 0.1
+    terminal_value: bool = False
 
     def __post_init__(self) -> None:
         require_methods(self.world, ["rollouts"], "world", "a world such as SimulatorWorld(domain)")
         object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
         if not 0 < self.discount <= 1:
             raise ValueError(f"discount must be above 0 and at most 1, not {self.discount}")
-        if not 0 <= self.branch <= 1:
-            raise ValueError(f"branch must be from 0 to 1, not {self.branch}")
+        if not 0 <= self.enumerate_above <= 1:
+            raise ValueError(f"enumerate_above must be from 0 to 1, not {self.enumerate_above}")
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
         """See :class:`Objective`."""
@@ -112,7 +112,7 @@ class ExpectedUtility:
             tree = _Tree(context, candidates, self.world.draws)
             count = len(candidates)
             utility = torch.zeros(count * person.number, device=device)
-            if self.beyond:
+            if self.terminal_value:
                 world = torch.arange(person.number, device=device) % self.world.draws
                 utility += rollouts.values(0)[world, 0].repeat(count)
             predicted = torch.zeros(count, horizon, number, device=device)
@@ -124,7 +124,7 @@ class ExpectedUtility:
                 chances = tree.act(observation, told, channels)
                 gains = (
                     rollouts.advantages(step, self.discount)
-                    if self.beyond
+                    if self.terminal_value
                     else rollouts.rewards(step)
                 )
                 gained = gains[tree.draw_of_world(), tree.path]
@@ -134,9 +134,9 @@ class ExpectedUtility:
                     discounts[step] * (chances * gained).sum(-1),
                 )
                 predicted[:, step].index_add_(0, tree.candidate, chances / person.number)
-                if step < horizon - 1 or (self.beyond and ends):
-                    tree.branch(chances, rollouts, step, self.branch, seed)
-            if self.beyond and ends:
+                if step < horizon - 1 or (self.terminal_value and ends):
+                    tree.branch(chances, rollouts, step, self.enumerate_above, seed)
+            if self.terminal_value and ends:
                 # What could be gained is lost where the round ends.
                 left = rollouts.values(horizon)[tree.draw_of_world(), tree.path]
                 utility.index_add_(
