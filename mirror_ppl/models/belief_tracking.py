@@ -146,8 +146,10 @@ class BeliefState:
         evidence = self.human.evidence(
             view.map(lambda part: part[person, step]),
             {
-                name: torch.cat([each[name] for each in observation])[row[person, step]]
-                for name in observation[0]
+                name: (torch.cat([each[name] for each in observation]) if steps > 1 else value)[
+                    row[person, step]
+                ]
+                for name, value in observation[0].items()
             },
         )
         still = None if view.still is None else view.still[one]
