@@ -16,10 +16,11 @@ from typing import Any as _Any
 
 from gymnasium import register as _register
 
+from mirror_ppl.version import __version__ as __version__
+
 if _TYPE_CHECKING:
     from mirror_ppl.face import Communicator, Fit, HumanModel, infer, load_recordings, worlds
 
-__version__ = "0.1.0"
 __all__ = ["Communicator", "Fit", "HumanModel", "infer", "load_recordings", "worlds"]
 
 _register("mirror_ppl/Driving-v0", "mirror_ppl.domains.driving_environment:DrivingEnv")

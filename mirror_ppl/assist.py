@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.assist`: pair communicators with people, and see who helps how much."""
+"""`python -m mirror_ppl.assist`: pair communicators with people, and compare net returns."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
     from mirror_ppl.evaluation.assistance import Played
+    from mirror_ppl.evaluation.assistance_cells import Pairing
     from mirror_ppl.inference.results.posterior_file import PosteriorFile
 
 FAR_BELOW = -10
-"""Ways from silence to the oracle of which less is told."""
+"""Shares of the way from silence to the oracle below which no number is printed."""
 KL, LEARNED = "mirror-kl", "mirror-self-model"
 PROGRAM = "python -m mirror_ppl.assist"
-DESCRIPTION = """Let communicators speak to the simulated people of a posterior while they drive,
-and print for each what the people gained, what the messages cost and what they were about. All play
-the same rounds with the same random numbers. With --json or --log, a run that is stopped goes on
-where it was when the same command is given again."""
+DESCRIPTION = """Let communicators send messages to the simulated people of a posterior in their
+rounds, and print for each the people's returns, the cost of messages and what they were about. All
+play the same rounds with the same random numbers. With --json or --log, a run that is stopped goes
+on where it was when the same command is given again."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,8 @@ class Options:
     """Seed of the rounds and of everything random."""
     jobs: int = 2
     """Processes that share the work."""
+    scheduler: str | None = None
+    """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
 
     def __post_init__(self) -> None:
         check_numbers(self, "rounds", "people", "draws", "horizon", "patience", jobs=1)
@@ -112,11 +115,11 @@ def main(options: Options) -> None:
     Raises:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
-    from mirror_ppl.communication.objectives import beliefs_have_density, require_density
-    from mirror_ppl.evaluation.assistance import COMMUNICATORS, RATES_FROM, PlannerOptions
-    from mirror_ppl.evaluation.assistance_cells import Pairing, run_cells
+    from mirror_ppl.evaluation.assistance import COMMUNICATORS
+    from mirror_ppl.evaluation.assistance_cells import play_all, turns
     from mirror_ppl.evaluation.assistance_summary import summarize_assistance
     from mirror_ppl.files import lock_of, output_folder, write_together
+    from mirror_ppl.jobs import Runner
 
     chosen = options.communicator or COMMUNICATORS
     for name in chosen:
@@ -131,6 +134,34 @@ def main(options: Options) -> None:
         raise PosteriorError(
             f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
         )
+    pairing = _pairing(options, posterior, source)
+    pairing.check()
+    chosen = _possible(options, chosen, pairing)
+    parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
+    cells = turns(chosen, number)
+    with ExitStack() as stack:
+        for path in outputs:
+            own = [parts.name] if parts is not None and path == kept else []
+            results = output_folder(path.parent, [path.name], lock_of(path), own)
+            stack.enter_context(results)
+        progress = stack.enter_context(Progress("assist", len(cells)))
+        runner = Runner(parts, jobs=options.jobs, scheduler=options.scheduler, progress=progress)
+        everything = play_all(pairing, cells, runner)
+        played = {name: everything[name] for name in chosen}
+        summary = summarize_assistance(played, options.seed)
+        write_together(_contents(options, posterior, played, summary))
+        runner.clean()
+    _show(summary, posterior.attributes, number, options.rounds)
+    for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
+        if path is not None:
+            print(f"{path}: {what}")
+
+
+def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, Any]) -> Pairing:
+    """Who is paired in which rounds."""
+    from mirror_ppl.evaluation.assistance import PlannerOptions
+    from mirror_ppl.evaluation.assistance_cells import Pairing
+
     planner = PlannerOptions.of(
         posterior.attributes["domain"],
         horizon=options.horizon,
@@ -141,7 +172,7 @@ def main(options: Options) -> None:
         kl_weight=options.kl_weight,
         kl_measure=options.kl_measure,
     )
-    pairing = Pairing(
+    return Pairing(
         posterior=options.posterior,
         human_model=options.human_model,
         self_model=options.self_model,
@@ -155,7 +186,12 @@ def main(options: Options) -> None:
         seed=options.seed,
         keep_log=options.log is not None,
     )
-    pairing.check()
+
+
+def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tuple[str, ...]:
+    """Communicators without those that cannot plan for these people, unless they are asked for."""
+    from mirror_ppl.communication.objectives import beliefs_have_density, require_density
+
     if KL in chosen and not beliefs_have_density(pairing.human):
         if KL in options.communicator:
             require_density(pairing.human)
@@ -168,24 +204,7 @@ def main(options: Options) -> None:
             f"{LEARNED} is left out: the robot was taught wrong in {pairing.domain.name}",
             file=sys.stderr,
         )
-    parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
-    # Rates of random messages are those of a planner, which plays then, too.
-    playing = len({*chosen} | ({RATES_FROM} if "random" in chosen else set()))
-    with ExitStack() as stack:
-        for path in outputs:
-            own = [parts.name] if parts is not None and path == kept else []
-            results = output_folder(path.parent, [path.name], lock_of(path), own)
-            stack.enter_context(results)
-        progress = stack.enter_context(Progress("assist", number * playing))
-        played = run_cells(pairing, chosen, number, options.jobs, parts, progress.update)
-        summary = summarize_assistance(played, options.seed)
-        write_together(_contents(options, posterior, played, summary))
-        if parts is not None:
-            pairing.forget(parts)
-    _show(summary, posterior.attributes, number, options.rounds)
-    for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
-        if path is not None:
-            print(f"{path}: {what}")
+    return chosen
 
 
 def _contents(
@@ -205,7 +224,7 @@ def _contents(
             "options": {
                 name: value
                 for name, value in asdict(options).items()
-                if name not in ("json", "log", "jobs")
+                if name not in ("json", "log", "jobs", "scheduler")
             },
             "posterior": dict(posterior.attributes),
             "communicators": summary,

@@ -1,8 +1,8 @@
-"""`python -m mirror_ppl.calibrate`: are posteriors as sure of people as they have a right to be?"""
+"""`python -m mirror_ppl.calibrate`: simulation-based calibration of an engine's posteriors."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,21 +12,22 @@ from mirror_ppl.console import console_for_tables, run
 from mirror_ppl.errors import OptionError
 from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers
+from mirror_ppl.models.world_knowledge import fit_world
 from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
     from mirror_ppl.data import Demonstrations
-    from mirror_ppl.inference.amortized import AmortizedGuide
+    from mirror_ppl.inference.amortized_guide import AmortizedGuide
     from mirror_ppl.inference.calibration.ranks import Calibration
     from mirror_ppl.inference.engines import InferenceOptions, Inferred
     from mirror_ppl.models.human import HumanModel
 
 PROGRAM = "python -m mirror_ppl.calibrate"
-DESCRIPTION = """Simulation-based calibration: people are drawn from the human model's prior, play
-rounds, and their implants are inferred. Where inference is right, the truth is as likely to be at
-any place among the posterior draws. Prints a table for each implant and number of rounds, and
-writes ranks.png, ecdf.png, coverage.png and calibration.nc. The exit status is 1 if calibration is
-rejected. A run that is stopped goes on where it was when the same command is given again."""
+DESCRIPTION = """Simulation-based calibration: simulates people from the human model's prior, fits
+them, and tests that ranks of the truth among posterior draws are uniform. Prints a table for each
+implant and number of rounds, and writes ranks.png, ecdf.png, coverage.png and calibration.nc. The
+exit status is 1 if calibration is rejected. A run that is stopped goes on where it was when the
+same command is given again."""
 REJECTED = 1
 WIDTH = 80
 FEW_PEOPLE = 100
@@ -61,6 +62,8 @@ class Options:
     """Weights of the robot's self-model; those that ship unless given."""
     jobs: int = -1
     """Processes; -1 for one a core."""
+    scheduler: str | None = None
+    """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
     seed: int = 0
     """Seed of everything random."""
 
@@ -90,6 +93,7 @@ def main(options: Options) -> int:
     from mirror_ppl.files import output_folder, write_together
     from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
     from mirror_ppl.inference.engines import InferenceOptions, run_identity
+    from mirror_ppl.jobs import Runner
     from mirror_ppl.likelihood.contract import check_contract
     from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -106,31 +110,27 @@ def main(options: Options) -> int:
     check_contract(human)
     # What is so for everybody is learned first, as by a fit: people are drawn from what is open.
     name = f"{options.domain}_{setting}_paper.nc"
-    human.learn_world(load_demonstrations(asset_path(name)))
+    fit_world(human, load_demonstrations(asset_path(name)))
     network = network_for(guide, options.guide_file, human)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     what = [settings, setting, options.seed, trial]
     identity = run_identity(human, network, what)
     pictures = {"ranks.png": plot_ranks, "ecdf.png": plot_ecdf, "coverage.png": plot_coverage}
     results = output_folder(options.out, ["calibration.nc", *pictures], parts=["parts"])
-    with results as folder, Progress("calibrate", options.people) as progress:
-        parts = folder / "parts"
-        calibration = calibrate(
-            human,
-            partial(_infer, human, settings, network),
-            trial,
-            setting,
-            options.seed,
-            lambda name, done, total, message: progress.update(done, message),
+    batches = math.ceil(trial.people / trial.batch)
+    with results as folder, Progress("calibrate", batches) as progress:
+        runner = Runner(
+            folder / "parts",
+            lambda batch: identity,
             options.jobs,
-            (parts, identity),
+            options.scheduler,
+            progress=progress,
         )
+        tested = partial(_infer, human, settings, network)
+        calibration = calibrate(human, tested, trial, setting, options.seed, runner)
         drawn = {folder / name: plot(calibration).content() for name, plot in pictures.items()}
         write_together({folder / "calibration.nc": calibration.content(), **drawn})
-        for file in parts.glob("*.nc"):
-            file.unlink()
-        with suppress(OSError):  # something else is in it
-            parts.rmdir()
+        runner.clean()
     _show(calibration, guide)
     print(f"{folder / 'calibration.nc'}: ranks of every person")
     for path in drawn:

@@ -75,7 +75,7 @@ def main(options: Options) -> None:
     if options.json is not None:
         contents[options.json] = json_text({"command": PROGRAM} | comparison.as_data())
     if options.figure is not None:
-        picture = plot_comparison(comparison)
+        picture = plot_comparison(comparison.table(), comparison.by)
         contents[options.figure] = picture.content(options.figure.suffix[1:].lower())
     with ExitStack() as stack:
         for path in contents:

@@ -16,22 +16,22 @@ from mirror_ppl.limits import check_numbers
 from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
-    from mirror_ppl.evaluation.sweep import Outcome
+    from mirror_ppl.jobs import Outcome
 
 PROGRAM = "python -m mirror_ppl.evaluate"
-DESCRIPTION = """Compare MIRROR with its parts and its rivals on simulated people. prediction: how
-well each predicts held-out actions, by the number of rounds that it learned from. assistance: the
-net return of people who are spoken to by communicators that plan with each. relevance: which share
-of what those tell is relevant. Writes rows of every person (CSV), tables to read (Markdown), a
-summary (JSON) and a figure. A run that is stopped goes on where it was when the same command is
-given again; the exit status is 1 if something failed."""
+DESCRIPTION = """Compare MIRROR with its ablations and baselines on simulated people. prediction:
+how well each predicts held-out actions, by the number of rounds that it learned from. assistance:
+the net return of people who receive messages from communicators that plan with each. relevance: the
+share of the communicated items that is relevant. Writes rows of every person (CSV), tables to read
+(Markdown), a summary (JSON) and a figure. A run that is stopped goes on where it was when the same
+command is given again; the exit status is 1 if something failed."""
 FAILED = 1
 QUICK = ("driving",)
 """Worlds of short rounds, of which more is learned in the same time."""
 SEEDS, FEW_SEEDS = (5, 2), (2, 1)
 """Of prediction and of the others, in those worlds and otherwise."""
 TOLD = 0.03
-"""Of an item at a step, in rounds from which it is learned how to help."""
+"""Probability that an item is communicated at a step, in rounds that models learn from."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ class Options:
     rounds: tuple[int, ...] = (1, 2, 5, 10, 20)
     """Numbers of rounds that are learned from, from 1 to 20; the most only, for relevance."""
     played: int = 5
-    """Rounds of each person in which they are spoken to; of assistance and relevance."""
+    """Rounds of each person in which they receive messages; of assistance and relevance."""
     draws: int = 64
     """Posterior draws that are planned with; of assistance and relevance."""
     told: float | None = None
-    """Chance that an item that can be communicated is told, at each step of the rounds that are
-    learned from. Unless given .03 of assistance and relevance, so that everybody can learn what
-    people make of messages, and none of prediction."""
+    """Probability that an item that can be communicated is, at each step of the rounds that models
+    learn from. Unless given .03 of assistance and relevance, so that all models can learn how
+    people use messages, and 0 of prediction."""
     out: Path = Path("runs/evaluate")
     """Folder for the results; made if it is not there. Tables are of the last command: what is to
     be in one table is asked for at once, and what was done before is not done again."""
@@ -82,8 +82,6 @@ class Options:
             for name in ("played", "draws"):
                 if getattr(self, name) != getattr(Options, name):  # which has the default
                     raise OptionError(f"--{name} is of assistance and relevance, not of prediction")
-        if self.scheduler is not None and not self.scheduler.strip():
-            raise OptionError("--scheduler must be an address, such as tcp://host:8786")
         if self.told is not None and not 0 <= self.told <= 1:
             raise OptionError(f"--told must be from 0 to 1, not {self.told}")
         if not self.domain:
@@ -108,9 +106,9 @@ def main(options: Options) -> int:
     """
     from mirror_ppl.evaluation.study import assist, identities, predict
     from mirror_ppl.evaluation.study_report import REPORTS
-    from mirror_ppl.evaluation.sweep import run_cells
     from mirror_ppl.evaluation.tables import comma_separated, page
     from mirror_ppl.files import json_text, output_folder, write_together
+    from mirror_ppl.jobs import Runner
 
     cells = _cells(options)
     work = predict if options.study == "prediction" else assist
@@ -119,18 +117,16 @@ def main(options: Options) -> int:
     names = [path.with_suffix(kind).name for kind in kinds]
     results = output_folder(path.parent, names, parts=["parts"])
     with results as folder, Progress(options.study, len(cells)) as progress:
-        parts = folder / "parts"
-        outcomes = run_cells(
-            cells,
-            work,
-            parts,
+        runner = Runner(
+            folder / "parts",
             identities(options.domain),
             options.jobs,
             options.scheduler,
-            progress.update,
-            progress.resume,
+            keep_going=True,
+            progress=progress,
         )
-        rows = [row for outcome in outcomes for row in outcome.rows]
+        outcomes = runner.run(cells, work)
+        rows = [row for outcome in outcomes for row in outcome.result or ()]
         failed = [outcome for outcome in outcomes if outcome.error is not None]
         report = REPORTS[options.study](rows) if rows else None
         if report is not None:
@@ -155,7 +151,7 @@ def main(options: Options) -> int:
 
 
 def _told(options: Options) -> float:
-    """How much is told in the rounds that are learned from."""
+    """How much is communicated in the rounds that models learn from."""
     if options.told is not None:
         return options.told
     return 0.0 if options.study == "prediction" else TOLD
@@ -211,7 +207,7 @@ def _origin(options: Options) -> dict[str, Any]:
 
     import torch
 
-    from mirror_ppl import __version__
+    from mirror_ppl.version import __version__
 
     return {
         "command": _command(options),

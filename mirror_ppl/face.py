@@ -277,7 +277,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         train_rounds: how many rounds of each person to learn from; see
             :func:`mirror_ppl.inference.results.fitting.split_rounds`.
         settings: of the engine; its own unless given.
-        refine: gradient steps of ``svi`` that start at what the engine found.
+        refine: gradient steps on each person's rounds that refine what a network proposes.
         explore: rounds that the model plays in each scenario, to find the most informative one; 0
             leaves it out.
         allow_contradictions: share of steps, from 0 to 1, that may contradict the next observation.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mirror_ppl.console import run
 from mirror_ppl.errors import OptionError
-from mirror_ppl.inference.names import current_name, told_engine
+from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers, require_memory, share
 from mirror_ppl.progress import Stages
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "python -m mirror_ppl.fit"
 CHECKPOINT = "fit.checkpoint"
-CHECKPOINTS = re.compile(r"fit\.checkpoint(\.refined)?(\.\d+)?")
+CHECKPOINTS = re.compile(r"fit\.checkpoint(\.\d+)?")
 COPIES = 4
 """Of log-probabilities of actions, while they are worked out and drawn from."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
@@ -76,7 +76,8 @@ class Options:
     steps: int = 300
     """Gradient steps of svi."""
     refine: int = 0
-    """Gradient steps of svi that start at what amortized or importance found; none unless given."""
+    """Of auto and amortized: gradient steps on each person's rounds that refine what the network
+    proposes; none unless given."""
     draws: int = 200
     """Posterior draws."""
     seed: int = 0
@@ -89,8 +90,8 @@ class Options:
             raise OptionError("--guide-file is for --guide auto and amortized")
         if self.prior_from is not None and self.pooling != "none":
             raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
-        if self.refine and current_name(self.guide)[0] in ("svi", "nuts"):
-            raise OptionError("--refine is for --guide auto, importance and amortized")
+        if self.refine and self.guide not in ("auto", "amortized"):
+            raise OptionError("--refine is for --guide auto and amortized")
         check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed")
         share(self.allow_contradictions, "--allow-contradictions")
 

@@ -21,6 +21,7 @@ LIMITS: Mapping[str, tuple[int, int]] = {
     "draws": (1, 100_000),
     "steps": (1, 1_000_000),
     "refine": (0, 1_000_000),
+    "elbo_steps": (0, 1_000_000),
     "phases": (1, 100_000),
     "horizon": (1, 1_000),
     "patience": (1, 1_000),

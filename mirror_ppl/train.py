@@ -18,7 +18,7 @@ model's prior; it takes about half an hour. A run that is stopped goes on when t
 given again."""
 SELF_MODEL, GUIDE = "self-model", "guide"
 OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "sizes", "device")
-OF_GUIDE = ("people", "human_model", "self_model")
+OF_GUIDE = ("people", "elbo_steps", "human_model", "self_model")
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class Options:
     bomb_defusal: a Q-network of 3 x 2048)."""
     people: int = 1000
     """Of a guide: people to learn from, simulated in the true domain."""
+    elbo_steps: int = 0
+    """Of a guide: gradient steps of the ELBO among those of inference compilation."""
     human_model: str | None = None
     """Of a guide: another human model: one-radius, per-item, perceptual-only and so on, or
     one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
@@ -66,7 +68,7 @@ class Options:
     def __post_init__(self) -> None:
         if self.what not in (SELF_MODEL, GUIDE):
             raise OptionError(f"--what must be {SELF_MODEL} or {GUIDE}, not {self.what}")
-        check_numbers(self, "phases", "steps", "seed", people=LEAST_PEOPLE)
+        check_numbers(self, "phases", "steps", "elbo_steps", "seed", people=LEAST_PEOPLE)
         other, of_other = (SELF_MODEL, OF_SELF_MODEL) if self.what == GUIDE else (GUIDE, OF_GUIDE)
         defaults = {field.name: field.default for field in fields(self)}
         for name in of_other:
@@ -165,7 +167,7 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
     self_model, _ = load_self_model(weights, options.domain)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
-    settings = GuideOptions(people=options.people)
+    settings = GuideOptions(people=options.people, elbo_steps=options.elbo_steps)
     with Stages() as stages:
         guide, quality = train_guide(human, settings, options.seed, stages.report, checkpoint)
     card = _described(options, settings, quality, "nats a person, of people held out")
@@ -178,7 +180,7 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
 def _described(options: Options, settings: Any, quality: dict[str, float], measured: str) -> dict:
     import torch
 
-    from mirror_ppl import __version__
+    from mirror_ppl.version import __version__
 
     return {
         "command": _command(options),

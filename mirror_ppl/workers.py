@@ -1,20 +1,21 @@
-"""Tasks that run beside each other in processes, which end with the one that started them."""
+"""Tasks in processes, which end with the one that started them, or on a cluster."""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from mirror_ppl.errors import HumanModelError, MirrorError, WorkerError
+from mirror_ppl.errors import HumanModelError, MirrorError, OptionError, WorkerError
 from mirror_ppl.user_code import describe, passed_user_code, remember_file, remembered_files
 
 Result = TypeVar("Result")
@@ -23,6 +24,8 @@ SECONDS_BETWEEN_LOOKS = 1.0
 """How often a worker looks whether the process that started it is still there."""
 WATCH = "mirror_ppl watch"
 """Name of the thread that looks."""
+KILLED = "its process was killed; there may be too little memory for so many --jobs"
+"""What is said of work that takes its process along."""
 
 
 def run_tasks(
@@ -33,7 +36,7 @@ def run_tasks(
     Args:
         tasks: calls without arguments, such as a `functools.partial` of a module's function.
         jobs: number of processes; 1 for this one, -1 for one a core.
-        here: whether they are processes of this machine, and not those of joblib's active backend.
+        here: whether they are processes of this machine, and not those of a `cluster`.
 
     Yields:
         Results, in the order in which tasks end.
@@ -44,35 +47,84 @@ def run_tasks(
     """
     from joblib import Parallel, delayed
 
+    if here and jobs == 1:
+        yield from map(_guarded, tasks)
+        return
     with warnings.catch_warnings():
         # Processes that have used much memory are replaced by new ones; nothing is lost.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
         own: dict[str, Any] = {}
-        if here and jobs != 1:
+        if here:
             own = {"backend": "loky", "initializer": _end_with, "initargs": (os.getpid(),)}
-        files = remembered_files()
-        calls = (delayed(partial(_guarded, files, task))() for task in tasks)
+        files = _files_of_users()
+        calls = (delayed(partial(_in_worker, files, task))() for task in tasks)
         results = Parallel(n_jobs=jobs, return_as="generator_unordered", **own)(calls)
         try:
             yield from cast(Iterator[Result], results)
-        except BrokenExecutor as error:
+        except BaseException as error:
             _end_workers()
-            raise WorkerError(
-                "a worker process was ended from outside, perhaps for lack of memory; use fewer "
-                "--jobs"
-            ) from error
-        except BaseException:
-            _end_workers()
+            if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":
+                raise WorkerError(KILLED) from error
             raise
 
 
-def _guarded(files: Sequence[Path], task: Callable[[], Result]) -> Result:
+def cluster(address: str) -> ExitStack:
+    """A context in which tasks that are not done here are done by the workers of a Dask scheduler.
+
+    Raises:
+        OptionError: Dask is not installed, or the scheduler cannot be reached.
+    """
+    from joblib import parallel_config
+
+    if not address.strip():
+        raise OptionError("--scheduler must be an address, such as tcp://host:8786")
+    try:
+        from distributed import Client
+        from distributed.comm import connect
+        from distributed.utils import LoopRunner
+    except ImportError as error:
+        raise OptionError(
+            "--scheduler needs Dask: pip install 'mirror_ppl[cluster]', here and on the workers"
+        ) from error
+
+    async def reach() -> None:
+        await (await connect(address, timeout=10)).close()
+
+    with ExitStack() as stack:
+        try:
+            # A client that cannot connect would stay behind as what xarray asks for its locks.
+            LoopRunner().run_sync(reach)
+            # xarray would ask the default client for locks of files that are written here.
+            client = stack.enter_context(Client(address, timeout="10s", set_as_default=False))
+        except (OSError, ValueError) as error:
+            raise OptionError(f"--scheduler {address} cannot be reached: {error}") from error
+        stack.enter_context(parallel_config(backend="dask", client=client))
+        return stack.pop_all()
+
+
+def _files_of_users() -> tuple[Path, ...]:
+    """Files of users, whose classes are sent whole: other processes cannot import them."""
+    import cloudpickle
+
+    files = remembered_files()
+    for module in list(sys.modules.values()) if files else ():
+        path = getattr(module, "__file__", None)
+        if path is not None and Path(path).resolve() in files:
+            cloudpickle.register_pickle_by_value(module)
+    return files
+
+
+def _in_worker(files: Sequence[Path], task: Callable[[], Result]) -> Result:
     for file in files:
         remember_file(file)
     # One thread a process: the cores are shared by processes.
     import torch
 
     torch.set_num_threads(1)
+    return _guarded(task)
+
+
+def _guarded(task: Callable[[], Result]) -> Result:
     try:
         return task()
     except MirrorError:

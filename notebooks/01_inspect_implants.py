@@ -47,11 +47,7 @@ import torch
 # Whether Jupyter's widgets are installed does not matter here.
 warnings.filterwarnings("ignore", message="IProgress not found")
 
-from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.engines import InferenceOptions
-from mirror_ppl.inference.results.fitting import fit_people
-from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.weights import load_self_model, shipped_weights
+import mirror_ppl
 
 # The networks are small: one thread is as fast as several.
 torch.set_num_threads(1)
@@ -61,12 +57,12 @@ quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
 # %% [markdown]
 # ## Recordings
 #
-# Ten people, each with their own reach of sight. (In `driving_fog_paper.nc` all of them see two
-# cells ahead and nothing behind.) Everybody drove 40 rounds of 15 steps: rounds 1 to 20 are
-# learned from, rounds 31 to 36 are held out.
+# Ten simulated people who differ in how far they see. (In the population `paper` all of them see
+# two cells ahead and nothing behind.) Each drove 40 rounds of 15 steps. Rounds 1 to 20 are learned
+# from, rounds 31 to 36 are held out. For your own file: `load_recordings("recordings.nc")`.
 
 # %%
-recordings = load_demonstrations(asset_path("driving_fog_diverse.nc"))
+recordings = mirror_ppl.load_recordings(setting="fog", population="diverse")
 if quick:
     recordings = recordings.select_people(["person-08", "person-09"])
 recordings
@@ -74,25 +70,23 @@ recordings
 # %% [markdown]
 # ## Fit
 #
-# The robot's model of the world ships with the package. `HumanModel` is a Pyro program around it;
-# to study another kind of person, derive a class from it and override `prior`, `perceive`,
-# `believe` or `act`. Fitting takes a minute or two. On the command line, the same is
+# `infer` conditions the human model, a Pyro program, on the recordings. To study another kind of
+# person, derive a class from `mirror_ppl.HumanModel`, override `prior`, `perceive`, `believe` or
+# `act`, and give it as `human=`. Fitting takes less than a minute. On the command line:
 # `python -m mirror_ppl.fit --setting fog --population diverse`.
 
 # %%
-self_model, card = load_self_model(shipped_weights("driving"))
-human = HumanModel(self_model)
-options = InferenceOptions(draws=20) if quick else InferenceOptions()
-
-fit = fit_people(human, recordings, options, seed=0, train_rounds=4 if quick else None)
-data = fit.data
+settings = {"draws": 20, "train_rounds": 4, "explore": 1} if quick else {}
+fit = mirror_ppl.infer(recordings, **settings)
+fit
 
 # %% [markdown]
-# `data` is an ArviZ `InferenceData`: draws from the prior and the posterior, what either
-# predicts, and what was recorded. Saved as netCDF (`data.to_netcdf(...)`), it opens in any ArviZ
-# tool without this package.
+# `fit.data` is an ArviZ `InferenceData`: draws from the prior and the posterior, what either
+# predicts, and what was recorded. `fit.save(folder)` writes it as netCDF, with a summary and
+# pictures. The file opens in any ArviZ tool without this package.
 
 # %%
+data = fit.data
 for group in data.groups():
     names = [str(name) for name in data[group].data_vars if not str(name).startswith("truth_")]
     print(f"{group}: {', '.join(names)}")
@@ -105,9 +99,7 @@ for group in data.groups():
 # line surrounds what the person really sees.
 
 # %%
-from mirror_ppl.plots.driving import plot_sight, sight_picture
-
-sight_picture(data)
+fit.plot.sight()
 
 # %% [markdown]
 # Sight ahead in the own lane is known best, above all where it is short: when a person drives up
@@ -122,21 +114,21 @@ sight_picture(data)
 # nothing was learned.
 
 # %%
-from mirror_ppl.plots.implants import plot_implants, scalar_implants
-
 person = "person-09"
-plot_implants(data, person)
+fit.plot.implants(person)
 
 # %%
-plot_sight(data, person).figure
+fit.person(person).implants.round(2)
 
 # %% [markdown]
-# The same in numbers: mean, standard deviation and 90% interval. `kind="stats"` leaves out what
-# ArviZ says of Markov chains (effective sample size, r-hat): these draws are no chain, and such
-# numbers would mean nothing here.
+# ArviZ gives the mean, the standard deviation and the 90% highest-density interval. `kind="stats"`
+# leaves out effective sample size and r-hat: they are about Markov chains, and these draws come
+# from none.
 
 # %%
 import arviz as az
+
+from mirror_ppl.plots.implants import scalar_implants
 
 numbers = az.summary(
     data.posterior.sel(person=person),
@@ -144,8 +136,7 @@ numbers = az.summary(
     kind="stats",
     hdi_prob=0.9,
 )
-found = {one["id"]: one for one in fit.summary["people"]}
-numbers["truth"] = [found[person]["implants"][name]["truth"] for name in numbers.index]
+numbers["truth"] = fit.person(person).implants["truth"]
 numbers.round(2)
 
 # %% [markdown]
@@ -158,16 +149,16 @@ numbers.round(2)
 # changes, the round holds some that nobody could have foreseen.
 
 # %%
-from mirror_ppl.plots.rounds import lane_changes, plot_predictive_check, plot_round
+from mirror_ppl.plots.rounds import lane_changes
 
 changes = lane_changes(data, "observed_data")
-plot_round(data, person, int(changes.sel(person=person).values.argmax()))
+fit.plot.round(person, int(changes.sel(person=person).values.argmax()))
 
 # %% [markdown]
 # A round that was not learned from:
 
 # %%
-plot_round(data, person, 2, held_out=True)
+fit.plot.round(person, 2, held_out=True)
 
 # %% [markdown]
 # ## Does the model fit these people?
@@ -179,7 +170,7 @@ plot_round(data, person, 2, held_out=True)
 # 90% intervals.
 
 # %%
-plot_predictive_check(data)
+fit.plot.predictive_check()
 
 # %% [markdown]
 # The same check with ArviZ's own tools. Each line is what ten people might have done, by one draw
@@ -240,7 +231,7 @@ for name in recordings.people:
         # It warns of doubtful rounds, which are counted here.
         warnings.simplefilter("ignore", UserWarning)
         loo = az.loo(one, pointwise=True)
-    test = found[name]["test"]
+    test = fit.person(name).summary["test"]
     rows.append(
         {
             "person": name,

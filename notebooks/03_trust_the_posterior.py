@@ -39,53 +39,42 @@ import torch
 # Whether Jupyter's widgets are installed does not matter here.
 warnings.filterwarnings("ignore", message="IProgress not found")
 
-from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.engines import InferenceOptions, infer
-from mirror_ppl.inference.svi import SVIOptions
-from mirror_ppl.models.human import HumanModel
+import mirror_ppl
 from mirror_ppl.models.implants import sight_sites
-from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.plots.picture import Picture
-from mirror_ppl.training.guide_file import load_guide, shipped_guide
 
 # The networks are small: one thread is as fast as several.
 torch.set_num_threads(1)
 # The project's tests run this notebook with few people, rounds and steps.
 quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
 
-human = HumanModel(load_self_model(shipped_weights("driving"))[0])
-network, _ = load_guide(shipped_guide("driving"), human)
-recordings = load_demonstrations(asset_path("driving_fog_paper.nc"))
-rounds = 3 if quick else 20
-train = recordings.select_rounds(range(rounds))
+recordings = mirror_ppl.load_recordings(setting="fog", population="paper")
+rounds, draws = (3, 30) if quick else (20, 200)
 
 # %% [markdown]
 # ## 1. Do they agree?
 #
-# What a person sees is summed out exactly in all of them: every combination of thresholds is tried
-# under every way to decide. How they decide is
+# Every engine sums what a person sees out exactly: all combinations of thresholds are tried. How
+# they decide is
 #
-# - `exact`: sampled by importance, until there are enough draws that count;
-# - `amortized`: proposed by a network that learned from a thousand simulated people, and weighted
-#   in the same way;
-# - `svi`: fitted by a mean-field Gaussian, for ten people at once.
+# - `importance`: drawn by adaptive importance sampling;
+# - `amortized`: proposed by a network that learned from a thousand simulated people, and corrected
+#   by importance weights;
+# - `svi`: fitted by a mean-field Gaussian.
 #
 # On the command line: `python -m mirror_ppl.fit --guide amortized`, and so on.
 
 # %%
 person = "person-04"
-one = train.select_people([person])
-options = {
-    "exact": InferenceOptions("importance", 400),
-    "amortized": InferenceOptions("amortized", 400),
-    "svi": InferenceOptions("svi", 400, SVIOptions(steps=10 if quick else 300)),
-}
-posteriors, seconds = {}, {}
-for name, settings in options.items():
+one = recordings.select_people([person])
+fits, seconds = {}, {}
+for engine in ("importance", "amortized", "svi"):
     began = perf_counter()
-    posteriors[name] = infer(human, one, settings, 0, network)
-    seconds[name] = perf_counter() - began
+    fits[engine] = mirror_ppl.infer(one, engine=engine, draws=400, train_rounds=rounds, explore=0)
+    seconds[engine] = perf_counter() - began
+posteriors = {engine: fit.posterior for engine, fit in fits.items()}
 
+human = fits["importance"].human
 bins = human.domain.reach_bins
 figure = Picture(figsize=(11, 3), layout="constrained")
 axes = figure.subplots(1, 5, width_ratios=[1, 1, 1, 1, 1.4])
@@ -128,14 +117,16 @@ pd.DataFrame(
 
 # %%
 from mirror_ppl.inference.online import OnlinePosterior
+from mirror_ppl.training.guide_file import load_guide, shipped_guide
 
+network, _ = load_guide(shipped_guide("driving"), human)
 figure = Picture(figsize=(9, 3.4), layout="constrained")
 left, right = figure.subplots(1, 2)
 milliseconds = []
 for name in ["person-02", person]:
     online, known = OnlinePosterior(human, network), []
     for number in range(rounds):
-        online.add(train.select_people([name]).select_rounds([number]))
+        online.add(recordings.select_people([name]).select_rounds([number]))
         reach = online.draws(200)["sight_front_own"].flatten()
         known.append(float((reach == bins.index(2)).float().mean()))
         milliseconds.append(1000 * sum(online.seconds))
@@ -164,6 +155,7 @@ figure
 
 # %%
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
+from mirror_ppl.inference.engines import InferenceOptions, infer
 
 settings = InferenceOptions("amortized", 50)
 
@@ -201,17 +193,10 @@ plot_ecdf(calibration)
 # `python -m mirror_ppl.fit` writes this picture as `open.png`.
 
 # %%
-from mirror_ppl.inference.results.export import add_identifiability
-from mirror_ppl.inference.results.fitting import fit_people
-from mirror_ppl.inference.results.identifiability import identify
-from mirror_ppl.plots.identifiability import plot_identifiability
-
 some = recordings.select_people(recordings.people[: 2 if quick else 6])
-draws = 30 if quick else 200
-fit = fit_people(human, some, InferenceOptions(draws=draws), 0, rounds)
-found = identify(human, fit.train, fit.posterior.draws, 0, rounds=1 if quick else 8)
-add_identifiability(fit.data, found, fit.data["posterior"].attrs)
-plot_identifiability(fit.data)
+settings = {"draws": draws, "train_rounds": rounds}
+fit = mirror_ppl.infer(some, explore=1 if quick else 8, **settings)
+fit.plot.identifiability()
 
 # %% [markdown]
 # Little is hatched: the prior keeps the policy implant so small that it can hardly imitate
@@ -226,7 +211,7 @@ plot_identifiability(fit.data)
 # (`python -m mirror_ppl.fit --pooling partial`.)
 
 # %%
-together = fit_people(human, some, InferenceOptions(draws=draws, pooling="partial"), 0, rounds)
+together = mirror_ppl.infer(some, pooling="partial", explore=0, **settings)
 
 
 def right(draws, site, value):
@@ -246,17 +231,19 @@ pd.DataFrame(
 # %% [markdown]
 # A population is worth most where a person has done little. Somebody *else*, of whom there is no
 # round at all ("round zero") or one: how well are their actions predicted, with the prior and with
-# the population as a prior? (`python -m mirror_ppl.fit --prior-from runs/demo/posterior.nc`.)
+# the population as a prior? (`python -m mirror_ppl.fit --prior-from runs/pooled/posterior.nc`.)
 
 # %%
 from mirror_ppl.people import simulate
 
 others = simulate("driving", "fog", "paper", 2 if quick else 6, 40, 11)
+folder = tempfile.TemporaryDirectory()
+together.save(folder.name)
 rows = {}
 for number in (0, 1):
-    for how, population in (("prior", None), ("population", together.posterior.population)):
-        known = fit_people(
-            human, others, InferenceOptions(draws=draws), 0, number, population=population
+    for how, prior in (("prior", None), ("population", Path(folder.name, "posterior.nc"))):
+        known = mirror_ppl.infer(
+            others, prior_from=prior, draws=draws, train_rounds=number, explore=0
         )
         tests = [person["test"] for person in known.summary["people"]]
         above = np.mean([test["nll"] - test["floor"] for test in tests])
@@ -272,23 +259,17 @@ pd.DataFrame(rows).T.rename_axis("nats an action above their own entropy")
 
 # %%
 from mirror_ppl.evaluation.comparison import compare_fits, read_fit
-from mirror_ppl.inference.results.export import save_inference_data
-from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.plots.comparison import plot_comparison
 
 names = ["mirror", "perceptual-only", "policy-only", "no-implants"]
-with tempfile.TemporaryDirectory() as folder:
-    files = []
-    for name in names:
-        model = VARIANTS[name](human.self_model)
-        own = fit
-        if name != "mirror":
-            own = fit_people(model, some, InferenceOptions(draws=draws), 0, rounds)
-        path = Path(folder) / f"{name}.nc"
-        save_inference_data(own.data, path)
-        files.append(read_fit(path, "heldout"))
+files = []
+for name in names:
+    own = fit if name == "mirror" else mirror_ppl.infer(some, human=name, explore=0, **settings)
+    own.save(Path(folder.name, name))
+    files.append(read_fit(Path(folder.name, name, "posterior.nc"), "heldout"))
+folder.cleanup()
 comparison = compare_fits(files, names, "heldout")
-plot_comparison(comparison)
+plot_comparison(comparison.table())
 
 # %% [markdown]
 # What these people *see* is what sets them apart from the robot. Without it, no policy implant

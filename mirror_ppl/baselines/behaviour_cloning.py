@@ -60,7 +60,7 @@ class BehaviourCloneOptions(TrainingOptions):
     choosing one for each person by their validation rounds predicts held-out rounds no better.
     Beside it there was no gain from dropout (.3 and .4 after the GRU and the layer, .2 on the
     inputs) or from torch's usual initial input weights, and a loss of .02 to .04 from scaled
-    numbers in place of symbols. In other domains, in both settings, `benchmarks.rivals` searched:
+    numbers in place of symbols. In other domains, in both settings, `benchmarks.baselines` found:
     in search and rescue a tenth of the learning rate halves what is missed in clear air (1.203 to
     .555 nats of 20 rounds, .599 to .593 in smoke); in bomb defusal all values are alike.
 

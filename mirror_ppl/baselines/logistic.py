@@ -1,4 +1,4 @@
-"""Logistic regression pooled over people: the strongest simple rival where rounds are few.
+"""Logistic regression pooled over people: the strongest simple baseline where rounds are few.
 
 No memory, and weights that people share but for what their own rounds say against it::
 

@@ -26,6 +26,7 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.view import View
+from mirror_ppl.models.world_knowledge import WorldKnowledge
 
 NETWORK = "network"
 """Name of the only site: which network it is, of one."""
@@ -33,7 +34,7 @@ TOLD = "told_"
 """Prefix of masks of what is told, which networks read besides what is seen."""
 
 
-class NetworkPerson(HumanModel):
+class NetworkPerson(HumanModel, WorldKnowledge):
     """A person as a trained network has them.
 
     Args:
@@ -80,7 +81,7 @@ class NetworkPerson(HumanModel):
         """As many draws of the posterior, ``[S, 1, 1]``, which are all the same."""
         return {NETWORK: torch.zeros(number, 1, 1, dtype=torch.long)}
 
-    def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
+    def planning_domain(self, draws: Mapping[str, Tensor]) -> Domain:
         """The world that was given, or that of the self-model."""
         del draws
         return self.domain if self.world is None else self.world

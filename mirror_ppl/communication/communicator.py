@@ -25,6 +25,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.errors import InputError
+from mirror_ppl.models.world_knowledge import planning_domain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -323,7 +324,7 @@ class Communicator:
     @cached_property
     def _world(self) -> Domain:
         """The world as the robot knows it after what it learned."""
-        return self.person.human.known_world(self.person.draws)
+        return planning_domain(self.person.human, self.person.draws)
 
 
 def choose(valued: Valued, standard_errors: float) -> int:

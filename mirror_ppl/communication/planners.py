@@ -12,6 +12,7 @@ from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.rollouts import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.search import Automatic
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.models.world_knowledge import planning_domain
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def _utility(world: World, options: PlannerOptions) -> Objective:
 
 
 def _mirror(person: Person, options: PlannerOptions) -> Objective:
-    return _utility(SimulatorWorld(person.human.known_world(person.draws)), options)
+    return _utility(SimulatorWorld(planning_domain(person.human, person.draws)), options)
 
 
 def _mirror_self_model(person: Person, options: PlannerOptions) -> Objective:

@@ -7,7 +7,7 @@ them are differences in what they said.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
@@ -21,11 +21,11 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains.base import Domain, map_state, total_reward
+from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.oracle import Oracle
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
-from mirror_ppl.people import draw_starts, simulated_people
+from mirror_ppl.people import draw_starts
 from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.driving import Drivers
 from mirror_ppl.people.populations import derived_generator
@@ -107,7 +107,7 @@ class Listener:
         domain: the world.
         setting: its setting.
         driver: the person as they are, P = 1.
-        start: how the rounds ``[1, R]`` begin, and the luck by which the person chooses.
+        start: how the rounds ``[1, R]`` begin, and the noise by which the person chooses.
         person: what was inferred of the person, if anything; planners need it.
     """
 
@@ -119,26 +119,18 @@ class Listener:
 
 
 def listeners(
-    domain: Domain,
-    setting: str,
-    population: str,
-    people: int,
-    people_seed: int,
-    rounds: int,
-    seed: int,
+    everybody: SimulatedPeople, people: int, setting: str, rounds: int, seed: int
 ) -> list[Listener]:
     """Simulated people, and rounds that are the same whoever speaks to them.
 
     Args:
-        domain: the world.
-        setting: its setting.
-        population: which people.
-        people: how many.
-        people_seed: of the people.
+        everybody: the people.
+        people: how many they are.
+        setting: of their world.
         rounds: of each of them.
-        seed: of how the rounds begin and of all luck in them.
+        seed: of how the rounds begin and of all noise in them.
     """
-    everybody = simulated_people(domain.name, setting, population, people, people_seed)
+    domain = everybody.domain
     starts = draw_starts(
         people, rounds, seed, "assist", setting, domain=domain, fates=everybody.fates
     )
@@ -204,6 +196,57 @@ def _oracle(listener: Listener) -> Say:
     return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
 
 
+class _Tally:
+    """What R rounds add up to, see `Played`."""
+
+    def __init__(self, domain: Domain, channels: Channels, rounds: int) -> None:
+        self.domain, self.channels = domain, channels
+        self.task, self.cost = torch.zeros(rounds), torch.zeros(rounds)
+        self.mishaps = torch.zeros(rounds, dtype=torch.long)
+        self.items = {m.name: torch.zeros_like(self.mishaps) for m in self.domain.modalities}
+        self.relevant: dict[str, dict[str, Tensor]] = {}
+        self.chances = dict.fromkeys(self.items, 0)
+        self.steps = 0
+
+    def add_messages(self, observation: Observation, flags: Tensor, under_way: Tensor) -> None:
+        """Count messages ``[R, N]`` of a step, and what could have been communicated."""
+        self.steps += int(under_way.sum())
+        self.cost += self.channels.cost(flags)
+        messages, may = self.channels.split(flags), self.domain.communicable(observation)
+        for name, mask in messages.items():
+            self.items[name] += mask.sum(-1)
+            self.chances[name] += int(may[name][0, under_way].sum())
+        for notion, masks in self.domain.relevance(observation).items():
+            counts = self.relevant.setdefault(
+                notion, {name: torch.zeros_like(count) for name, count in self.items.items()}
+            )
+            for name, mask in messages.items():
+                counts[name] += (mask & masks[name][0]).sum(-1)
+
+    def add_rewards(self, terms: Mapping[str, Tensor]) -> None:
+        """Add rewards ``[1, R]`` of a step, by term."""
+        self.task += total_reward(terms)[0]
+        self.mishaps += (terms[self.domain.mishap[0]][0] < 0).long()
+
+    def played(self, seconds: float, log: list[dict[str, Any]]) -> Played:
+        """The rounds, of which decisions took so many seconds."""
+        return Played(
+            self.task.tolist(),
+            self.cost.tolist(),
+            self.mishaps.tolist(),
+            _lists(self.items),
+            {notion: _lists(counts) for notion, counts in self.relevant.items()},
+            self.chances,
+            self.steps,
+            1000 * seconds / self.steps,
+            log,
+        )
+
+
+def _lists(counts: Mapping[str, Tensor]) -> dict[str, list[int]]:
+    return {name: count.tolist() for name, count in counts.items()}
+
+
 @torch.no_grad()
 def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
     """Let one person play their rounds while somebody speaks to them.
@@ -214,22 +257,16 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
         keep_log: whether to keep every decision.
     """
     domain, driver, start = listener.domain, listener.driver, listener.start
-    channels = Channels(domain)
-    number = start.luck.shape[1]
+    channels, number = Channels(domain), start.luck.shape[1]
+    tally, seconds, log = _Tally(domain, channels, number), 0.0, []
     state, memory = start.state, driver.start(number, fate=start.fate)
     rounds: list[RoundSoFar] = []
-    task, cost = torch.zeros(number), torch.zeros(number)
-    mishaps = torch.zeros(number, dtype=torch.long)
-    items = {m.name: torch.zeros(number, dtype=torch.long) for m in domain.modalities}
-    relevant: dict[str, dict[str, Tensor]] = {}
-    chances = dict.fromkeys(items, 0)
-    seconds, steps, log = 0.0, 0, []
-    told, action = {}, torch.zeros(number, dtype=torch.long)
+    messages, action = {}, torch.zeros(number, dtype=torch.long)
     for step in range(domain.horizon):
         observation = domain.observe(state)
         now = [{name: value[0, r] for name, value in observation.items()} for r in range(number)]
         rounds = (
-            [past.then(_row(told, r), action[r], now[r]) for r, past in enumerate(rounds)]
+            [past.then(_row(messages, r), action[r], now[r]) for r, past in enumerate(rounds)]
             if rounds
             else [RoundSoFar.begin(domain, one) for one in now]
         )
@@ -237,48 +274,23 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
         flags, decisions = say(rounds, Truth(step, state, memory))
         seconds += perf_counter() - began
         under_way = ~domain.over(state)[0]
-        steps += int(under_way.sum())
         flags = flags & under_way[:, None]
-        told = channels.split(flags)
+        messages = channels.split(flags)
         probability, memory = driver.step(memory, observation, channels.split(flags[None]))
         action = act(probability, start.luck[..., step])[0]
         following = domain.transition(state, action[None])
-        terms = domain.rewards(state, action[None], following)
-        task += total_reward(terms)[0]
-        mishaps += (terms[domain.mishap[0]][0] < 0).long()
-        cost += channels.cost(flags)
-        may = domain.communicable(observation)
-        for name, mask in told.items():
-            items[name] += mask.sum(-1)
-            chances[name] += int(may[name][0, under_way].sum())
-        for notion, masks in domain.relevance(observation).items():
-            counts = relevant.setdefault(
-                notion, {name: torch.zeros_like(count) for name, count in items.items()}
-            )
-            for name, mask in told.items():
-                counts[name] += (mask & masks[name][0]).sum(-1)
+        tally.add_messages(observation, flags, under_way)
+        tally.add_rewards(domain.rewards(state, action[None], following))
         if keep_log:
             log += [
-                _entry(domain, channels, flags[r], r, step, int(action[r]), probability[0, r])
+                {"round": r, "step": step}
+                | _entry(domain, channels, flags[r], int(action[r]), probability[0, r])
                 | ({} if decisions is None else audit(decisions[r]))
                 for r in range(number)
                 if under_way[r]
             ]
         state = following
-    return Played(
-        task.tolist(),
-        cost.tolist(),
-        mishaps.tolist(),
-        {name: count.tolist() for name, count in items.items()},
-        {
-            notion: {name: count.tolist() for name, count in counts.items()}
-            for notion, counts in relevant.items()
-        },
-        chances,
-        steps,
-        1000 * seconds / steps,
-        log,
-    )
+    return tally.played(seconds, log)
 
 
 def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
@@ -307,19 +319,10 @@ def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
 
 
 def _entry(
-    domain: Domain,
-    channels: Channels,
-    flags: Tensor,
-    number: int,
-    step: int,
-    action: int,
-    probability: Tensor,
+    domain: Domain, channels: Channels, flags: Tensor, action: int, probability: Tensor
 ) -> dict[str, Any]:
-    message = channels.message(flags)
     return {
-        "round": number,
-        "step": step,
-        "message": {name: list(items) for name, items in message.items.items()},
+        "message": {name: list(items) for name, items in channels.message(flags).items.items()},
         "cost": float(channels.cost(flags)),
         "action": domain.actions[action],
         "true_probability": dict(zip(domain.actions, probability.tolist(), strict=True)),
@@ -328,10 +331,3 @@ def _entry(
 
 def _row(masks: dict[str, Tensor], row: int) -> dict[str, Tensor]:
     return {name: mask[row] for name, mask in masks.items()}
-
-
-def as_data(played: Played) -> dict[str, Any]:
-    """A person's rounds as plain data, without the log."""
-    data = asdict(played)
-    del data["log"]
-    return data

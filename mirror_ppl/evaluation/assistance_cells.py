@@ -1,25 +1,17 @@
-"""The work of pairing people with communicators, in cells that run beside each other and resume.
-
-A cell is one person with one communicator; the results of each are a file of its own until the
-whole is done.
-"""
+"""The work of pairing people with communicators, in cells that can be done beside each other."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
-from mirror_ppl import __version__
 from mirror_ppl.communication.person import Person
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.evaluation.assistance import (
-    COMMUNICATORS,
     RATES_FROM,
     Listener,
     PlannerOptions,
@@ -28,13 +20,14 @@ from mirror_ppl.evaluation.assistance import (
     play,
     speaker,
 )
-from mirror_ppl.files import write_whole
 from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
+from mirror_ppl.jobs import JsonFormat, Runner
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.workers import run_tasks
+from mirror_ppl.people import simulated_people
+from mirror_ppl.version import __version__
 
 
 @dataclass(frozen=True)
@@ -93,15 +86,10 @@ class Pairing:
 
     def listener(self, number: int, inferred: bool = True) -> Listener:
         """The person of that number, with their rounds, and what was inferred of them."""
-        listener = listeners(
-            self.domain,
-            self.setting,
-            self.population,
-            self.people,
-            self.people_seed,
-            self.rounds,
-            self.seed,
-        )[number]
+        everybody = simulated_people(
+            self.domain.name, self.setting, self.population, self.people, self.people_seed
+        )
+        listener = listeners(everybody, self.people, self.setting, self.rounds, self.seed)[number]
         if not inferred:
             return listener
         own = slice(number, number + 1)
@@ -127,85 +115,67 @@ class Pairing:
             digest.update(b"" if path is None else path.read_bytes())
         return digest.hexdigest()
 
-    def forget(self, parts: Path) -> None:
-        """Remove the files of finished cells, and their folder if nothing else is in it."""
-        for name in COMMUNICATORS:
-            for number in range(self.people):
-                (parts / f"{name}-{number}.json").unlink(missing_ok=True)
-        with suppress(OSError):
-            parts.rmdir()
+
+@dataclass(frozen=True)
+class Turn:
+    """One person with one communicator, or with several of which one depends on another.
+
+    Attributes:
+        person: their number.
+        communicators: by name; ``random`` comes after the one whose rates it has.
+    """
+
+    person: int
+    communicators: tuple[str, ...]
+
+    @property
+    def label(self) -> str:
+        """What it is, for people who wait."""
+        return f"{' and '.join(self.communicators)}, person {self.person + 1}"
 
 
-def run_cells(
-    pairing: Pairing,
-    communicators: Sequence[str],
-    people: int,
-    jobs: int,
-    parts: Path | None,
-    report: Callable[[int, str], None] = lambda done, message: None,
-) -> dict[str, list[Played]]:
-    """Play every cell.
+def turns(communicators: Sequence[str], people: int) -> list[Turn]:
+    """Every communicator with every person, slowest first, so that processes end together.
+
+    Args:
+        communicators: by name.
+        people: how many of the people, from the first on.
+    """
+    first: list[tuple[str, ...]] = [
+        (name,) for name in communicators if name not in (RATES_FROM, "random")
+    ]
+    if "random" in communicators:
+        first.append((RATES_FROM, "random"))
+    elif RATES_FROM in communicators:
+        first.append((RATES_FROM,))
+    first.sort(key=lambda names: not names[0].startswith(("mirror", "oracle")))
+    return [Turn(number, names) for names in first for number in range(people)]
+
+
+def play_all(pairing: Pairing, chosen: Sequence[Turn], runner: Runner) -> dict[str, list[Played]]:
+    """What each person played with each communicator.
 
     Args:
         pairing: who is paired in which rounds.
-        communicators: by name.
-        people: how many of the people, from the first on.
-        jobs: processes.
-        parts: folder in which finished cells are kept, and looked for.
-        report: told how many cells are done, and which was the last.
-
-    Returns:
-        Of each communicator, what each person played.
+        chosen: everything that is played.
+        runner: does the work and keeps what is finished.
     """
-    # Slowest first, so that no process is left waiting for another at the end.
-    first = [name for name in communicators if name != "random"]
-    first.sort(key=lambda name: not name.startswith(("mirror", "oracle")))
-    if "random" in communicators and RATES_FROM not in first:
-        first.insert(0, RATES_FROM)
-    identity = pairing.identity() if parts is not None else ""
-    results: dict[tuple[str, int], Played] = {}
-
-    def work(names: Sequence[str]) -> None:
-        rates: dict[int, dict[str, float] | None] = {
-            number: results[RATES_FROM, number].rates() if "random" in names else None
-            for number in range(people)
-        }
-        tasks = [
-            partial(_cell, pairing, name, number, rates[number], parts, identity)
-            for name in names
-            for number in range(people)
-        ]
-        for name, number, played in run_tasks(tasks, jobs):
-            results[name, number] = played
-            report(len(results), f"{name}, person {number + 1}")
-
-    work(first)
-    if "random" in communicators:
-        work(["random"])
-    return {name: [results[name, number] for number in range(people)] for name in communicators}
+    identity = pairing.identity()
+    form = JsonFormat(lambda content: {name: Played(**one) for name, one in content.items()})
+    outcomes = replace(runner, identity=lambda turn: identity).run(
+        chosen, partial(_play, pairing), form
+    )
+    played: dict[str, list[Played]] = {}
+    for outcome in outcomes:
+        assert outcome.result is not None
+        for name, own in outcome.result.items():
+            played.setdefault(name, []).append(own)
+    return played
 
 
-def _cell(
-    pairing: Pairing,
-    name: str,
-    number: int,
-    rates: dict[str, float] | None,
-    parts: Path | None,
-    identity: str,
-) -> tuple[str, int, Played]:
-    path = None if parts is None else parts / f"{name}-{number}.json"
-    played = None if path is None else _kept(path, identity)
-    if played is None:
-        played = pairing.play(number, name, rates)
-        if path is not None:
-            write_whole(path, json.dumps({"identity": identity, "played": asdict(played)}))
-    return name, number, played
-
-
-def _kept(path: Path, identity: str) -> Played | None:
-    """What an earlier run left, if it was a run of the same thing."""
-    try:
-        content: dict[str, Any] = json.loads(path.read_text())
-        return Played(**content["played"]) if content["identity"] == identity else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def _play(pairing: Pairing, turn: Turn) -> dict[str, Played]:
+    played: dict[str, Played] = {}
+    for name in turn.communicators:
+        rates = played[RATES_FROM].rates() if name == "random" else None
+        played[name] = pairing.play(turn.person, name, rates)
+    return played

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from mirror_ppl.arviz import az
@@ -101,7 +102,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Standing:
+class RankedModel:
     """Where a model stands among those it is compared with.
 
     Attributes:
@@ -137,7 +138,20 @@ class Comparison:
     by: str
     attributes: Mapping[str, str]
     people: tuple[str, ...]
-    models: tuple[Standing, ...]
+    models: tuple[RankedModel, ...]
+
+    def table(self) -> pd.DataFrame:
+        """Scores as `mirror_ppl.plots.comparison.plot_comparison` draws them."""
+        return pd.DataFrame(
+            [
+                {"model": model.label, "person": person}
+                | ({"rounds": 0} if score is None else asdict(score))
+                for model in self.models
+                for person, score in zip(
+                    (None, *self.people), (model.total, *model.people), strict=True
+                )
+            ]
+        ).astype({"difference_se": float})
 
     def as_data(self) -> dict[str, Any]:
         """The comparison as JSON holds it, people by name."""
@@ -284,9 +298,9 @@ def compare_fits(files: Sequence[FitFile], labels: Sequence[str], by: str = "loo
     best = measured[order[0]].values
     people = [person == index for index in range(len(first.people))]
 
-    def standing(label: str, weight: float) -> Standing:
+    def standing(label: str, weight: float) -> RankedModel:
         file, rounds = files[labels.index(label)], measured[label]
-        return Standing(
+        return RankedModel(
             label,
             file.path,
             _model(file),

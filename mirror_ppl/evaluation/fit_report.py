@@ -55,14 +55,14 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     ]
     if few:
         print(
-            f"In the population, fewer than {FEW} draws count of {', '.join(few)}: it is at odds "
-            "with what they did, or far from the prior; their posterior is coarse"
+            f"Fewer than {FEW} effective draws under the population for {', '.join(few)}: it is at "
+            "odds with what they did, or far from the prior; their posterior is coarse"
         )
     opened = [person["identifiability"] for person in people if "identifiability" in person]
-    _show_open(opened, sites)
+    _show_entropy(opened, sites)
     tested = [person["test"] for person in people if person["test"]]
     if not tested:
-        print("No rounds were held out, so that predictions are not judged (--train-rounds)")
+        print("No rounds were held out, so predictions are not scored (--train-rounds)")
     else:
         nll = sum(test["nll"] for test in tested) / len(tested)
         line = f"Held-out actions: {nll:.3f} nats an action on average"
@@ -127,11 +127,11 @@ def _side_by_side(
     return blocks
 
 
-def _show_open(people: list[dict[str, Any]], sites: Iterable[str]) -> None:
-    """What is open about sight, and which rounds would tell most."""
+def _show_entropy(people: list[dict[str, Any]], sites: Iterable[str]) -> None:
+    """Posterior entropy of perceptual implants, and the most informative next scenario."""
     if not people:
         return
-    entropy, hanging = (
+    entropy, shared = (
         sum(person[part]["together"] for person in people) / len(people)
         for part in ("open", "hangs_on_policy")
     )
@@ -140,17 +140,18 @@ def _show_open(people: list[dict[str, Any]], sites: Iterable[str]) -> None:
         for name in people[0]["scenarios"]
     }
     best = max(expected, key=lambda name: expected[name], default="")
-    told = [person["open"]["together"] for person in people]
-    told += [one["expected"] for person in people for one in person["scenarios"].values()]
-    if max(told) < NEGLIGIBLE:
+    amounts = [person["open"]["together"] for person in people]
+    amounts += [one["expected"] for person in people for one in person["scenarios"].values()]
+    if max(amounts) < NEGLIGIBLE:
         noticing = any(name.startswith(NOTICES) for name in sites)
-        but = ", but for how soon they notice things, which is not counted" if noticing else ""
-        print(f"Nothing is open about what they see{but}")
+        but = ", not counting how soon they notice things" if noticing else ""
+        print(f"Posterior entropy of the perceptual implants: none{but}")
         return
-    line = f"Open about what they see: {entropy:.2f} nats on average, "
-    line += f"of which {hanging:.2f} hang on how they decide"
+    line = f"Posterior entropy of the perceptual implants: {entropy:.2f} nats on average "
+    line += f"({shared:.2f} shared with the policy implants)"
     if best and expected[best] >= NEGLIGIBLE:
-        line += f'; a round more of "{best}" would tell most, {expected[best]:.2f}'
+        line += f'. Most informative next scenario: "{best}" '
+        line += f"(expected information gain {expected[best]:.2f} nats)"
     print(line)
 
 

@@ -1,4 +1,4 @@
-"""Models of people that are compared: one interface for MIRROR, its parts, and its rivals.
+"""Models of people that are compared: one interface for MIRROR, its parts, and its baselines.
 
 A learner gets rounds of people and their robot's self-model. What it learned predicts other rounds
 of the same people and, if it can be planned with, stands for a person in a communicator.
@@ -27,7 +27,7 @@ from mirror_ppl.baselines import (
 from mirror_ppl.baselines.inputs import Sight
 from mirror_ppl.communication.person import Person
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains import DOMAINS, get_domain
+from mirror_ppl.domains import DOMAINS
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, listeners
@@ -39,7 +39,8 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import simulate
+from mirror_ppl.models.world_knowledge import fit_world, planning_domain
+from mirror_ppl.people import simulate, simulated_people
 from mirror_ppl.training.guide_file import network_for
 
 TRAINING = 20
@@ -89,15 +90,10 @@ class Group:
 
     def listeners(self, rounds: int) -> list[Listener]:
         """These people, and other rounds of theirs in which they can be spoken to."""
-        return listeners(
-            get_domain(self.domain),
-            self.setting,
-            self.population,
-            self.people,
-            self.seed,
-            rounds,
-            self.seed,
+        everybody = simulated_people(
+            self.domain, self.setting, self.population, self.people, self.seed
         )
+        return listeners(everybody, self.people, self.setting, rounds, self.seed)
 
     @property
     def self_model(self) -> SelfModel:
@@ -188,7 +184,7 @@ def _mirror(
     def learn(group: Group, rounds: int, seed: int) -> Posterior:
         human = load_human_model(variant, group.self_model)
         train = group.recordings().select_rounds(slice(rounds))
-        human.learn_world(train)
+        fit_world(human, train)
         network = network_for(engine, None, human)
         population = population_of(replace(group, seed=OTHERS)) if from_others else None
         options = InferenceOptions(engine)
@@ -203,7 +199,7 @@ def population_of(group: Group) -> Population:
     """The population that a group is from, as far as all their training rounds tell."""
     human = load_human_model(None, group.self_model)
     rounds = group.recordings(TRAINING)
-    human.learn_world(rounds)
+    fit_world(human, rounds)
     found = infer(human, rounds, InferenceOptions(pooling="partial"), group.seed)
     assert found.population is not None
     return found.population
@@ -215,10 +211,10 @@ def _parts(group: Group, rounds: int) -> tuple[Demonstrations, Demonstrations]:
 
 
 def _trained(group: Group, train: Demonstrations, networks: RecurrentNetworks) -> Trained:
-    # What rewards tell of the world is nothing about people, so rivals get to know it, too.
+    # What rewards say of the world is nothing about people, so baselines get to know it, too.
     human = load_human_model(None, group.self_model)
-    human.learn_world(train)
-    return Trained(networks, human.self_model, group.setting, human.known_world({}))
+    fit_world(human, train)
+    return Trained(networks, human.self_model, group.setting, planning_domain(human, {}))
 
 
 def _behaviour_cloning(sight: Sight) -> Learn:
@@ -264,7 +260,7 @@ LEARNERS: dict[str, Learn] = {
 }
 """Everything that can be compared, in the order in which it is shown. Guides are `exact` but for
 those of other names; ``mirror-population`` has a prior learned from others.
-Rivals are told what the setting lets people see, which MIRROR has to find out, but for those that
+Baselines get what the setting lets people see, which MIRROR has to find out, but for those that
 read ``everything``, as the human model is given it."""
 SLOW = {
     "mirror-nuts": DOMAINS,

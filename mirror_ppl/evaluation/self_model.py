@@ -125,14 +125,11 @@ def self_model_quality(
     best = float(returns(domain, start, planner_actions(domain, start, steps, 1.0)).mean())
     worst = float(returns(domain, start, anything).mean())
     report = {"return_exact": best, "return_random": worst}
-    views = {"full": fixed_views(domain, rounds, generator, speech=True)}
-    if "clear" in domain.settings:
-        views["clear"] = fixed_views(domain, rounds, generator)
-    for name, reach in domain.partial_views.items():
-        views[name] = fixed_views(domain, rounds, generator, reach)
+    views = _views(domain, rounds, generator)
     for done, (name, plan) in enumerate(views.items()):
         progress(done, len(views))
-        if name in ("full", "clear") or not domain.settled:
+        whole = name in ("full", "clear")
+        if whole or not domain.settled:
             own = drive(self_model, start, plan, steps, generator)
             reached = float(returns(domain, start, own).mean())
             report[f"return_{name}"] = reached
@@ -142,22 +139,37 @@ def self_model_quality(
                 report["return_as_it_is"] = float(returns(real, start, own).mean())
                 planned = planner_actions(real, start, steps, 1.0)
                 report["return_exact_as_it_is"] = float(returns(real, start, planned).mean())
-        if name not in ("full", "clear") and not domain.settled:
-            continue
-        actions = drive(self_model, start, plan, steps, generator, epsilon=0.2)
-        lived = experience(domain, start, actions, plan).rounds
-        belief = self_model.believe(
-            self_model.evidence(lived.observation, lived.visible, lived.actions)
-        )
-        own_values = self_model.action_values(belief[:, :-1])
-        exact = _exact_values(domain, start, actions, plan, discount)
-        chosen = exact.gather(-1, own_values.argmax(-1, keepdim=True)).squeeze(-1)
-        agree = chosen >= exact.amax(-1) - TIE
-        stake = exact.amax(-1) - exact.amin(-1)
-        report[f"agreement_{name}"] = float(agree.float().mean())
-        report[f"clear_agreement_{name}"] = float(agree[stake > CLEAR_DECISION].float().mean())
+        if whole or domain.settled:
+            actions = drive(self_model, start, plan, steps, generator, epsilon=0.2)
+            exact = _exact_values(domain, start, actions, plan, discount)
+            agree, clear = _agreement(self_model, exact, start, actions, plan)
+            report |= {f"agreement_{name}": agree, f"clear_agreement_{name}": clear}
     progress(len(views), len(views))
     return report
+
+
+def _views(domain: Domain, rounds: int, generator: torch.Generator) -> dict[str, ViewPlan]:
+    """Full view, clear view where there is one, and the domain's partial views."""
+    views = {"full": fixed_views(domain, rounds, generator, speech=True)}
+    if "clear" in domain.settings:
+        views["clear"] = fixed_views(domain, rounds, generator)
+    for name, reach in domain.partial_views.items():
+        views[name] = fixed_views(domain, rounds, generator, reach)
+    return views
+
+
+def _agreement(
+    self_model: SelfModel, exact: Tensor, start: Any, actions: Tensor, plan: ViewPlan
+) -> tuple[float, float]:
+    """Share of decisions that are best by exact values ``[B, T, A]``: of all, and of clear ones."""
+    lived = experience(self_model.domain.as_believed, start, actions, plan).rounds
+    belief = self_model.believe(
+        self_model.evidence(lived.observation, lived.visible, lived.actions)
+    )
+    best = self_model.action_values(belief[:, :-1]).argmax(-1, keepdim=True)
+    agree = exact.gather(-1, best).squeeze(-1) >= exact.amax(-1) - TIE
+    stake = exact.amax(-1) - exact.amin(-1)
+    return float(agree.float().mean()), float(agree[stake > CLEAR_DECISION].float().mean())
 
 
 def _exact_values(

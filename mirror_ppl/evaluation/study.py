@@ -26,7 +26,7 @@ from mirror_ppl.evaluation.learners import (
     is_own,
     learn,
 )
-from mirror_ppl.evaluation.sweep import Rows
+from mirror_ppl.evaluation.tables import Rows
 from mirror_ppl.inference.results.summary import score
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.loading import file_of, load_human_model
@@ -35,7 +35,7 @@ from mirror_ppl.training.guide_file import shipped_guide
 
 CODE = (
     *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
-    *(f"{name}/**/*.py" for name in ("inference", "models", "people")),
+    *(f"{name}/**/*.py" for name in ("inference", "likelihood", "models", "people")),
     *(f"evaluation/{name}.py" for name in ("assistance", "learners", "oracle", "study")),
     "evaluation/reachable_oracle.py",
     "cross_entropy.py",

@@ -12,17 +12,18 @@ from mirror_ppl.domains import Domain, Observation, get_domain
 from mirror_ppl.evaluation.study_summary import (
     Claim,
     Interval,
+    ModelResult,
     Paired,
     Place,
     Share,
-    Standing,
     few_against_many,
     floors,
+    means_table,
     relevance,
+    shares_table,
     summarize_study,
 )
-from mirror_ppl.evaluation.sweep import Rows
-from mirror_ppl.evaluation.tables import TextTable
+from mirror_ppl.evaluation.tables import Rows, TextTable
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.study import plot_curves, plot_relevance
 
@@ -52,27 +53,29 @@ class Report:
 
 
 def _prediction(rows: Rows) -> Report:
-    standings, floor = summarize_study(rows, "nll", -1), floors(rows)
+    results, floor = summarize_study(rows, "nll", -1), floors(rows)
     accuracy, claims = summarize_study(rows, "accuracy"), few_against_many(rows, "nll", -1)
-    data = {"nll": standings, "accuracy": accuracy, "few_against_many": claims}
+    data = {"nll": results, "accuracy": accuracy, "few_against_many": claims}
     return Report(
         [
-            *_tables(standings, "NLL of held-out actions, nats an action: less is better", floor),
+            *_tables(results, "NLL of held-out actions, nats an action: less is better", floor),
             *_tables(accuracy, "accuracy of held-out actions: more is better", {}),
         ],
         [_claimed(claim) for claim in claims],
         data,
-        plot_curves(standings, "NLL of held-out actions (nats an action)", floor, by_ratio=True),
+        plot_curves(
+            means_table(results), "NLL of held-out actions (nats an action)", floor, by_ratio=True
+        ),
     )
 
 
 def _assistance(rows: Rows) -> Report:
-    standings = summarize_study(rows, "net")
+    results = summarize_study(rows, "net")
     return Report(
-        _tables(standings, "net return of a round: more is better", {}),
+        _tables(results, "net return of a round: more is better", {}),
         [],
-        {"net": standings},
-        plot_curves(standings, "net return of a round"),
+        {"net": results},
+        plot_curves(means_table(results), "net return of a round"),
     )
 
 
@@ -86,10 +89,10 @@ def _relevance(rows: Rows) -> Report:
             for where in dict.fromkeys(one.place for one in found):
                 here = [one for one in found if one.place == where]
                 if not place:
-                    first.append(here)
+                    first += here
                 title = f"{', '.join(where)}: items about {notion.replace('_', ' ')}"
                 tables.append(_shares(here, title))
-    return Report(tables, [], {"relevance": data}, plot_relevance(first))
+    return Report(tables, [], {"relevance": data}, plot_relevance(shares_table(first)))
 
 
 def _first_observation(domain: Domain) -> Observation:
@@ -100,18 +103,18 @@ def _claimed(claim: Claim) -> str:
     ahead, better = claim.paired.ahead, claim.paired.improvement
     return (
         f"{claim.place.domain}, {claim.place.setting}: mirror with {_counted(claim.rounds)} "
-        f"against {claim.rival} with {_counted(claim.rival_rounds)}: ahead by {_text(ahead)} "
+        f"against {claim.baseline} with {_counted(claim.baseline_rounds)}: ahead by {_text(ahead)} "
         f"nats an action, in {100 * better.mean:.0f}% of people"
     )
 
 
 def _tables(
-    standings: Sequence[Standing], title: str, floor: Mapping[Place, float]
+    results: Sequence[ModelResult], title: str, floor: Mapping[Place, float]
 ) -> list[TextTable]:
     """One a place."""
     tables = []
-    for place in dict.fromkeys(one.place for one in standings):
-        here = [one for one in standings if one.place == place]
+    for place in dict.fromkeys(one.place for one in results):
+        here = [one for one in results if one.place == place]
         numbers = sorted({one.rounds for one in here})
         by = {(one.model, one.rounds): one for one in here}
         number = max(one.people for one in here)
@@ -133,7 +136,7 @@ def _tables(
     return tables
 
 
-def _entry(one: Standing | None, people: int) -> str:
+def _entry(one: ModelResult | None, people: int) -> str:
     if one is None:
         return ""
     text = f"{one.measured.mean:.3f}"
@@ -159,7 +162,7 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
     names = list(dict.fromkeys(one.modality for one in shares))
     cells: dict[tuple[str, int], dict[str, str]] = {}
     for one in shares:
-        text = "nothing told"
+        text = "no messages"
         if one.share is not None:
             low, high = 100 * one.share.low, 100 * one.share.high
             text = f"{100 * one.share.mean:.0f}% [{low:.0f}, {high:.0f}] of {one.items}"
@@ -170,11 +173,11 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
         (model, "-" if rounds == 0 else str(rounds), *(own[name] for name in names))
         for (model, rounds), own in cells.items()
     )
-    caption = "share that is relevant [90% interval over people] of the items told"
+    caption = "relevant share [90% interval over people] of the communicated items"
     if any(one.mirror for one in shares):
         caption += (
             "; below it how far mirror's share (of 1) is ahead person by person, the 90% interval "
-            "of that, and in how many it is (ties count half), of people whom both told something"
+            "of that, and in how many it is (ties count half), over people with messages from both"
         )
     return TextTable(title, caption, ("model", "rounds", *names), rows)
 

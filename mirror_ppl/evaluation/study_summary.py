@@ -9,17 +9,18 @@ the statistical precipice*, 2021, with people in the place of runs).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from mirror_ppl.evaluation.sweep import Rows
+from mirror_ppl.evaluation.tables import Rows
 
 RESAMPLES = 2000
 LEVELS = (0.05, 0.95)
 FIRST = "mirror"
-RIVALS = ("bc", "bc-everything", "sqil", "sqil-everything")
+BASELINES = ("bc", "bc-everything", "sqil", "sqil-everything")
 """With whom the paper compares MIRROR."""
 
 
@@ -56,7 +57,7 @@ class Paired:
 
 
 @dataclass(frozen=True)
-class Standing:
+class ModelResult:
     """A model that learned from some rounds.
 
     Attributes:
@@ -79,29 +80,29 @@ class Standing:
 
 @dataclass(frozen=True)
 class Claim:
-    """MIRROR with the fewest rounds against a rival with the most."""
+    """MIRROR with the fewest rounds against a baseline with the most."""
 
     place: Place
     rounds: int
-    rival: str
-    rival_rounds: int
+    baseline: str
+    baseline_rounds: int
     paired: Paired
 
 
 @dataclass(frozen=True)
 class Share:
-    """How much of what a communicator told was relevant.
+    """How much of what a communicator sent was relevant.
 
     Attributes:
         place: where.
         model: what it planned with.
         rounds: that this learned from.
-        modality: of what was told; ``all`` together.
-        items: how many were told.
-        share: of them that was relevant; ``None`` if nothing was told.
-        mirror: how much more of what MIRROR told was, with as many rounds or, of who learns
-            nothing, with the most; of the people whom both told something. ``None`` for itself,
-            and where there is nobody.
+        modality: of the communicated items; ``all`` together.
+        items: how many were communicated.
+        share: of them that was relevant; ``None`` if there were none.
+        mirror: how much larger MIRROR's share is, with as many rounds or, for a model that learns
+            nothing, with the most; over people who got messages from both. ``None`` for itself,
+            and where there are no such people.
     """
 
     place: Place
@@ -126,7 +127,7 @@ def paired(first: np.ndarray, second: np.ndarray) -> Paired:
     return Paired(interval(difference), interval(better), len(difference))
 
 
-def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[Standing]:
+def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[ModelResult]:
     """How each model does at each number of rounds, and how far MIRROR is ahead of it.
 
     Args:
@@ -139,36 +140,36 @@ def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[Standing]:
         mirror = _mirror(values, place, model, rounds)
         own = np.array(list(people.values()))
         ahead = _both(mirror, people, sign)
-        found.append(Standing(place, model, rounds, interval(own), len(own), ahead))
+        found.append(ModelResult(place, model, rounds, interval(own), len(own), ahead))
     return found
 
 
 def few_against_many(
-    rows: Rows, measure: str, sign: int = 1, rivals: Iterable[str] = RIVALS
+    rows: Rows, measure: str, sign: int = 1, baselines: Iterable[str] = BASELINES
 ) -> list[Claim]:
-    """MIRROR with the fewest rounds against its rivals with the most, where there are both."""
+    """MIRROR with the fewest rounds against its baselines with the most, where there are both."""
     values = _by_model(rows, measure)
     found = []
     for place in dict.fromkeys(place for place, _, _ in values):
         numbers = {
             name: [rounds for where, model, rounds in values if (where, model) == (place, name)]
-            for name in (FIRST, *rivals)
+            for name in (FIRST, *baselines)
         }
-        for rival in rivals:
-            if not (numbers[FIRST] and numbers[rival]):
+        for baseline in baselines:
+            if not (numbers[FIRST] and numbers[baseline]):
                 continue
-            few, many = min(numbers[FIRST]), max(numbers[rival])
-            ahead = _both(values[place, FIRST, few], values[place, rival, many], sign)
+            few, many = min(numbers[FIRST]), max(numbers[baseline])
+            ahead = _both(values[place, FIRST, few], values[place, baseline, many], sign)
             if ahead is not None:
-                found.append(Claim(place, few, rival, many, ahead))
+                found.append(Claim(place, few, baseline, many, ahead))
     return found
 
 
 def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]:
-    """Share of what was told that was relevant; the bootstrap draws people.
+    """Share of the communicated items that was relevant; the bootstrap draws people.
 
-    Shares are of the items that all people were told together, and what MIRROR is ahead by is
-    the mean of the differences person by person.
+    A share is of the items that all people got together. MIRROR is ahead by the mean of the
+    differences person by person.
 
     Args:
         rows: of a study of assistance, of one domain.
@@ -202,6 +203,29 @@ def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]
                 share = Interval(float(good.sum() / items.sum()), float(low), float(high))
             found.append(Share(place, model, rounds, name, int(items.sum()), share, ahead))
     return found
+
+
+def means_table(results: Sequence[ModelResult]) -> pd.DataFrame:
+    """Means and intervals as columns, with place, model and number of rounds."""
+    return pd.DataFrame(
+        [
+            one.place._asdict() | {"model": one.model, "rounds": one.rounds} | asdict(one.measured)
+            for one in results
+        ]
+    )
+
+
+def shares_table(shares: Sequence[Share]) -> pd.DataFrame:
+    """Shares and intervals as columns, with place, model, rounds and modality; NaN of nothing."""
+    nothing = Interval(np.nan, np.nan, np.nan)
+    return pd.DataFrame(
+        [
+            one.place._asdict()
+            | {"model": one.model, "rounds": one.rounds, "modality": one.modality}
+            | asdict(one.share or nothing)
+            for one in shares
+        ]
+    )
 
 
 def floors(rows: Rows) -> dict[Place, float]:

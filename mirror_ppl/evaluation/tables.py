@@ -6,15 +6,17 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
 from mirror_ppl.console import console_for_tables
-from mirror_ppl.evaluation.sweep import Rows
 
 WIDTH = 110
+Rows = list[dict[str, Any]]
+"""A table of plain values."""
 
 
 @dataclass(frozen=True)

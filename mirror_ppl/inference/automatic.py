@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 from mirror_ppl.inference import amortized, importance
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
-from mirror_ppl.inference.amortized import AmortizedOptions, guide_screening, sample_amortized
+from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
+from mirror_ppl.inference.amortized_guide import guide_screening
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
 from mirror_ppl.inference.sampler import HIGH_PARETO_K, Weighted
@@ -41,8 +42,10 @@ def infer_automatically(job: Job) -> Inferred:
     if network is None or job.rounds.measurements:
         return importance.ENGINE.run(replace(job, settings=options.importance))
 
+    proposing = replace(options.amortized, refine=job.refine)
+
     def first_pass(builder: ViewTableBuilder, first: ImportanceOptions) -> tuple[str, Weighted]:
-        found = sample_amortized(builder.human, network, builder, options.amortized)
+        found = sample_amortized(builder.human, network, builder, proposing)
         if found.effective >= options.enough and found.pareto_k <= options.pareto_k:
             return amortized.ENGINE.name, found
         found = sample_importance(builder.human, builder.table(), first)
@@ -57,6 +60,5 @@ ENGINE = Engine(
     infer_automatically,
     AutomaticOptions,
     pooled_draws=4000,
-    weighted=True,
     takes_network=True,
 )

@@ -15,7 +15,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.progress import Report, silent
 
 if TYPE_CHECKING:
-    from mirror_ppl.inference.amortized import AmortizedGuide
+    from mirror_ppl.inference.amortized_guide import AmortizedGuide
     from mirror_ppl.inference.population.pooling import Population
 
 
@@ -55,7 +55,7 @@ class Job:
         report: told of progress.
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused).
-        start: draws ``[S, P, 1, ...]`` at which to start, if there are any.
+        refine: gradient steps on each person's rounds that refine what a network proposes.
     """
 
     human: HumanModel
@@ -67,16 +67,13 @@ class Job:
     network: AmortizedGuide | None = None
     report: Report = silent
     checkpoint: tuple[Path, str] | None = None
-    start: Mapping[str, Tensor] | None = None
+    refine: int = 0
 
     def of(self, people: range) -> Job:
         """The part of the job about some of the people."""
         if len(people) == self.rounds.num_people:
             return self
-        start = self.start
-        if start is not None:
-            start = {name: value[:, people.start : people.stop] for name, value in start.items()}
-        return replace(self, rounds=self.rounds.select_people(people), start=start)
+        return replace(self, rounds=self.rounds.select_people(people))
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,6 @@ class Engine:
         settings: class of the engine's settings; made without arguments unless they are given.
         pooled_draws: of each person under the human model's own prior, from which pooling chooses.
         any_program: whether it runs human models that cannot be compiled.
-        weighted: whether its draws are corrected by importance weights.
         takes_network: whether it proposes by an amortized guide, if there is one.
         needs_network: whether it does nothing without.
     """
@@ -99,6 +95,5 @@ class Engine:
     settings: type
     pooled_draws: int = 1000
     any_program: bool = False
-    weighted: bool = False
     takes_network: bool = False
     needs_network: bool = False

@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mirror_ppl import __version__
 from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.inference import amortized, automatic, importance, nuts, svi
-from mirror_ppl.inference.amortized import AmortizedGuide, require_network_of
+from mirror_ppl.inference.amortized_guide import AmortizedGuide, require_network_of
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
@@ -33,14 +32,13 @@ from mirror_ppl.models.measured import require_measurable
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.version import __version__
 
 ENGINES: Mapping[str, Engine] = {
     engine.name: engine
     for engine in (automatic.ENGINE, importance.ENGINE, amortized.ENGINE, svi.ENGINE, nuts.ENGINE)
 }
 """The registry; a new engine is a file of its own and its name here."""
-REFINING_RATE = 0.02
-"""Learning rate of Adam where it starts near the end."""
 
 
 def engine_name(name: str) -> str:
@@ -69,7 +67,7 @@ class InferenceOptions:
             amortized guide is its own.
         pooling: ``none``, or ``partial`` to infer with the people the population that they are
             from (:mod:`mirror_ppl.inference.population.pooling`).
-        refine: gradient steps of ``svi`` that start at what another engine found.
+        refine: gradient steps on each person's rounds that refine what a network proposes.
         allow_contradictions: share of recorded steps, from 0 to 1, that may contradict the next
             observation.
     """
@@ -96,9 +94,8 @@ class InferenceOptions:
             require_kind(self.screening, Screening, "screening")
         share = real_number(self.allow_contradictions, "allow_contradictions", 0, 1)
         object.__setattr__(self, "allow_contradictions", share)
-        if self.refine and not engine.weighted:
-            *others, last = (name for name, one in ENGINES.items() if one.weighted)
-            names = f"{', '.join(others)} and {last}"
+        if self.refine and not engine.takes_network:
+            names = " and ".join(name for name, one in ENGINES.items() if one.takes_network)
             raise InputError(f"refining is for the engines {names}, not {self.engine}")
 
 
@@ -149,11 +146,12 @@ def infer(
         require_measurable(human, demonstrations)
         if not has_own_program(human):
             require_unread(human, demonstrations.measurements)
-        if engine.needs_network or options.pooling != "none" or population is not None:
+        own = options.pooling == "none" and population is None
+        if engine.needs_network or options.refine or not own:
             raise InputError(
                 f"{', '.join(demonstrations.measurements)} of people was measured, which the "
-                "engine amortized and pooling cannot take into account: use another engine, each "
-                "person by themselves"
+                "engine amortized, refining and pooling cannot take into account: use another "
+                "engine, each person by themselves, unrefined"
             )
     job = Job(
         human,
@@ -165,16 +163,17 @@ def infer(
         network if engine.takes_network else None,
         report,
         checkpoint,
+        options.refine,
     )
     if options.pooling == "none" and population is None:
-        return _each(engine, job, options.refine)
+        return _each(engine, job)
     if options.pooling != "none" and population is not None:
         raise InputError(
             f"people from a known population are not pooled: pooling must be none, not "
             f"{options.pooling}"
         )
     many = replace(job, draws=max(options.draws, engine.pooled_draws))
-    own = _each(engine, many, options.refine)
+    own = _each(engine, many)
     pooling = Pooling(human)
     if population is None:
         population = pooling.fit(own.draws, options.draws, seed, report)
@@ -183,23 +182,17 @@ def infer(
     return replace(own, draws=pooled.draws, population=population, effective=pooled.effective)
 
 
-def _each(engine: Engine, job: Job, refine: int) -> Inferred:
+def _each(engine: Engine, job: Job) -> Inferred:
     """Every person under the human model's own prior."""
     if not engine.any_program:
         require_standard_program(job.human, f"be inferred by the engine {engine.name}")
-    if engine.needs_network and job.network is None:
-        raise InputError(f"the engine {engine.name} needs its network, not None; see load_guide")
+    if job.network is None and (engine.needs_network or job.refine):
+        what = "refining" if job.refine else f"the engine {engine.name}"
+        raise InputError(f"{what} needs its network, not None; see load_guide")
     found = engine.run(job)
     if not found.engines:
         found = replace(found, engines=(engine.name,) * job.rounds.num_people)
-    if not refine:
-        return found
-    checkpoint = job.checkpoint
-    if checkpoint is not None:
-        checkpoint = checkpoint[0].with_name(f"{checkpoint[0].name}.refined"), checkpoint[1]
-    settings = svi.SVIOptions(steps=refine, learning_rate=REFINING_RATE)
-    again = replace(job, settings=settings, checkpoint=checkpoint, start=found.draws)
-    return replace(svi.ENGINE.run(again), engines=found.engines)
+    return found
 
 
 def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequence[object]) -> str:

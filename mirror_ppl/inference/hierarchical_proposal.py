@@ -1,4 +1,4 @@
-"""Proposals for sites whose prior hangs on others, such as probabilities with a mean of their own.
+"""Proposals for sites whose prior depends on others, such as probabilities with a common mean.
 
 In unconstrained space such sites are a funnel: how far they spread depends on their parents, which
 no Gaussian follows. Taken relative to what their prior expects of them given the parents, ::
@@ -19,60 +19,43 @@ from pyro.distributions import TorchDistribution
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import sample_sites, values_of
-
-TRIED = 64
-"""Draws from the prior by which it is found what hangs on others."""
+from mirror_ppl.models.prior import sample_sites
 
 
-@torch.no_grad()
 def dependent_sites(human: HumanModel, sites: Mapping[str, Any]) -> tuple[str, ...]:
-    """Those of the scalar sites whose prior hangs on other scalar sites, and on nothing else.
+    """Those of the scalar sites whose prior depends on other scalar sites, and on nothing else.
 
-    What hangs on sites of other kinds, too, is left out: those are not proposed together with the
+    What depends on sites of other kinds, too, is left out: those are not proposed together with the
     scalar ones. So is what has no moments.
     """
+    parents = dependencies(human).prior
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        drawn = values_of(sample_sites(human, 1, TRIED))
-        scalars = {name: drawn[name] for name in sites}
-        first = {name: value[:1].expand_as(value) for name, value in drawn.items()}
-        others = {name: value for name, value in drawn.items() if name not in sites}
-        for name, node in sample_sites(human, 1, TRIED).items():
-            if name in others and node["fn"].has_enumerate_support:
-                # Every value, however improbable.
-                support = node["fn"].enumerate_support(expand=False).flatten(1)
-                each = torch.arange(TRIED, device=support.device) % len(support)
-                others[name] = support[each].reshape_as(others[name]).to(others[name])
-        one_way = sample_sites(human, 1, TRIED, {**first, **scalars})
-        other_way = sample_sites(human, 1, TRIED, {**first, **others})
+        nodes = sample_sites(human, 1)
     return tuple(
         name
         for name, site in sites.items()
-        if _differs(one_way[name]["fn"], site) and _differs(other_way[name]["fn"], site) is False
+        if parents[name] and parents[name] <= sites.keys() and _has_moments(nodes[name]["fn"], site)
     )
 
 
-def _differs(fn: Any, site: Any) -> bool | None:
-    """Whether moments of a prior differ from draw to draw; ``None`` where it has none."""
+def _has_moments(fn: Any, site: Any) -> bool:
+    """Whether a prior has a mean and a standard deviation in unconstrained space."""
     try:
-        moments = torch.stack(torch.broadcast_tensors(*_moments(fn, site)))
+        middle, scale = _moments(fn, site)
     except NotImplementedError:
-        return None
-    if not (moments.isfinite().all() and (moments[1] > 0).all()):
-        return None
-    moments = moments.expand(2, TRIED, 1, 1)
-    return not bool((moments == moments[:, :1]).all())
+        return False
+    return bool(middle.isfinite().all() and scale.isfinite().all() and (scale > 0).all())
 
 
 class RelativeProposal:
-    """A density over scalar sites, those that hang on others relative to their prior.
+    """A density over scalar sites, those that depend on others relative to their prior.
 
     Args:
         human: the model of people.
         sites: the D scalar sites, with the map from unconstrained space.
-        dependent: those that hang on others.
+        dependent: those that depend on others.
         place: draws in unconstrained space ``[S, D]``.
         fit: from draws ``[S, D]``, those that depend relative, to the density of these.
     """

@@ -97,5 +97,4 @@ ENGINE = Engine(
     infer_by_importance,
     ImportanceOptions,
     pooled_draws=4000,
-    weighted=True,
 )

@@ -1,8 +1,8 @@
 """The map from standard normal numbers to a prior's margins, as a guide reads and proposes them.
 
-Some sites of a prior have long tails in unconstrained space (the probability of noticing a terminal,
-say, whose logit is sometimes -40). No mixture of a few Gaussians is near them, but each is a standard
-normal number, stretched: piecewise linearly, between quantiles of draws from the prior.
+Some sites of a prior have long tails in unconstrained space: the logit of the probability of
+noticing a terminal is sometimes -40. No mixture of a few Gaussians is near such a prior. Each of
+its margins is a standard normal number, mapped piecewise linearly between quantiles of draws.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class PriorMargins(Transform):
     """From ``[..., D]`` standard normal numbers to places in unconstrained space.
 
     Args:
-        knots: of each dimension, increasing, ``[D, K]``; beyond them the first and last slopes go on.
+        knots: of each dimension, increasing, ``[D, K]``. The first and last slopes go on beyond
+            them.
     """
 
     bijective = True
-    sign = 1
     domain = constraints.independent(constraints.real, 1)
     codomain = constraints.independent(constraints.real, 1)
 
@@ -51,6 +51,11 @@ class PriorMargins(Transform):
         return isinstance(other, PriorMargins) and torch.equal(self.knots, other.knots)
 
     __hash__ = Transform.__hash__
+
+    @property
+    def sign(self) -> int:
+        """Of the slope."""
+        return 1
 
     def _call(self, x: Tensor) -> Tensor:
         return _interpolated(x, self.normal, self.knots)[0]

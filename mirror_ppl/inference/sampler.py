@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
-from mirror_ppl.likelihood.combination_sets import Alike, fixed_prior
+from mirror_ppl.likelihood.combination_sets import EquivalentCombinations, fixed_prior
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.likelihood.densities import log_correction
 from mirror_ppl.likelihood.enumeration import (
@@ -55,7 +55,7 @@ class Weighted:
 
     Attributes:
         policy: values of the sites that perception does not read, ``[S, 1, 1, ...]``.
-        alike: combinations of the discrete sites that it reads, those still possible; G sets.
+        combinations: those of the discrete sites that it reads, still possible; G sets.
         log_joint: log-probability of each of these sets and of the recorded actions under each
             draw, ``[S, G]``, up to what all of them share.
         log_weights: normalized and Pareto-smoothed, ``[S]``.
@@ -63,7 +63,7 @@ class Weighted:
     """
 
     policy: Draws
-    alike: Alike
+    combinations: EquivalentCombinations
     log_joint: Tensor
     log_weights: Tensor
     pareto_k: float
@@ -106,7 +106,9 @@ class Weighted:
         distinct, which = place.unique(return_inverse=True)
         ladder = torch.softmax(self.log_joint[distinct].double(), -1).cumsum(-1)[which]
         chosen = torch.searchsorted(ladder, ladder[:, -1:] * torch.rand_like(ladder[:, :1]))
-        combination = self.alike.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))[:, None]
+        combination = self.combinations.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))[
+            :, None
+        ]
         discrete = {site: value[combination][..., None] for site, value in values.items()}
         return {name: value[place] for name, value in self.policy.items()} | discrete
 
@@ -161,7 +163,7 @@ class Sampler:
     Args:
         human: the model of people.
         table: views of one person's rounds.
-        alike: the possible combinations, if they are known.
+        combinations: the possible combinations, if they are known.
         sites: see :func:`scalar_sites`, of a model that is known to act on beliefs alone; looked
             up and checked unless given.
 
@@ -169,7 +171,7 @@ class Sampler:
         HumanModelError: actions depend on what is seen otherwise than through beliefs.
 
     Attributes:
-        alike: combinations of the discrete sites that are still possible.
+        combinations: of the discrete sites, those that are still possible.
         place: the scalar sites of all draws, in unconstrained space ``[S, D]``.
         supports: of the discrete sites of the policy ``[n]``.
     """
@@ -178,7 +180,7 @@ class Sampler:
         self,
         human: HumanModel,
         table: ViewTable,
-        alike: Alike | None = None,
+        combinations: EquivalentCombinations | None = None,
         sites: Mapping[str, Any] | None = None,
     ) -> None:
         if sites is None:
@@ -186,9 +188,11 @@ class Sampler:
         self.human = human
         self.table = table
         self.sites = scalar_sites(human) if sites is None else sites
-        if alike is None:
-            alike = Alike.of(table, fixed_prior(human, combination_values(human, table)))
-        self.alike = alike
+        if combinations is None:
+            combinations = EquivalentCombinations.of(
+                table, fixed_prior(human, combination_values(human, table))
+            )
+        self.combinations = combinations
         self.place = torch.zeros(0, len(self.sites), device=table.index.device)
         self.supports = _policy_supports(human, table)
         self._stages: list[_Stage] = []
@@ -209,7 +213,7 @@ class Sampler:
     def add_prior_draws(self, policy: Draws, joint: Tensor) -> None:
         """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
         place = unconstrained(self.sites, policy, len(joint))
-        # All of it is given: priors may hang on any of these sites.
+        # All of it is given: priors may depend on any of these sites.
         own = (*self.sites, *self.supports)
         _, log_priors = _completed(self.human, self.table, policy, len(joint), own)
         self._add(policy, joint, place, log_priors)
@@ -219,11 +223,11 @@ class Sampler:
         """Give up combinations that are behind the best by more than that under every draw."""
         joint = torch.cat(self._joints)
         keep = (joint - joint.max()).amax(0) >= -margin
-        self.alike = self.alike.kept(keep)
+        self.combinations = self.combinations.kept(keep)
         self._joints = [joint[:, keep] for joint in self._joints]
         if self.table.real.any():
             alive = torch.zeros_like(self.table.index[:, 0], dtype=torch.bool)
-            alive[0, self.alike.members] = True
+            alive[0, self.combinations.members] = True
             self.table = restricted(self.table, alive)
 
     @property
@@ -245,8 +249,8 @@ class Sampler:
             self.table,
             {name: value[best] for name, value in found.policy.items()},
             found.log_weights[best],
-            self.alike.first,
-            self.alike.log_prior if self.alike.fixed else None,
+            self.combinations.first,
+            self.combinations.log_prior if self.combinations.fixed else None,
         )
         self._residual = ResidualProposal.of(self.human, self.table, counts)
         self._log_residual = self._residual_densities(
@@ -343,12 +347,12 @@ class Sampler:
         target = joint.logsumexp(-1) + of_scalars + of_discrete + prior
         target = target + torch.cat(self._corrections)
         log_weights, pareto_k = _smoothed(target - mixture)
-        return Weighted(policy, self.alike, joint, log_weights, pareto_k)
+        return Weighted(policy, self.combinations, joint, log_weights, pareto_k)
 
     def _joint(self, policy: Draws, number: int) -> Tensor:
-        alike = self.alike
-        prior = alike.log_prior if alike.fixed else None
-        joint = log_joints(self.human, self.table, policy, alike.first, prior)[:, 0]
+        combinations = self.combinations
+        prior = combinations.log_prior if combinations.fixed else None
+        joint = log_joints(self.human, self.table, policy, combinations.first, prior)[:, 0]
         return joint.expand(number, -1)
 
 

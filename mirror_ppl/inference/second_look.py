@@ -26,7 +26,7 @@ Round = tuple[Observation, Visibility, Tensor, Tensor]
 
 
 def looks_twice(human: HumanModel) -> bool:
-    """Whether what stands for all that people may attend to hangs on who they are."""
+    """Whether what stands for all that people may attend to depends on who they are."""
     return human.has_round_latents and not human.chained
 
 

@@ -7,7 +7,7 @@ between plateaus of the likelihood; enumeration has no such trap.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,6 @@ from pyro.infer.autoguide import AutoGuide, AutoNormal, init_to_median
 from pyro.infer.autoguide.utils import deep_setattr
 from pyro.nn import PyroParam
 from pyro.optim import PyroLRScheduler
-from torch import Tensor
 from torch.distributions import biject_to
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
@@ -40,8 +39,6 @@ from mirror_ppl.progress import Report, silent
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100
-LEAST_WIDTH = 0.01
-"""Of a site where draws say that nothing is open, on the unconstrained scale."""
 
 
 @dataclass(frozen=True)
@@ -106,40 +103,19 @@ class PriorScaledNormal(AutoNormal):
             )
             deep_setattr(self.scales, name, parameter)
 
-    def start_at(self, draws: Mapping[str, Tensor]) -> None:
-        """Take location and width of each site of one number from draws ``[S, P, 1, ...]``.
 
-        Of hundreds of weights, draws say less than the prior does.
-        """
-        assert self.prototype_trace is not None
-        for name, site in self.prototype_trace.iter_stochastic_nodes():
-            if site["fn"].event_dim:
-                continue
-            place = biject_to(site["fn"].support).inv(draws[name])
-            loc, scale = self._get_loc_and_scale(name)
-            with torch.no_grad():
-                loc.copy_(place.mean(0))
-            width = place.std(0).clamp(min=LEAST_WIDTH) if len(place) > 1 else scale.detach()
-            parameter = PyroParam(width.clone(), self.scale_constraint, site["fn"].event_dim)
-            deep_setattr(self.scales, name, parameter)
-
-
-def continuous_guide(
-    compiled: Compiled, start: Mapping[str, Tensor] | None = None
-) -> PriorScaledNormal:
+def continuous_guide(compiled: Compiled, without: Collection[str] = ()) -> PriorScaledNormal:
     """A mean-field guide over the continuous sites of a human program, one factor a person.
 
     Args:
         compiled: the program and the rounds.
-        start: draws ``[S, P, 1, ...]`` at which it starts; the prior unless given.
+        without: names of sites that another guide covers.
     """
     # Parameters are the guide's own until SVI takes them into Pyro's store.
     with pyro.settings.context(module_local_params=True):
-        program = poutine.block(compiled.program, hide=list(compiled.discrete))
+        program = poutine.block(compiled.program, hide=[*compiled.discrete, *without])
         guide = PriorScaledNormal(program, init_loc_fn=init_to_median)
         guide()
-        if start is not None:
-            guide.start_at(start)
     return guide
 
 
@@ -158,7 +134,6 @@ def fit_implants(
     seed: int,
     report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
-    start: Mapping[str, Tensor] | None = None,
 ) -> ImplantPosterior:
     """Posterior of the implants of P people.
 
@@ -170,26 +145,36 @@ def fit_implants(
         report: told of gradient steps and of draws.
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused).
-        start: draws ``[S, P, 1, ...]`` at which the guide starts; the prior unless given.
 
     Raises:
         CheckpointError: the checkpoint is damaged or of another run.
     """
     with own_parameters(seed):
-        guide = continuous_guide(compiled, start)
-        losses = _optimize(compiled, guide, options, report, checkpoint)
+        guide = continuous_guide(compiled)
+        losses = optimize(compiled, guide, options, report, checkpoint)
         drawn = draw_implants(compiled, guide, draws, report)
     return ImplantPosterior(guide, drawn, tuple(losses))
 
 
-def _optimize(
+def optimize(
     compiled: Compiled,
-    guide: AutoGuide,
+    guide: Callable[[], Draws],
     options: SVIOptions,
-    report: Report,
-    checkpoint: tuple[Path, str] | None,
+    report: Report = silent,
+    checkpoint: tuple[Path, str] | None = None,
 ) -> list[float]:
-    """Optimize the guide; returns the losses. Of tables, hopeless combinations are given up."""
+    """Fit a guide by ``pyro.infer.SVI``. Of tables, hopeless combinations are given up.
+
+    Args:
+        compiled: the program and the rounds.
+        guide: over the continuous sites; a module, if there is a checkpoint.
+        options: settings.
+        report: told of gradient steps.
+        checkpoint: see :func:`fit_implants`.
+
+    Returns:
+        The negative ELBO at each step in nats.
+    """
     optimizer = PyroLRScheduler(
         torch.optim.lr_scheduler.CosineAnnealingLR,
         {
@@ -203,7 +188,7 @@ def _optimize(
     svi = SVI(program, guide, optimizer, elbo_of(compiled))
     losses: list[float] = []
     if checkpoint is not None and checkpoint[0].exists():
-        losses = _restore(*checkpoint, guide, optimizer, compiled)
+        losses = _restore(*checkpoint, cast(AutoGuide, guide), optimizer, compiled)
     while len(losses) < options.steps:
         # What is wrong with a model shows at the first step; checking all of them costs a third.
         with pyro.validation_enabled(not losses):
@@ -215,12 +200,12 @@ def _optimize(
         ):
             _prune(compiled, guide, options.prune_margin)
         if checkpoint is not None and len(losses) % options.checkpoint_every == 0:
-            _save(*checkpoint, guide, optimizer, losses, compiled)
+            _save(*checkpoint, cast(AutoGuide, guide), optimizer, losses, compiled)
     return losses
 
 
 @torch.no_grad()
-def _prune(compiled: ViewTables, guide: AutoGuide, margin: float) -> None:
+def _prune(compiled: ViewTables, guide: Callable[[], Draws], margin: float) -> None:
     """Give up combinations that are behind the best one by more than the margin.
 
     Each is scored under the guide's draw that suits it best.
@@ -299,7 +284,6 @@ def infer_by_svi(job: Job) -> Inferred:
             part.seed,
             part.report,
             part.checkpoint,
-            part.start,
         )
         return Inferred(found.draws, losses=found.losses)
 

@@ -49,14 +49,14 @@ class AttentionValues:
         log_weights: ``-log pi``, ``[G]``.
         kept: which of them are looked at ``[G']``.
         log_kept: log-probability with which each of these was kept ``[G']``.
-        facts: of the round, see `HumanModel.covariates`.
+        covariates: of the round, see `HumanModel.covariates`.
     """
 
     values: dict[str, Tensor]
     log_weights: Tensor
     kept: Tensor
     log_kept: Tensor
-    facts: Mapping[str, Tensor] = field(default_factory=dict)
+    covariates: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.log_weights)
@@ -89,28 +89,28 @@ def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[s
 
 def site_probabilities(
     human: HumanModel,
-    ways: Mapping[str, Tensor],
+    policies: Mapping[str, Tensor],
     weights: Tensor | None = None,
-    facts: Mapping[str, Tensor] | None = None,
+    covariates: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:
     """How probable each value of each site of attention is, ``[n]``.
 
     Args:
         human: the model of people.
-        ways: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
+        policies: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
         weights: of each of them ``[W]``; alike unless given.
-        facts: of the round, see `HumanModel.covariates`.
+        covariates: of the round, see `HumanModel.covariates`.
     """
-    number = len(next(iter(ways.values())))
+    number = len(next(iter(policies.values())))
     with (
         torch.random.fork_rng(devices=[]),
         poutine.block(),
-        poutine.condition(data=dict(ways)),
-        pyro.plate("way", number, dim=-3),
+        poutine.condition(data=dict(policies)),
+        pyro.plate("policy", number, dim=-3),
         pyro.plate("person", 1, dim=-2),
     ):
         torch.manual_seed(0)
-        nodes = attention_nodes(human, {**human.prior(), **(facts or {})})
+        nodes = attention_nodes(human, {**human.prior(), **(covariates or {})})
     found = {}
     for name, node in nodes.items():
         support = node["fn"].enumerate_support(expand=False)
@@ -210,8 +210,8 @@ class Proposal:
         self,
         weights: Tensor | None,
         seed: int,
-        facts: Mapping[str, Tensor] | None = None,
-        explanations: Mapping[str, Tensor] | None = None,
+        covariates: Mapping[str, Tensor] | None = None,
+        log_proposal: Mapping[str, Tensor] | None = None,
     ) -> AttentionValues:
         """Values for a round.
 
@@ -219,31 +219,31 @@ class Proposal:
             weights: of the draws from the prior, as the rounds so far have it, ``[W]``; looked at
                 unless it is known what the person may be like.
             seed: of the draws.
-            facts: of the round, see `HumanModel.covariates`.
-            explanations: of what was done, see `HumanModel.log_proposal`.
+            covariates: of the round, see `HumanModel.covariates`.
+            log_proposal: of what was done, see `HumanModel.log_proposal`.
         """
-        facts = dict(facts or {})
-        prior = self._known("anybody", self.anybody, facts)
+        covariates = dict(covariates or {})
+        prior = self._known("anybody", self.anybody, covariates)
         likely = prior
         if self.likely is not None:
-            likely = self._known("likely", self.likely, facts)
+            likely = self._known("likely", self.likely, covariates)
         elif weights is not None:
-            likely = site_probabilities(self.human, self.anybody, weights, facts)
+            likely = site_probabilities(self.human, self.anybody, weights, covariates)
         chances = {}
         for name, own in likely.items():
             own = (1 - ANY_WAY) * own + ANY_WAY * prior[name]
-            if explanations and name in explanations:
-                own = torch.softmax(own.log() + explanations[name].to(own), 0)
+            if log_proposal and name in log_proposal:
+                own = torch.softmax(own.log() + log_proposal[name].to(own), 0)
             chances[name] = (1 - ANY_VALUE) * own + ANY_VALUE / len(own)
         generator = torch.Generator(next(iter(chances.values())).device).manual_seed(seed)
         chosen = choose_values(self.supports, chances, self.number, generator)
-        return replace(chosen, facts=facts)
+        return replace(chosen, covariates=covariates)
 
     def _known(
-        self, whom: str, draws: Mapping[str, Tensor], facts: Mapping[str, Tensor]
+        self, whom: str, draws: Mapping[str, Tensor], covariates: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Probabilities of values; the same for the same facts."""
-        key = (whom, *((name, *value.flatten().tolist()) for name, value in facts.items()))
+        """Probabilities of values; the same for the same covariates."""
+        key = (whom, *((name, *value.flatten().tolist()) for name, value in covariates.items()))
         if key not in self._found:
-            self._found[key] = site_probabilities(self.human, draws, None, facts)
+            self._found[key] = site_probabilities(self.human, draws, None, covariates)
         return self._found[key]

@@ -63,12 +63,12 @@ class Chain:
     Attributes:
         supports: of the sites of ``round_latents``, ``[n]``, in the order of their spans.
         levels: of each site.
-        facts: of the rounds ``[P, B]``, see `HumanModel.covariates`.
+        covariates: of the rounds ``[P, B]``, see `HumanModel.covariates`.
     """
 
     supports: Mapping[str, Tensor]
     levels: tuple[Level, ...]
-    facts: Mapping[str, Tensor] = field(default_factory=dict)
+    covariates: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def sights(self) -> int:
@@ -94,7 +94,7 @@ class Chain:
             )
             for name, support in self.supports.items()
         }
-        found = log_latents(human, implants, values, self.facts)
+        found = log_latents(human, implants, values, self.covariates)
         parts = []
         added = found.pop(next(iter(self.supports)))
         for name in set(found) - set(self.supports):
@@ -163,8 +163,8 @@ class Chain:
             Level(*(part[person : person + 1] for part in vars(level).values()))
             for level in self.levels
         )
-        facts = {name: fact[person : person + 1] for name, fact in self.facts.items()}
-        return Chain(self.supports, levels, facts)
+        covariates = {name: value[person : person + 1] for name, value in self.covariates.items()}
+        return Chain(self.supports, levels, covariates)
 
     @classmethod
     def one_after_another(cls, rounds: Sequence[Chain], views: Sequence[int]) -> Chain:
@@ -190,14 +190,15 @@ class Chain:
                     )
                 )
             levels.append(Level(*(torch.cat(some, 1) for some in zip(*parts, strict=True))))
-        facts = {
-            name: torch.cat([chain.facts[name] for chain in rounds], 1) for name in rounds[0].facts
+        covariates = {
+            name: torch.cat([chain.covariates[name] for chain in rounds], 1)
+            for name in rounds[0].covariates
         }
-        return cls(rounds[0].supports, tuple(levels), facts)
+        return cls(rounds[0].supports, tuple(levels), covariates)
 
     @classmethod
     def of_people(cls, people: Sequence[Chain]) -> Chain:
-        """Of P people, of each of whom there is one, with facts of as many rounds."""
+        """Of P people, of each of whom there is one, with covariates of as many rounds."""
         levels = []
         for own in zip(*(chain.levels for chain in people), strict=True):
             states = max(level.view.shape[1] for level in own)
@@ -212,10 +213,11 @@ class Chain:
                     ],
                 )
             )
-        facts = {
-            name: torch.cat([chain.facts[name] for chain in people]) for name in people[0].facts
+        covariates = {
+            name: torch.cat([chain.covariates[name] for chain in people])
+            for name in people[0].covariates
         }
-        return cls(people[0].supports, tuple(levels), facts)
+        return cls(people[0].supports, tuple(levels), covariates)
 
 
 def _padded(parts: Sequence[Tensor], states: int, width: int, fill: int) -> Tensor:

@@ -14,37 +14,27 @@ from torch import Tensor
 
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.view_table import NO_VIEW, ViewTable
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import sample_sites, values_of
 from mirror_ppl.row_hashing import distinct_rows
-
-TRIED = 64
-"""Draws of the other implants under which priors of combinations are compared."""
 
 
 @torch.no_grad()
 def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
-    """Log prior ``[M]`` of combinations; ``None`` if it hangs on the other implants.
+    """Log prior ``[M]`` of combinations; ``None`` if it depends on the other implants.
 
     Args:
         human: the model of people.
         grid: values ``[M]`` of the discrete sites that perception reads.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        nodes = sample_sites(human, 1, TRIED)
-        others = {name: value for name, value in values_of(nodes).items() if name not in grid}
-        for name, value in others.items():
-            if nodes[name]["fn"].has_enumerate_support:  # every value, however improbable
-                support = nodes[name]["fn"].enumerate_support(expand=False).flatten()
-                each = torch.arange(TRIED, device=value.device) % len(support)
-                others[name] = support[each].view(TRIED, 1, 1).to(value)
-        found = log_priors(human, grid, others, 1)[:, 0]
-    return found[0] if bool((found == found[:1]).all()) else None
+    for name, parents in dependencies(human).prior.items():
+        if (name in grid or parents & grid.keys()) and parents - grid.keys():
+            return None
+    return log_priors(human, grid, {}, 1)[0, 0]
 
 
 @dataclass(frozen=True)
-class Alike:
+class EquivalentCombinations:
     """G sets of C combinations of one person.
 
     Attributes:
@@ -65,7 +55,7 @@ class Alike:
     end: Tensor
 
     @classmethod
-    def of(cls, table: ViewTable, log_prior: Tensor | None) -> Alike:
+    def of(cls, table: ViewTable, log_prior: Tensor | None) -> EquivalentCombinations:
         """Of the possible combinations of a table of one person.
 
         Args:
@@ -98,7 +88,7 @@ class Alike:
     def __len__(self) -> int:
         return len(self.first)
 
-    def kept(self, sets: Tensor) -> Alike:
+    def kept(self, sets: Tensor) -> EquivalentCombinations:
         """Only some sets ``[G]``, as truth values."""
         some = sets.repeat_interleave(self.sizes)
         chance = self.share.diff(prepend=self.share.new_zeros(1))

@@ -12,7 +12,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError, InputError
-from mirror_ppl.likelihood.attention import attention_nodes, attention_sites
+from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.densities import (
     BATCH,
     check_plates,
@@ -20,6 +20,7 @@ from mirror_ppl.likelihood.densities import (
     log_prob,
     prior_nodes,
 )
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 
@@ -38,32 +39,18 @@ def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
     }
 
 
-def require_own_attention(human: HumanModel, sites: Mapping[str, Tensor]) -> None:
+def require_own_attention(human: HumanModel, sites: Iterable[str]) -> None:
     """Refuse models whose attention depends on what people see otherwise.
 
     Args:
         human: the model of people.
-        sites: supports ``[n]`` of the discrete sites that ``perceive`` reads.
+        sites: names of the discrete sites that ``perceive`` reads.
 
     Raises:
         HumanModelError: it does.
     """
-    found = []
-    # Every value of each site once.
-    for place in range(max((len(support) for support in sites.values()), default=1)):
-        some = {name: own[place % len(own)].view(1, 1) for name, own in sites.items()}
-        with torch.random.fork_rng(devices=[]), poutine.block():
-            torch.manual_seed(0)
-            with poutine.condition(data=some), pyro.plate("person", 1, dim=-2):
-                nodes = attention_nodes(human, human.prior())
-        found.append(
-            {
-                name: node["fn"].log_prob(node["fn"].enumerate_support(expand=False)).flatten()
-                for name, node in nodes.items()
-            }
-        )
-    for name, one in found[0].items():
-        if not all(torch.equal(one, other.get(name, one[:0])) for other in found):
+    for name, parents in dependencies(human).round_latents.items():
+        if parents & set(sites):
             raise HumanModelError(
                 f'"{name}" of round_latents depends on a discrete site that perceive() reads; let '
                 "it depend on others only"
@@ -169,7 +156,7 @@ def log_priors(
 
 
 def _log_prior(node: Any, value: Tensor) -> Tensor:
-    """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 where all is alike."""
+    """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 if draws do not differ."""
     fn = node["fn"]
     plain = node["mask"] is None and isinstance(node["scale"], (int, float))
     if len(fn.batch_shape) > BATCH or not plain:  # depends on other discrete sites, perhaps

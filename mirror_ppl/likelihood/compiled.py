@@ -21,7 +21,7 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.likelihood.combinations import discrete_sites
-from mirror_ppl.likelihood.densities import PLATES, Given, log_prob, sample_nodes
+from mirror_ppl.likelihood.densities import PLATES, Given, log_prob
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import TableProgram
@@ -31,7 +31,7 @@ from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import ACTION, HumanModel, has_own_program
 from mirror_ppl.models.measured import with_measurements
 from mirror_ppl.models.prior import Draws, draw_prior, values_of
-from mirror_ppl.models.sites import discrete_names, latent_sites
+from mirror_ppl.models.sites import discrete_names, latent_sites, sample_nodes
 
 
 class Compiled(ABC):

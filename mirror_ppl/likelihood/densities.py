@@ -14,13 +14,12 @@ import pyro
 import torch
 from pyro import poutine
 from pyro.distributions.util import scale_and_mask
-from pyro.poutine import Trace
 from pyro.poutine.condition_messenger import ConditionMessenger
-from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import ACTION, HumanModel, require_standard_program
+from mirror_ppl.models.sites import sample_nodes
 
 BATCH = 3
 """Dimensions of draws, people and their rounds; combinations of discrete values go before them."""
@@ -40,15 +39,6 @@ def require_compilable(human: HumanModel) -> None:
     # Of data of several people it is noticed here that they are no one person's.
     for name, node in prior_nodes(human, {}, 1, 1).items():
         check_plates(name, log_prob(node), 1)
-
-
-def sample_nodes(trace: Trace) -> dict[str, Any]:
-    """Nodes of all sites that are sampled, observed or factors; no plates."""
-    return {
-        name: node
-        for name, node in trace.nodes.items()
-        if node["type"] == "sample" and not site_is_subsample(node)
-    }
 
 
 def log_prob(node: Mapping[str, Any]) -> Tensor:

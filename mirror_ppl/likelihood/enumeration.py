@@ -20,12 +20,11 @@ from mirror_ppl.likelihood.densities import choices
 from mirror_ppl.likelihood.table_program import log_likelihoods, of_moments
 from mirror_ppl.likelihood.tables import combination_scores
 from mirror_ppl.likelihood.view_table import ViewTable
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 
 CHUNK = 2**21
 """Steps of views, of all draws together, that are worked out at once; bounds memory."""
-
-TRIED_VIEWS = 16
 
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
@@ -125,7 +124,7 @@ def expected_counts(
         draws: of the other sites ``[S, 1, 1, ...]``.
         log_weights: of these, ``[S]``.
         combinations: of discrete sites that are possible, ``[G]``.
-        log_prior: of these ``[G]``, if it does not hang on the other sites.
+        log_prior: of these ``[G]``, if it does not depend on the other sites.
     """
     number = len(log_weights)
     grid = {name: one[combinations] for name, one in combination_values(human, table).items()}
@@ -146,27 +145,12 @@ def expected_counts(
     return actions.scatter(-1, table.acted[0][:, None], often[:, None])
 
 
-@torch.no_grad()
 def acts_on_beliefs(human: HumanModel, table: ViewTable) -> bool:
     """Whether what a person sees reaches their actions through beliefs alone.
 
     If ``act`` reads a site that ``perceive`` reads, too, likelihoods of views are not enough.
     """
-    found = []
-    some = slice(None, None, max(1, table.belief.shape[1] // TRIED_VIEWS))
-    belief, action_values = table.belief[:, some], table.values[:, some]
-    for place in (0, -1):
-        ends = {site: value[place] for site, value in combination_values(human, table).items()}
-        with (
-            torch.random.fork_rng(devices=[]),
-            poutine.block(),
-            pyro.plate("person", table.people, dim=-2),
-        ):
-            torch.manual_seed(0)
-            implants = human.prior()
-            ends = {site: value.expand_as(implants[site]) for site, value in ends.items()}
-            found.append(human.act({**implants, **ends}, belief, action_values))
-    return torch.equal(*found)
+    return not dependencies(human).actions & set(table.sites)
 
 
 def require_acting_on_beliefs(human: HumanModel, table: ViewTable) -> None:

@@ -79,7 +79,7 @@ def _attentive(
     done = done.expand(table.people, -1)[person[..., None, None], moments]
     along = done.cumsum(-1)
     weights = log_weighted_latents(
-        human, implants, attention.values, attention.log_weights, attention.facts
+        human, implants, attention.values, attention.log_weights, attention.covariates
     )
     # What was done before a step tells what they attend to at it.
     before = torch.nn.functional.pad(along[..., :-1], [1, 0])

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, map_state
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.likelihood.densities import log_latents
+from mirror_ppl.likelihood.attention import attention_sites
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.sites import latent_sites
 from mirror_ppl.models.spans import Span, check_spans
 
 STEPS = 12
@@ -29,8 +27,8 @@ def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
 
     Raises:
         HumanModelError: spans are not as :meth:`HumanModel.spans` says: they overlap, a site is
-            read outside of its span, values that are said to be alike are not, or the distribution
-            of a site hangs on another one.
+            read outside of its span, values that are said to show the same do not, or a site
+            depends on another one.
     """
     domain = human.domain
     device = next(human.parameters()).device
@@ -43,7 +41,8 @@ def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
         state = domain.transition(state, action * (len(observed) % 2))
     so_far = {name: torch.cat([one[name] for one in observed]) for name in observed[0]}
     spans = human.spans(so_far)
-    supports = _check_independence(human, so_far)
+    _check_independence(human)
+    supports = attention_sites(human)
     check_spans(spans, {name: len(support) for name, support in supports.items()}, len(observed))
     # What one site hides at its first value it may show at its last.
     for place in (0, -1):
@@ -88,30 +87,12 @@ def _check_looks(
         _, knowledge = human.perceive(usual, knowledge, now, told, step)
 
 
-def _check_independence(human: HumanModel, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Supports ``[n]`` of the sites of attention, none of which hangs on another."""
-    with torch.random.fork_rng(devices=[]), poutine.block(), pyro.plate("person", 1, dim=-2):
-        torch.manual_seed(0)
-        implants = human.prior()
-        facts = {name: fact.view(1, 1) for name, fact in human.covariates({**so_far}).items()}
-        with poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-            human.round_latents({**implants, **facts})
-        supports = {
-            name: node["fn"].enumerate_support(expand=False).flatten()
-            for name, node in latent_sites(trace.trace).items()
-        }
-        for site, own in supports.items():
-            found = []
-            for place in (0, -1):
-                values = {
-                    name: support[place].expand(1, 1, len(own))
-                    for name, support in supports.items()
-                }
-                values[site] = own.expand(1, 1, -1)
-                found.append(log_latents(human, implants, values, facts)[site])
-            if not torch.equal(*torch.broadcast_tensors(*found)):
-                raise HumanModelError(
-                    f'"{site}" of round_latents depends on another of its sites, so that spans '
-                    "cannot be summed out one after another"
-                )
-    return supports
+def _check_independence(human: HumanModel) -> None:
+    """None of the sites of attention depends on another."""
+    found = dependencies(human).round_latents
+    for site, parents in found.items():
+        if parents & found.keys():
+            raise HumanModelError(
+                f'"{site}" of round_latents depends on another of its sites, so that spans '
+                "cannot be summed out one after another"
+            )

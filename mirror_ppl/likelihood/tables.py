@@ -29,7 +29,7 @@ def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
         people.append(views_of(table, person).kept(needed))
     attention = table.attention
     if isinstance(attention, Chain):
-        attention = _joined_chain(people, attention.facts)
+        attention = _joined_chain(people, attention.covariates)
     elif attention is not None:
         attention = replace(attention, **_padded_sights(people))
     return replace(
@@ -75,10 +75,10 @@ def _padded(people: Sequence[RoundViews]) -> dict[str, Tensor]:
     }
 
 
-def _joined_chain(people: Sequence[RoundViews], facts: Mapping[str, Tensor]) -> Chain:
+def _joined_chain(people: Sequence[RoundViews], covariates: Mapping[str, Tensor]) -> Chain:
     """The chains of P people as one."""
-    chains = [replace(own.chain, facts={}) for own in people if own.chain is not None]
-    return replace(Chain.of_people(chains), facts=facts)
+    chains = [replace(own.chain, covariates={}) for own in people if own.chain is not None]
+    return replace(Chain.of_people(chains), covariates=covariates)
 
 
 def _padded_sights(people: Sequence[RoundViews]) -> dict[str, Tensor]:
@@ -201,11 +201,11 @@ def join_tables(
 
     attention = None
     if chains:
-        facts = {
-            name: torch.stack([_pad(one.facts[name][0], rounds) for one in chains])
-            for name in chains[0].facts
+        covariates = {
+            name: torch.stack([_pad(one.covariates[name][0], rounds) for one in chains])
+            for name in chains[0].covariates
         }
-        attention = _joined_chain(views, facts)
+        attention = _joined_chain(views, covariates)
     if own:
 
         def padded(parts: Sequence[Tensor], fill: float = 0) -> Tensor:
@@ -218,9 +218,9 @@ def join_tables(
             log_weights=padded([one.log_weights for one in own], -torch.inf),
             kept=padded([one.kept for one in own]),
             log_kept=padded([one.log_kept for one in own], torch.inf),
-            facts={
-                name: torch.stack([_pad(one.facts[name][0], rounds) for one in own])
-                for name in own[0].facts
+            covariates={
+                name: torch.stack([_pad(one.covariates[name][0], rounds) for one in own])
+                for name in own[0].covariates
             },
             **_padded_sights(views),
         )

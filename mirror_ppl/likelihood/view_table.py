@@ -69,7 +69,7 @@ class Attention:
         sights: the view of each sight under each value kept, ``[P, U, G']``, an index into the V
             views.
         rounds: the round that each sight is of, ``[P, U]``.
-        facts: of the rounds ``[P, B]``, see `HumanModel.covariates`.
+        covariates: of the rounds ``[P, B]``, see `HumanModel.covariates`.
     """
 
     values: Mapping[str, Tensor]
@@ -78,12 +78,12 @@ class Attention:
     log_kept: Tensor
     sights: Tensor
     rounds: Tensor
-    facts: Mapping[str, Tensor] = field(default_factory=dict)
+    covariates: Mapping[str, Tensor] = field(default_factory=dict)
 
     def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
         """See `log_weighted_latents`, ``[..., P, B, G]``; runs inside the person plate."""
         del rounds
-        return log_weighted_latents(human, implants, self.values, self.log_weights, self.facts)
+        return log_weighted_latents(human, implants, self.values, self.log_weights, self.covariates)
 
     def marginal(self, likelihoods: Tensor, log_weights: Tensor) -> Tensor:
         """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.

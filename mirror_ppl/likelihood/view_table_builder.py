@@ -42,7 +42,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
 
-PROPOSING_WAYS = 64
+PROPOSING_POLICIES = 64
 """Draws from the prior by which attention is proposed where nothing is screened."""
 TEMPERATURE = 4.0
 
@@ -52,24 +52,29 @@ class Screening:
     """When a combination of discrete implants is given up.
 
     Attributes:
-        margin: nats by which its log-likelihood may fall behind the best one's, each under the way
-            to decide that suits it best.
-        ways: number of ways to decide, drawn from the prior.
+        margin: nats by which its log-likelihood may fall behind the best one's, each under the
+            policy that suits it best.
+        policies: number of policies: of draws of the implants from the prior.
         seed: seed of those draws.
-        resolution: moments of a round count as one when the log-probabilities of what was done
-            there, each under ``alike`` of those ways, fall on the same points of a grid of this
-            width. 0 for never.
-        alike: see there.
+        resolution: moments of a round are merged when the log-probabilities of what was done there,
+            each under ``merge_policies`` of those policies, fall on the same points of a grid of
+            this width. 0 for never.
+        merge_policies: see there.
     """
 
     margin: float = 15.0
-    ways: int = 16
+    policies: int = 16
     seed: int = 0
     resolution: float = 0.03
-    alike: int = 16
+    merge_policies: int = 16
 
     def __post_init__(self) -> None:
-        for name, least in (("margin", 0), ("ways", 1), ("resolution", 0), ("alike", 1)):
+        for name, least in (
+            ("margin", 0),
+            ("policies", 1),
+            ("resolution", 0),
+            ("merge_policies", 1),
+        ):
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
 
@@ -79,7 +84,7 @@ class ViewTableBuilder:
 
     Args:
         human: whose ``perceive`` and ``believe`` are called (and ``act`` for screening).
-        screening: when to give up combinations on the way; never if ``None``.
+        screening: when to give up combinations; never if ``None``.
         candidates: numbers of the combinations that are considered at all (see
             :meth:`ViewTable.combination`); all of them unless given.
         likely: draws ``[S, 1, 1, ...]`` of what the person may be like, from whom attention is
@@ -93,8 +98,8 @@ class ViewTableBuilder:
         grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
         sizes: number of values of each of these sites.
         alive: numbers of the combinations that are left.
-        score: log-likelihood ``[ways, M]`` of each of them under each way to decide.
-        ways: these ways, see :meth:`draw_ways`; what is likely, if that is known.
+        score: log-likelihood ``[policies, M]`` of each of them under each policy.
+        policies: these policies, see :meth:`draw_policies`; what is likely, if that is known.
     """
 
     def __init__(
@@ -115,12 +120,12 @@ class ViewTableBuilder:
         self.alive = torch.arange(prod(self.sizes), device=device)
         if candidates is not None:
             self.alive = candidates
-        ways = 0 if screening is None else screening.ways
-        self.score = torch.zeros(ways, prod(self.sizes), device=device)
-        self.ways: dict[str, Tensor] = {}
+        policies = 0 if screening is None else screening.policies
+        self.score = torch.zeros(policies, prod(self.sizes), device=device)
+        self.policies: dict[str, Tensor] = {}
         if likely is not None and screening is not None:
-            some = torch.arange(ways, device=device) % len(next(iter(likely.values())))
-            self.ways = {name: value[some] for name, value in likely.items()}
+            some = torch.arange(policies, device=device) % len(next(iter(likely.values())))
+            self.policies = {name: value[some] for name, value in likely.items()}
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
@@ -129,8 +134,8 @@ class ViewTableBuilder:
         if human.has_round_latents:
             require_own_attention(human, supports)
         if human.has_round_latents and not human.chained:
-            known = {} if likely is not None else self.draw_ways()
-            anybody = known or draw_prior(human, 1, PROPOSING_WAYS, 0)
+            known = {} if likely is not None else self.draw_policies()
+            anybody = known or draw_prior(human, 1, PROPOSING_POLICIES, 0)
             self._proposal = Proposal(human, anybody, likely, values)
 
     @torch.no_grad()
@@ -158,7 +163,7 @@ class ViewTableBuilder:
             attended = self._proposal.values(
                 self._weights(),
                 seed,
-                {name: fact.view(1, 1) for name, fact in self.human.covariates(so_far).items()},
+                {name: value.view(1, 1) for name, value in self.human.covariates(so_far).items()},
                 self.human.log_proposal(so_far, actions[0, real]),
             )
             each = len(attended)
@@ -206,7 +211,7 @@ class ViewTableBuilder:
                 part, place = self._merged(part, self.screening)
                 chain = chain.of_views(place)
             likelihoods = self._log_likelihoods(part)[:, None]
-            with self._deciding(self.draw_ways()):
+            with self._deciding(self.draw_policies()):
                 chances = chain.log_chances(self.human, self.human.prior(), 1)
             self._screen(chain.marginal(likelihoods, chances)[:, 0], self.screening)
         self._rounds.append(replace(part, chain=chain))
@@ -214,7 +219,7 @@ class ViewTableBuilder:
         self._recorded.append((actions[0], real))
 
     def _screen(self, found: Tensor, screening: Screening) -> None:
-        """Count log-likelihoods ``[ways, M']`` of those alive, and give up the hopeless ones."""
+        """Count log-likelihoods ``[policies, M']`` of those alive; give up the hopeless ones."""
         alive = self.alive
         score = self.score[:, alive] + found
         self.score[:, alive] = score
@@ -278,19 +283,19 @@ class ViewTableBuilder:
             log_kept=_stacked([one.log_kept for one in attended], torch.inf),
             sights=torch.cat([pad(part, [0, most - part.shape[1]]) for part in sights])[None],
             rounds=torch.cat(rounds).to(self.alive.device)[None],
-            facts={
-                name: torch.cat([one.facts[name] for one in attended], 1)
-                for name in attended[0].facts
+            covariates={
+                name: torch.cat([one.covariates[name] for one in attended], 1)
+                for name in attended[0].covariates
             },
         )
 
     def _weights(self) -> Tensor:
-        """Of the ways, as the rounds so far have it ``[ways]``; the same for all without ways."""
+        """Weights of the policies given the rounds so far ``[policies]``."""
         if self.screening is None:
-            number = PROPOSING_WAYS
+            number = PROPOSING_POLICIES
             return torch.full((number,), 1 / number, device=self.alive.device)
         joint = (self.score + self.log_prior)[:, self.alive].logsumexp(-1)
-        # Toned down: few ways would have all the weight, and none of them is the person.
+        # Tempered: few policies would have all the weight, and none of them is the person.
         return torch.softmax(joint / TEMPERATURE, 0)
 
     def _padded_to(self, steps: int, which: int) -> Tensor:
@@ -300,23 +305,28 @@ class ViewTableBuilder:
 
     @cached_property
     def fixed_prior(self) -> Tensor | None:
-        """Log prior ``[M]`` of each combination; ``None`` if it hangs on the other implants."""
+        """Log prior ``[M]`` of each combination; ``None`` if it depends on the other implants."""
         return fixed_prior(self.human, self.grid)
 
     @cached_property
     def log_prior(self) -> Tensor:
-        """Log prior probability of each combination under each way, ``[ways, M]``."""
-        others = {name: way for name, way in self.draw_ways().items() if name not in self.grid}
+        """Log prior probability of each combination under each policy, ``[policies, M]``."""
+        others = {
+            name: policy for name, policy in self.draw_policies().items() if name not in self.grid
+        }
         return log_priors(self.human, self.grid, others, 1)[:, 0]
 
     def _merged(self, part: RoundViews, screening: Screening) -> tuple[RoundViews, Tensor]:
         """The views of a round with moments that count as one made one; which each view is then."""
-        ways = {name: way[: screening.alike] for name, way in self.draw_ways().items()}
+        policies = {
+            name: policy[: screening.merge_policies]
+            for name, policy in self.draw_policies().items()
+        }
         real = torch.zeros_like(part.acted, dtype=torch.bool)
         real[part.moments[part.moments != NO_VIEW]] = True
         keys = []
         for some in torch.arange(len(part.acted), device=part.acted.device).split(CHUNK):
-            found = self._of_moments(ways, part, some)
+            found = self._of_moments(policies, part, some)
             keys.append(torch.round(found / screening.resolution).long().T)
         # What was done tells moments apart, too: theirs is one entry of ``acted``.
         key = torch.cat([torch.cat(keys), part.acted[:, None]], -1) * real[:, None]
@@ -330,43 +340,43 @@ class ViewTableBuilder:
         return kept, place
 
     def _log_likelihoods(self, part: RoundViews) -> Tensor:
-        """Of what was recorded of a round under each way and view, ``[ways, V]``."""
-        return along_views(self._of_moments(self.draw_ways(), part), part.moments)
+        """Of what was recorded of a round under each policy and view, ``[policies, V]``."""
+        return along_views(self._of_moments(self.draw_policies(), part), part.moments)
 
     def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
-        """Log joint ``[ways, U, G]`` of actions and attention, of likelihoods ``[ways, U, G]``."""
+        """Log joint ``[policies, U, G]`` of actions and attention, of their likelihoods."""
         values = {name: value[None, None] for name, value in attended.values.items()}
-        with self._deciding(self.draw_ways()):
+        with self._deciding(self.draw_policies()):
             implants = self.human.prior()
             chances = log_weighted_latents(
-                self.human, implants, values, attended.log_weights[None, None], attended.facts
+                self.human, implants, values, attended.log_weights[None, None], attended.covariates
             )
         return likelihoods + chances[:, 0]
 
-    def draw_ways(self) -> dict[str, Tensor]:
-        """The ways to decide, ``[ways, 1, 1, ...]``; always the same."""
-        if not self.ways and self.screening is not None:
-            self.ways = draw_prior(self.human, 1, self.screening.ways, self.screening.seed)
-        return self.ways
+    def draw_policies(self) -> dict[str, Tensor]:
+        """The policies, ``[policies, 1, 1, ...]``; always the same."""
+        if not self.policies and self.screening is not None:
+            self.policies = draw_prior(self.human, 1, self.screening.policies, self.screening.seed)
+        return self.policies
 
     def _of_moments(
-        self, ways: Mapping[str, Tensor], part: RoundViews, some: Tensor | slice = slice(None)
+        self, policies: Mapping[str, Tensor], part: RoundViews, some: Tensor | slice = slice(None)
     ) -> Tensor:
-        """Log-likelihood ``[ways, N]`` of what was recorded at some moments of a round."""
+        """Log-likelihood ``[policies, N]`` of what was recorded at some moments of a round."""
         moments = (one[None, some] for one in (part.belief, part.values, part.acted))
-        with self._deciding(ways) as number:
+        with self._deciding(policies) as number:
             _, found = choices(self.human, self.human.prior(), *moments)
-        # Of a model whose actions depend on no implant they are the same in every way.
+        # Of a model whose actions depend on no implant they are the same under every policy.
         return found.expand(number, *found.shape[-2:])[:, 0]
 
     @contextmanager
-    def _deciding(self, ways: Mapping[str, Tensor]) -> Iterator[int]:
-        """The program runs for so many people, each with one of the ways."""
-        number = len(next(iter(ways.values()))) if ways else len(self.score)
+    def _deciding(self, policies: Mapping[str, Tensor]) -> Iterator[int]:
+        """The program runs for so many people, each with one of the policies."""
+        number = len(next(iter(policies.values()))) if policies else len(self.score)
         with (
             poutine.block(),
-            poutine.condition(data=dict(ways)),
-            pyro.plate("way", number, dim=-3),
+            poutine.condition(data=dict(policies)),
+            pyro.plate("policy", number, dim=-3),
             pyro.plate("person", 1, dim=-2),
         ):
             yield number

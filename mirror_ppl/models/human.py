@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any
 
 import pyro
@@ -48,6 +49,8 @@ from mirror_ppl.models.world_program import first_state, next_state, reward
 Implants = Mapping[str, Tensor]
 ACTION = "action"
 """Site of the action of a step."""
+ABOUT_SPANS = ("round_latents", "sees", "perceive")
+"""Methods that decide at which steps latents of rounds are read."""
 
 
 class HumanModel(nn.Module):
@@ -60,11 +63,29 @@ class HumanModel(nn.Module):
     views. Weights and the like follow as event dimensions.
 
     Attributes:
-        of_the_world: sites whose prior :meth:`learn_world` changes. They are about the world, and a
-            population of people says nothing of them.
+        value_names: names of the values 0, 1 and so on of discrete sites whose values have no
+            order. Summaries have the most probable value of these, and quantiles of all others.
     """
 
-    of_the_world: tuple[str, ...] = ()
+    value_names: Mapping[str, Sequence[str]] = MappingProxyType({})
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Make sure that a class that changes what spans are about declares them.
+
+        Raises:
+            HumanModelError: they are not.
+        """
+        super().__init_subclass__(**options)
+        order = cls.__mro__
+        declaring = next(one for one in order if "spans" in vars(one))
+        since = set().union(*(vars(one) for one in order[: order.index(declaring)]))
+        changed = [name for name in ABOUT_SPANS if name in since]
+        if changed and cls.spans is not HumanModel.spans:
+            raise HumanModelError(
+                f"{cls.__name__} overrides {', '.join(changed)} and inherits spans: declare "
+                f'"spans = {declaring.__name__}.spans" if they still hold, else '
+                '"spans = HumanModel.spans"'
+            )
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__()
@@ -75,14 +96,6 @@ class HumanModel(nn.Module):
     def domain(self) -> Domain:
         """The domain that people act in."""
         return self.self_model.domain
-
-    @property
-    def value_names(self) -> Mapping[str, Sequence[str]]:
-        """Names of the values 0, 1 and so on of sites of the prior whose values have no order.
-
-        Of these the most probable value is told, and of all others quantiles.
-        """
-        return {}
 
     @property
     def belief_size(self) -> int:
@@ -137,9 +150,12 @@ class HumanModel(nn.Module):
         Where this is known, they are summed out exactly (:mod:`mirror_ppl.likelihood.chain`). Sites
         are read throughout the round, or at a span of it that ends before the next one begins;
         those read throughout come first. Their distributions do not depend on each other's values.
-        Nothing is known unless this is overridden, nor where a class that derives from the one that
-        does overrides ``round_latents``, ``sees`` or ``perceive`` and not this: then values are
-        drawn that stand for all there could be (:mod:`mirror_ppl.likelihood.attention`).
+        Unless this is overridden, values are drawn that stand for all there could be
+        (:mod:`mirror_ppl.likelihood.attention`).
+
+        A class that derives from one with spans and overrides ``round_latents``, ``sees`` or
+        ``perceive`` declares its own: ``spans = Base.spans`` if they still hold, or
+        ``spans = HumanModel.spans`` if there are none.
 
         Args:
             observation: of one round, as far as it went, ``[t, K, F]``; t is 0 of padding.
@@ -149,14 +165,8 @@ class HumanModel(nn.Module):
 
     @property
     def chained(self) -> bool:
-        """Whether attention is summed out exactly, see :meth:`spans`."""
-        if not self.has_round_latents:
-            return False
-        order = type(self).__mro__
-        known = next(place for place, one in enumerate(order) if "spans" in vars(one))
-        changed = {"round_latents", "sees", "perceive"}
-        since = any(changed & set(vars(one)) for one in order[:known])
-        return order[known] is not HumanModel and not since
+        """Whether attention is summed out exactly: the model has it, and declares :meth:`spans`."""
+        return self.has_round_latents and type(self).spans is not HumanModel.spans
 
     def log_proposal(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
         """How well values of attention explain what was done, as logarithms ``[n]`` by site.
@@ -170,23 +180,6 @@ class HumanModel(nn.Module):
         """
         del observation, actions
         return {}
-
-    def learn_world(self, demonstrations: Demonstrations) -> None:
-        """Learn from what was recorded what is true of the world, and not of one person.
-
-        Called with the rounds that are learned from, before anybody's implants are inferred. There
-        is nothing to learn unless this is overridden.
-        """
-        del demonstrations
-
-    def known_world(self, draws: Mapping[str, Tensor]) -> Domain:
-        """The world as the robot knows it after what it learned, in which it plans.
-
-        Args:
-            draws: of one person's implants ``[S, 1, 1, ...]``; implants of the reward change it.
-        """
-        del draws
-        return self.domain
 
     @cached_property
     def has_round_latents(self) -> bool:

@@ -11,9 +11,13 @@ from pathlib import Path
 
 from mirror_ppl.checks import require_kind
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.bomb_defusal import BombDefusalHuman
+from mirror_ppl.models.bomb_defusal_variants import (
+    BombDefusalNoImplants,
+    BombDefusalPerceptualOnly,
+    BombDefusalPolicyOnly,
+)
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.searcher import Searcher
-from mirror_ppl.models.searcher_variants import KnowingRobot, KnowingSearcher, PerceptualSearcher
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.user_code import describe, remember_file
@@ -22,10 +26,10 @@ MIRROR = "mirror"
 """The package's own model; which it is depends on the domain."""
 OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
     "bomb_defusal": {
-        MIRROR: Searcher,
-        "perceptual-only": PerceptualSearcher,
-        "policy-only": KnowingSearcher,
-        "no-implants": KnowingRobot,
+        MIRROR: BombDefusalHuman,
+        "perceptual-only": BombDefusalPerceptualOnly,
+        "policy-only": BombDefusalPolicyOnly,
+        "no-implants": BombDefusalNoImplants,
     }
 }
 """What names in ``VARIANTS`` stand for in domains that need another model than `HumanModel`."""

@@ -129,7 +129,7 @@ def checked_draws(human: HumanModel, draws: Any, people: int) -> Draws:
             )
     if number == 0:
         return own
-    # Under these draws, for what a site can be may hang on others.
+    # Under these draws, for what a site can be may depend on others.
     nodes = sample_sites(human, people, number, own)
     for name, value in own.items():
         possible = _possible(nodes[name]["fn"].support, value)

@@ -21,6 +21,15 @@ def latent_sites(trace: Trace) -> dict[str, Any]:
     }
 
 
+def sample_nodes(trace: Trace) -> dict[str, Any]:
+    """Nodes of all sites that are sampled, observed or factors; no plates."""
+    return {
+        name: node
+        for name, node in trace.nodes.items()
+        if node["type"] == "sample" and not site_is_subsample(node)
+    }
+
+
 def latent_values(trace: Trace) -> dict[str, Tensor]:
     """Values of the sites that were sampled."""
     return {name: site["value"] for name, site in latent_sites(trace).items()}

@@ -9,13 +9,19 @@ take the place of a simulator::
 
 from __future__ import annotations
 
+from typing import Any
+
 import pyro
 import pyro.distributions as dist
 import torch
+from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation
 from mirror_ppl.models.self_model import SelfModel
+
+ACTION, OBSERVATION = "action_", "observation_"
+"""What the names of these sites begin with."""
 
 
 def first_state(self_model: SelfModel, observation: Observation) -> Tensor:
@@ -59,3 +65,33 @@ def reward(self_model: SelfModel, state: Tensor, action: Tensor, recorded: Tenso
     """Sample or observe ``r_t`` ``[...]``, in units of reward."""
     mean, scale = self_model.reward(state, action)
     return pyro.sample("reward", dist.Normal(mean, scale), obs=recorded)
+
+
+class TrueWorld(Messenger):
+    """The domain's own world in place of the self-model's, where the program is run forward.
+
+    What there is to observe at a step follows from the actions drawn before it::
+
+        with TrueWorld(human.self_model, state):
+            poutine.uncondition(human.model)(rounds, world=True)
+
+    States and rewards stay those of the self-model.
+
+    Args:
+        self_model: the robot's.
+        state: of the domain, in which the rounds begin, ``[P, B]``.
+    """
+
+    def __init__(self, self_model: SelfModel, state: Any) -> None:
+        super().__init__()
+        self.self_model, self.state = self_model, state
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if msg["name"].startswith(OBSERVATION):
+            name = msg["name"].removeprefix(OBSERVATION).rpartition("_")[0]
+            seen = self.self_model.domain.observe(self.state)
+            msg["value"], msg["done"] = self.self_model.targets(seen)[name], True
+
+    def _pyro_post_sample(self, msg: Any) -> None:
+        if msg["name"].startswith(ACTION):
+            self.state = self.self_model.domain.transition(self.state, msg["value"])

@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl import __version__
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, total_reward
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.populations import derived_generator
 from mirror_ppl.progress import Progress
+from mirror_ppl.version import __version__
 
 
 @dataclass(frozen=True)

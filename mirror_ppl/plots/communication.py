@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from torch import Tensor
@@ -70,12 +72,34 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
     ax.axvline(0, color=BLACK, lw=0.8)
     silence = BLUE if decision.chosen == 0 else GREY
     ax.plot([0], [drawn.index(0)], "s", color=silence, ms=9, mec="white", clip_on=False, zorder=4)
+    _name_rows(ax, names, drawn.index(decision.chosen))
+    _columns(ax, means, costs)
+    ax.set_xlabel("gain over silence in units of reward, cost taken off")
+    ax.spines[["top", "right", "left"]].set_visible(False)
+    ax.tick_params(axis="y", length=0, pad=8)
+    title = f"What could be said, and what it is worth: {len(drawn)} of {len(gains)} candidates"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+    handles = [
+        Patch(fc=BLUE),
+        Patch(fc=PALE),
+        Line2D([], [], ls="", marker="s", color=silence, ms=9),
+        Line2D([], [], color=BLACK, lw=1.4, marker="|", ms=7),
+    ]
+    words = ["chosen", "not chosen", "silence", "90% interval"]
+    figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _name_rows(ax: Axes, names: Sequence[str], chosen: int) -> None:
+    """Names of candidates to the left of the axes, that of the chosen one in bold."""
     lines = ["\n".join(textwrap.wrap(name, WRAP, break_on_hyphens=False)) for name in names]
-    ax.set_yticks(place, lines, fontsize=9)
-    for text, colour in zip(ax.get_yticklabels(), colours, strict=True):
-        if colour == BLUE:
-            text.set(color=BLUE, fontweight="bold")
-    ax.set_ylim(len(drawn) - 0.4, -0.6)
+    ax.set_yticks(range(len(lines)), lines, fontsize=9)
+    ax.get_yticklabels()[chosen].set(color=BLUE, fontweight="bold")
+    ax.set_ylim(len(lines) - 0.4, -0.6)
+
+
+def _columns(ax: Axes, means: Sequence[float], costs: Sequence[float]) -> None:
+    """Gains and costs as numbers to the right of the axes, a row each."""
     rows = [
         ("gain", "cost"),
         *((f"{m:+.2f}", f"{c:.2f}") for m, c in zip(means, costs, strict=True)),
@@ -94,30 +118,6 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
                 fontweight="bold" if y < 0 else "normal",
                 annotation_clip=False,
             )
-    ax.set_xlabel("gain over silence in units of reward, cost taken off")
-    ax.spines[["top", "right", "left"]].set_visible(False)
-    ax.tick_params(axis="y", length=0, pad=8)
-    figure.suptitle(
-        f"What could be said, and what it is worth: {len(drawn)} of {len(gains)} candidates",
-        x=0.01,
-        ha="left",
-        fontsize=12,
-        fontweight="bold",
-    )
-    handles = [
-        Patch(fc=BLUE),
-        Patch(fc=PALE),
-        Line2D([], [], ls="", marker="s", color=silence, ms=9),
-        Line2D([], [], color=BLACK, lw=1.4, marker="|", ms=7),
-    ]
-    figure.legend(
-        handles,
-        ["chosen", "not chosen", "silence", "90% interval"],
-        loc="outside lower center",
-        ncols=4,
-        frameon=False,
-    )
-    return figure
 
 
 def _drawn(candidates: Tensor, chosen: int, order: list[int], most: int) -> list[int]:

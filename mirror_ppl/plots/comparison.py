@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 
+import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from mirror_ppl.evaluation.comparison import Comparison, Score
 from mirror_ppl.plots.picture import Picture, displayable, label_of
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY
 
@@ -18,53 +20,62 @@ LINE, GAP, PERSON, MOST = 0.24, 0.2, 0.13, 3.0
 MEASURES = {"loo": "leave-one-out", "heldout": "held-out rounds"}
 
 
-def plot_comparison(comparison: Comparison) -> Picture:
+def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
     """Draw each model's difference to the best one: of all rounds, and of each person's.
 
     Models are rows, the best on top. Bars are one standard error to either side; where there is
     but one round there is no bar.
+
+    Args:
+        table: a row for each ``model``, the best first, over all rounds (``person`` is missing) and
+            for each person, in one order: number of ``rounds``, ``elpd``, ``difference`` to the
+            best and its standard error ``difference_se``, NaN where there is none.
+        by: what is predicted, a key of `MEASURES`.
     """
-    models, best = comparison.models, comparison.models[0]
-    step = min(PERSON, MOST / len(comparison.people))
-    below = [0.7 * LINE + step * place for place in range(len(comparison.people))]
-    names = [
-        "\n".join(textwrap.wrap(model.label, WRAP, break_on_hyphens=False)) for model in models
-    ]
+    totals = table.loc[table["person"].isna()].set_index("model")
+    models = {str(model): own for model, own in table.groupby("model", sort=False)}
+    best = str(totals.index[0])
+    people = models[best]["person"].dropna().tolist()
+    step = min(PERSON, MOST / len(people))
+    below = [0.7 * LINE + step * place for place in range(len(people))]
+    names = ["\n".join(textwrap.wrap(model, WRAP, break_on_hyphens=False)) for model in models]
     # Down the picture in inches: a model's own line, and below it one person after the other.
     tops, down = [], 0.0
     for model, name in zip(models, names, strict=True):
         tops.append(down)
-        down += max(0 if model is best else below[-1] + step, LINE * (1 + name.count("\n"))) + GAP
+        down += max(0 if model == best else below[-1] + step, LINE * (1 + name.count("\n"))) + GAP
     figure = Picture(figsize=(9, down + 1.9), layout="constrained")
     ax = figure.subplots()
     ax.axvline(0, color=BLACK, lw=0.8)
     ax.plot([0], [0], "s", color=BLACK, ms=8, mec="white", zorder=4)
-    for model, top in zip(models[1:], tops[1:], strict=True):
+    for model, top in list(zip(models, tops, strict=True))[1:]:
         ax.axhline(top - GAP, color=GREY, lw=0.5, alpha=0.5)
-        for distance, score in zip(below, model.people, strict=True):
-            if score is not None:
-                _dot(ax, score, top + distance, GREY, "o", 4.5)
-        _dot(ax, model.total, top, BLUE, "D", 8)
+        own = models[model]
+        height = np.array([top + distance for distance in below])
+        _dots(ax, own.loc[own["person"].notna()], height, GREY, 4.5)
+        _dots(ax, own.loc[own["person"].isna()], np.array([top]), BLUE, 8)
     ax.set_yticks(tops, [displayable(name) for name in names])
     if step == PERSON:  # else there is no room for their names
         places = [top + distance for top in tops[1:] for distance in below]
-        shown = [label_of(person) for person in comparison.people] * (len(models) - 1)
+        shown = [label_of(person) for person in people] * (len(models) - 1)
         ax.set_yticks(places, shown, minor=True, fontsize=7)
     ax.set_ylim(down - GAP / 2, -GAP - LINE / 2)
-    for model, top in zip(models, tops, strict=True):
-        _column(ax, f"{model.total.elpd:z.4f}", top)
+    for elpd, top in zip(totals["elpd"], tops, strict=True):
+        _column(ax, f"{elpd:z.4f}", top)
     _column(ax, "elpd", -GAP - LINE / 2, weight="bold")
+    _finish(
+        figure, ax, f"{MEASURES[by]}, {totals.loc[best, 'rounds']} rounds of {len(people)} people"
+    )
+    return figure
+
+
+def _finish(figure: Picture, ax: Axes, what: str) -> None:
+    """Labels, title and legend."""
     ax.set_xlabel("difference to the best in nats an action; further left is worse")
     ax.spines[["top", "right", "left"]].set_visible(False)
     ax.tick_params(axis="y", which="both", length=0, pad=8)
-    figure.suptitle(
-        f"How much worse than the best model: {MEASURES[comparison.by]}, "
-        f"{best.total.rounds} rounds of {len(comparison.people)} people",
-        x=0.01,
-        ha="left",
-        fontsize=12,
-        fontweight="bold",
-    )
+    title = f"How much worse than the best model: {what}"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     handles = [
         Line2D([], [], ls="", marker="s", color=BLACK, ms=8),
         Line2D([], [], ls="", marker="D", color=BLUE, ms=8),
@@ -73,22 +84,24 @@ def plot_comparison(comparison: Comparison) -> Picture:
     ]
     words = ["the best", "all rounds", "a person's rounds", "± standard error, paired"]
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False)
-    return figure
 
 
-def _dot(ax: Axes, score: Score, y: float, colour: str, marker: str, size: float) -> None:
-    ax.errorbar(
-        [score.difference],
-        [y],
-        xerr=score.difference_se,
-        fmt=marker,
-        color=colour,
-        ms=size,
-        mec="white",
-        mew=0.6,
-        elinewidth=size / 4,
-        zorder=3,
-    )
+def _dots(ax: Axes, rows: pd.DataFrame, heights: np.ndarray, colour: str, size: float) -> None:
+    """A dot for each row that has rounds, with a bar if it has a standard error."""
+    for height, one in zip(heights.tolist(), rows.to_dict("records"), strict=True):
+        if one["rounds"]:
+            ax.errorbar(
+                [one["difference"]],
+                [height],
+                xerr=None if math.isnan(one["difference_se"]) else one["difference_se"],
+                fmt="D" if colour == BLUE else "o",
+                color=colour,
+                ms=size,
+                mec="white",
+                mew=0.6,
+                elinewidth=size / 4,
+                zorder=3,
+            )
 
 
 def _column(ax: Axes, text: str, y: float, weight: str = "normal") -> None:

@@ -144,28 +144,33 @@ def plot_frames(
             if memory is not None and step < len(memory.known):
                 _draw_thoughts(mind, memory, step, places, cells)
             draw_car(mind, 0, MIDDLES[int(past.observation["ego"][step, 0])])
-            for ax, label in ((road, "the road"), (mind, "what they\nknow")):
-                ax.set_xlim(-cells - 0.5, cells + 0.5)
-                ax.set_yticks([])
-                ax.tick_params(length=0, labelsize=8)
-                ax.set_ylabel(label if column == 0 else "", fontsize=9)
-        grid[0, column].annotate(
-            title,
-            (0, 1),
-            (0, 24),
-            xycoords="axes fraction",
-            textcoords="offset points",
-            fontsize=12,
-            fontweight="bold",
-        )
-        ticks = range(-cells + cells % 2, cells + 1, 2)
-        grid[-1, column].set_xticks(ticks, [str(abs(x)) for x in ticks])
-        grid[-1, column].set_xlabel(
-            "cells behind   \N{LEFTWARDS ARROW}   |   \N{RIGHTWARDS ARROW}   cells ahead",
-            fontsize=9,
-        )
+        _label_column(list(grid[:, column]), title, cells, column == 0)
     _explain(figure, list(grid.flat), knowledge is not None)
     return figure
+
+
+def _label_column(column: Sequence[Axes], title: str, cells: int, first: bool) -> None:
+    """Title and axes of the moments of one round: roads, and below each what they know."""
+    for number, ax in enumerate(column):
+        ax.set_xlim(-cells - 0.5, cells + 0.5)
+        ax.set_yticks([])
+        ax.tick_params(length=0, labelsize=8)
+        if first:
+            ax.set_ylabel("what they\nknow" if number % 2 else "the road", fontsize=9)
+    column[0].annotate(
+        title,
+        (0, 1),
+        (0, 24),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=12,
+        fontweight="bold",
+    )
+    ticks = range(-cells + cells % 2, cells + 1, 2)
+    column[-1].set_xticks(ticks, [str(abs(x)) for x in ticks])
+    column[-1].set_xlabel(
+        "cells behind   \N{LEFTWARDS ARROW}   |   \N{RIGHTWARDS ARROW}   cells ahead", fontsize=9
+    )
 
 
 @dataclass(frozen=True)

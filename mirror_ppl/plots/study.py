@@ -1,18 +1,22 @@
-"""Learning curves, and what was told: the figures of `python -m mirror_ppl.evaluate`."""
+"""Learning curves and relevance: the figures of `python -m mirror_ppl.evaluate`."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from mirror_ppl.evaluation.study_summary import Place, Share, Standing
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE
 
+PLACE = ["domain", "setting", "population"]
+"""Columns that say where people are compared."""
+Place = tuple[str, str, str]
 GREEN, VERMILION, SKY = "#009E73", "#D55E00", "#56B4E9"
 STYLES: dict[str, tuple[str, str, str]] = {
     "mirror": (BLUE, "-", "o"),
@@ -37,7 +41,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
 OTHER_LINES, OTHER_MARK = ("-", "--", "-.", ":"), "."
 """Of models of one's own."""
 OFF_SCALE = 4.0
-"""Spans of the curves beyond which a level is told in words."""
+"""Spans of the curves beyond which a level is named in words."""
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
 
@@ -52,39 +56,37 @@ class Look(NamedTuple):
 
 
 def plot_curves(
-    standings: Sequence[Standing],
+    means: pd.DataFrame,
     label: str,
-    floor: Mapping[Place, float] | None = None,
+    floor: Mapping[Any, float] | None = None,
     by_ratio: bool = False,
 ) -> Picture:
     """Draw a measure against the number of rounds, one panel a place; bands are 90% intervals.
 
-    Who learns nothing and does so much better or worse that all others would look alike is told in
-    words.
+    A model that learns nothing and does so much better or worse that all others would look alike is
+    named in words.
 
     Args:
-        standings: of `summarize_study`; models that learn from 0 rounds are level lines.
+        means: a row for each place (``domain``, ``setting``, ``population``), ``model`` and number
+            of ``rounds``, with columns ``mean``, ``low`` and ``high``; models that learn from 0
+            rounds are level lines.
         label: what is measured.
-        floor: what cannot be surpassed, by place, if it is known.
+        floor: what cannot be surpassed, by place (a tuple of the three), if it is known.
         by_ratio: the measure is shown by its logarithm, so that what is near the floor can be told
             apart beside what is far from it.
     """
-    places = list(dict.fromkeys(one.place for one in standings))
-    figure = Picture(figsize=(WIDTH * len(places) + LEGEND, HEIGHT), layout="constrained")
-    panels = figure.subplots(1, len(places), squeeze=False)[0]
-    looks = _looks(one.model for one in standings)
-    for ax, place in zip(panels, places, strict=True):
-        here = [one for one in standings if one.place == place]
-        far = _far([one for one in here if one.rounds == 0], [one for one in here if one.rounds])
-        for model in dict.fromkeys(one.model for one in here if one not in far):
-            own = [one for one in here if one.model == model]
-            _curve(ax, sorted(own, key=lambda one: one.rounds), looks[model])
-        for number, one in enumerate(far):
-            text = f"{looks[one.model].label}: {one.measured.mean:.1f}, off the scale"
+    figure, panels = _panels(means)
+    looks = _looks(means["model"])
+    for ax, (place, here) in zip(panels, _by_place(means), strict=True):
+        far = _far(here)
+        for model, own in here.drop(far.index).groupby("model", sort=False):
+            _curve(ax, own.sort_values("rounds"), looks[str(model)])
+        for number, (model, mean) in enumerate(zip(far["model"], far["mean"], strict=True)):
+            text = f"{looks[model].label}: {mean:.1f}, off the scale"
             ax.text(0.02, 0.02 + 0.06 * number, text, transform=ax.transAxes, fontsize=8)
         if floor is not None and place in floor:
             ax.axhline(floor[place], color=BLACK, lw=1, ls=":", label="people's own entropy")
-        ticks = sorted({one.rounds for one in here} - {0})
+        ticks = sorted({*here["rounds"]} - {0})
         ax.set_xscale("log")
         ax.set_xticks(ticks, [str(number) for number in ticks])
         ax.minorticks_off()
@@ -97,13 +99,24 @@ def plot_curves(
     return figure
 
 
-def _far(level: Sequence[Standing], curves: Sequence[Standing]) -> list[Standing]:
+def _by_place(table: pd.DataFrame) -> list[tuple[Place, pd.DataFrame]]:
+    return [(cast(Place, place), here) for place, here in table.groupby(PLACE, sort=False)]
+
+
+def _panels(table: pd.DataFrame) -> tuple[Picture, Sequence[Axes]]:
+    """A figure with a panel for each place."""
+    number = len(table[PLACE].drop_duplicates())
+    figure = Picture(figsize=(WIDTH * number + LEGEND, HEIGHT), layout="constrained")
+    return figure, figure.subplots(1, number, squeeze=False)[0]
+
+
+def _far(here: pd.DataFrame) -> pd.DataFrame:
     """Which levels are farther from the curves than ``OFF_SCALE`` times their span."""
-    if not curves:
-        return []
-    low, high = min(one.measured.low for one in curves), max(one.measured.high for one in curves)
+    curves, levels = here.loc[here["rounds"] > 0], here.loc[here["rounds"] == 0]
+    low, high = curves["low"].min(), curves["high"].max()
     away = OFF_SCALE * (high - low)
-    return [one for one in level if not low - away <= one.measured.mean <= high + away]
+    # Where there are no curves, nothing is far from them: comparisons with NaN are false.
+    return levels.loc[(levels["mean"] < low - away) | (levels["mean"] > high + away)]
 
 
 def _logarithmic(ax: Axes) -> None:
@@ -114,47 +127,42 @@ def _logarithmic(ax: Axes) -> None:
     ax.yaxis.set_major_formatter("{x:g}")
 
 
-def _curve(ax: Axes, own: Sequence[Standing], look: Look) -> None:
+def _curve(ax: Axes, own: pd.DataFrame, look: Look) -> None:
     label, colour, line, mark = look
-    if own[-1].rounds == 0:
-        ax.axhline(own[0].measured.mean, color=colour, ls=line, lw=1.2, label=label)
+    rounds, mean = own["rounds"].to_numpy(), own["mean"].to_numpy()
+    if rounds[-1] == 0:
+        ax.axhline(mean[0], color=colour, ls=line, lw=1.2, label=label)
         return
-    rounds = [one.rounds for one in own]
-    mean = [one.measured.mean for one in own]
     ax.plot(rounds, mean, color=colour, ls=line, marker=mark, ms=5, label=label)
-    low, high = [one.measured.low for one in own], [one.measured.high for one in own]
-    ax.fill_between(rounds, low, high, color=colour, alpha=0.12, lw=0)
+    ax.fill_between(rounds, own["low"], own["high"], color=colour, alpha=0.12, lw=0)
 
 
-def plot_relevance(places: Sequence[Sequence[Share]]) -> Picture:
-    """Draw which share of what was told was relevant, one panel a place, after all rounds.
+def plot_relevance(shares: pd.DataFrame) -> Picture:
+    """Draw which share of messages was relevant, one panel a place, after all rounds.
 
     Args:
-        places: of each what `relevance` found.
+        shares: columns as of `plot_curves` and ``modality``; NaN where nothing was communicated.
     """
-    figure = Picture(figsize=(WIDTH * len(places) + LEGEND, HEIGHT), layout="constrained")
-    panels = figure.subplots(1, len(places), squeeze=False)[0]
-    looks = _looks(one.model for shares in places for one in shares)
-    for ax, shares in zip(panels, places, strict=True):
-        most = max(one.rounds for one in shares)
-        last = [one for one in shares if one.rounds in (0, most)]
-        models = list(dict.fromkeys(one.model for one in last))
-        names = list(dict.fromkeys(one.modality for one in last))
+    figure, panels = _panels(shares)
+    looks = _looks(shares["model"])
+    for ax, (place, here) in zip(panels, _by_place(shares), strict=True):
+        last = here.loc[here["rounds"].isin([0, here["rounds"].max()])]
+        models, names = (list(dict.fromkeys(last[name])) for name in ("model", "modality"))
         width = 0.8 / len(models)
-        for one in last:
-            x = names.index(one.modality)
-            x += (models.index(one.model) - (len(models) - 1) / 2) * width
-            label, colour = looks[one.model][:2]
-            if one.share is None:
-                text = f"{label}: nothing told"
+        for one in last.to_dict("records"):
+            x = names.index(one["modality"])
+            x += (models.index(one["model"]) - (len(models) - 1) / 2) * width
+            label, colour = looks[one["model"]][:2]
+            if math.isnan(one["mean"]):
+                text = f"{label}: no messages"
                 ax.text(x, 1, text, rotation=90, ha="center", va="bottom", fontsize=7, color=colour)
                 continue
-            ax.bar(x, 100 * one.share.mean, 0.9 * width, color=colour, label=label)
-            ax.plot([x, x], [100 * one.share.low, 100 * one.share.high], color=BLACK, lw=1)
+            ax.bar(x, 100 * one["mean"], 0.9 * width, color=colour, label=label)
+            ax.plot([x, x], [100 * one["low"], 100 * one["high"]], color=BLACK, lw=1)
         ax.set_xticks(range(len(names)), names)
         ax.set_ylim(0, 105)
-        _title(ax, shares[0].place)
-    panels[0].set_ylabel("relevant, % of the items told")
+        _title(ax, place)
+    panels[0].set_ylabel("relevant, % of the communicated items")
     _legend(figure, panels)
     return figure
 

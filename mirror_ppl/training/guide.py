@@ -1,4 +1,4 @@
-"""Training of the amortized guide by inference compilation.
+"""Training of the amortized guide by inference compilation, and by the ELBO if asked.
 
 People are drawn from the prior, play rounds in the true domain, and the guide learns to find the
 implants that made them play so, from the first rounds, from more of them, and from all::
@@ -6,12 +6,14 @@ implants that made them play so, from the first rounds, from more of them, and f
     psi_p ~ prior;   rounds_p ~ program(psi_p);   minimize  - E log q(psi_p | first n rounds_p)
 
 (Le, Baydin and Wood, *Inference compilation and universal probabilistic programming*, 2017). At its
-minimum the guide is the posterior of everybody at once, as far as it can express it.
+minimum the guide is the posterior of everybody at once, as far as it can express it. Steps of the
+ELBO (:mod:`mirror_ppl.training.guide_elbo`) can be put between.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,11 +23,11 @@ from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.inference.amortized import (
+from mirror_ppl.inference.amortized import log_evidence
+from mirror_ppl.inference.amortized_guide import (
     PRIOR_DRAWS,
     AmortizedGuide,
     guide_screening,
-    log_evidence,
     reference_places,
 )
 from mirror_ppl.inference.calibration.study import prior_people
@@ -36,6 +38,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import sample_sites, scalar_sites, unconstrained
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.training.guide_elbo import ELBOTraining, Group, simulated_groups
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,8 @@ class GuideOptions:
     Attributes:
         people: number of people drawn from the prior.
         rounds: numbers of rounds after which evidence is looked at, increasing.
-        steps: gradient steps.
+        steps: gradient steps of inference compilation.
+        elbo_steps: gradient steps of the ELBO, evenly among the others.
         batch: examples in a gradient step, of a person and a number of rounds each.
         learning_rate: of AdamW at the start; it falls to nothing on a cosine.
         weight_decay: of AdamW.
@@ -56,6 +60,7 @@ class GuideOptions:
     people: int = 1000
     rounds: tuple[int, ...] = (1, 2, 3, 5, 8, 13, 20, 40)
     steps: int = 4000
+    elbo_steps: int = 0
     batch: int = 256
     learning_rate: float = 1e-3
     weight_decay: float = 0.1
@@ -63,7 +68,8 @@ class GuideOptions:
     together: int = 20
 
     def __post_init__(self) -> None:
-        for name, least in (("people", 10), ("steps", 1), ("batch", 1), ("together", 1)):
+        least_of = {"people": 10, "steps": 1, "elbo_steps": 0, "batch": 1, "together": 1}
+        for name, least in least_of.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
@@ -114,7 +120,9 @@ def train_guide(
     examples = simulate_examples(human, options, seed, report, checkpoint)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return _optimize(human, examples, options, report)
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + options.people)
+        groups = simulated_groups(human, options.rounds, generator)
+        return _optimize(human, examples, options, groups, report)
 
 
 def simulate_examples(
@@ -172,7 +180,11 @@ def _restored(checkpoint: Path | None, run: str) -> list[Examples]:
 
 
 def _optimize(
-    human: HumanModel, examples: Examples, options: GuideOptions, report: Report
+    human: HumanModel,
+    examples: Examples,
+    options: GuideOptions,
+    groups: Iterator[Group],
+    report: Report,
 ) -> tuple[AmortizedGuide, dict[str, float]]:
     sites = scalar_sites(human)
     guide = AmortizedGuide(reference_places(human), reference_places(human, PRIOR_DRAWS))
@@ -193,9 +205,14 @@ def _optimize(
         guide.parameters(), options.learning_rate, weight_decay=options.weight_decay
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.steps)
+    by_elbo = ELBOTraining(guide, groups, options.learning_rate)
     best, kept = float("inf"), copy.deepcopy(guide.state_dict())
     for step in range(options.steps):
         guide.train()
+        # So many of them are due by now.
+        due = (step + 1) * options.elbo_steps // options.steps
+        for _ in range(step * options.elbo_steps // options.steps, due):
+            by_elbo.step()
         optimizer.zero_grad()
         value = loss(
             torch.randint(learned, (options.batch,)), torch.randint(numbers, (options.batch,))

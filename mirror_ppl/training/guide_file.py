@@ -11,7 +11,7 @@ from mirror_ppl.checks import require_kind
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import AssetError
 from mirror_ppl.files import json_text
-from mirror_ppl.inference.amortized import AmortizedGuide, reference_places
+from mirror_ppl.inference.amortized_guide import AmortizedGuide, reference_places
 from mirror_ppl.inference.engines import ENGINES
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import model_name

@@ -237,8 +237,17 @@ def judge(
     )
 
 
+def join_rounds(judged: Mapping[int, xr.Dataset]) -> xr.Dataset:
+    """What was judged of the same people after several numbers of rounds, along ``rounds``.
+
+    Raises:
+        ValueError: numbers of draws differ.
+    """
+    return _joined(list(judged.values()), pd.Index(list(judged), name="rounds"))
+
+
 def collect(
-    parts: Mapping[int, Sequence[xr.Dataset]],
+    parts: Sequence[xr.Dataset],
     prior: Mapping[str, np.ndarray],
     discrete: Collection[str],
     attributes: Mapping[str, str],
@@ -246,8 +255,7 @@ def collect(
     """Put together what was judged of all people and numbers of rounds.
 
     Args:
-        parts: for each number of rounds, results of :func:`judge` of some people each; the same
-            people, in the same order.
+        parts: results of :func:`join_rounds` of some people each.
         prior: draws of the prior by site, ``[D]``.
         discrete: which sites are.
         attributes: what the file should say of itself.
@@ -260,18 +268,20 @@ def collect(
     Raises:
         ValueError: numbers of draws differ.
     """
-    sizes = {part.attrs["draws"] for judged in parts.values() for part in judged}
-    if len(sizes) != 1:
-        raise ValueError(f"expected as many draws every time, not {sorted(sizes)}")
-    joined = [xr.concat(judged, "person", **EXACTLY) for judged in parts.values()]
-    rounds = pd.Index(list(parts), name="rounds")
-    data = xr.concat(joined, rounds, **EXACTLY).transpose("site", "rounds", "person")
+    data = _joined(parts, "person").transpose("site", "rounds", "person")
     data["truth"] = data["truth"].isel(rounds=0, drop=True)
     before = {site: _of_prior(prior[site], site in discrete) for site in prior}
     for name in next(iter(before.values())):
         values = [before[site][name] for site in data["site"].values.tolist()]
         data[name] = ("site", np.asarray(values))
     return Calibration(data.assign_attrs(attributes))
+
+
+def _joined(parts: Sequence[xr.Dataset], dimension: str | pd.Index) -> xr.Dataset:
+    sizes = {part.attrs["draws"] for part in parts}
+    if len(sizes) != 1:
+        raise ValueError(f"expected as many draws every time, not {sorted(sizes)}")
+    return xr.concat(parts, dimension, **EXACTLY)
 
 
 def _of_prior(values: np.ndarray, discrete: bool) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Simulation-based calibration: are posteriors as sure of people as they have a right to be?
+"""Simulation-based calibration of posteriors: tests that ranks are uniform and intervals cover.
 
 Implements Talts, Betancourt, Simpson, Vehtari and Gelman (*Validating Bayesian inference algorithms
 with simulation-based calibration*, 2018) for human models, whatever makes the posteriors::
@@ -16,11 +16,9 @@ is tested, in two ways (:mod:`mirror_ppl.inference.calibration.uniformity`).
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,21 +26,17 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from mirror_ppl import __version__
 from mirror_ppl.checks import whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
-from mirror_ppl.errors import PosteriorError
-from mirror_ppl.files import write_whole
-from mirror_ppl.inference.calibration.ranks import Calibration, collect, judge
+from mirror_ppl.inference.calibration.ranks import Calibration, collect, join_rounds, judge
 from mirror_ppl.inference.engines import Inferred
+from mirror_ppl.jobs import DatasetFormat, Runner
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import fingerprint
-from mirror_ppl.netcdf import read_netcdf
-from mirror_ppl.progress import Report, silent
-from mirror_ppl.workers import run_tasks
+from mirror_ppl.version import __version__
 
 PRIOR_PEOPLE = 4000
 """Drawn to know the prior's widths and entropies to a few percent."""
@@ -106,17 +100,33 @@ def prior_people(human: HumanModel, people: int, generator: torch.Generator) -> 
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Some of the people, who are simulated and inferred together.
+
+    Attributes:
+        first: number of the first of them.
+        people: how many.
+    """
+
+    first: int
+    people: int
+
+    @property
+    def label(self) -> str:
+        """What it is, for people who wait."""
+        return f"people {self.first + 1} to {self.first + self.people}"
+
+
 def calibrate(
     human: HumanModel,
     infer: Infer,
     options: CalibrationOptions,
     setting: str,
     seed: int,
-    report: Report = silent,
-    jobs: int = 1,
-    parts: tuple[Path, str] | None = None,
+    runner: Runner | None = None,
 ) -> Calibration:
-    """Hold posteriors against people of whom everything is known, because the model drew them.
+    """Test posteriors on people who are drawn from the model's prior.
 
     Args:
         human: the model of people, from which people and rounds are drawn.
@@ -124,10 +134,7 @@ def calibrate(
         options: settings.
         setting: name under which the rounds are recorded.
         seed: of everything random; people and rounds are the same whatever ``infer`` is.
-        report: told how many people are done.
-        jobs: processes.
-        parts: folder in which finished batches are kept and looked for, and what identifies this
-            run (batches of another run are done anew).
+        runner: does the work of each `Batch`; this process unless given, and nothing is kept.
 
     Raises:
         UnknownNameError: there is no such setting.
@@ -135,14 +142,12 @@ def calibrate(
     """
     require_known(setting, "setting", human.domain.settings, human.domain.name)
     trial = _Trial(human, options, setting, seed)
-    begins = range(0, options.people, options.batch)
-    report("calibrate", 0, options.people, "people")
-    found: dict[int, dict[int, xr.Dataset]] = {}
-    done = 0
-    for begin, judged in _each_batch(trial, infer, begins, jobs, parts):
-        found[begin] = judged
-        done += judged[options.rounds[0]].sizes["person"]
-        report("calibrate", done, options.people, "people")
+    batches = [
+        Batch(first, min(options.batch, options.people - first))
+        for first in range(0, options.people, options.batch)
+    ]
+    work = partial(_judged, trial, infer)
+    outcomes = (runner or Runner()).run(batches, work, DatasetFormat())
     attributes = {
         "domain": human.domain.name,
         "domain_version": human.domain.version,
@@ -152,8 +157,12 @@ def calibrate(
         "version": __version__,
         "seed": str(seed),
     }
-    ordered = {number: [found[begin][number] for begin in begins] for number in options.rounds}
-    return collect(ordered, trial.prior, trial.discrete, attributes)
+    judged = [outcome.result for outcome in outcomes if outcome.result is not None]
+    return collect(judged, trial.prior, trial.discrete, attributes)
+
+
+def _judged(trial: _Trial, infer: Infer, batch: Batch) -> xr.Dataset:
+    return trial.batch(infer, batch)
 
 
 class _Trial:
@@ -178,79 +187,28 @@ class _Trial:
         for name, summary in options.summaries.items():
             self.discrete += [] if summary(drawn).is_floating_point() else [name]
 
-    def batch(self, infer: Infer, begin: int) -> dict[int, xr.Dataset]:
-        """The people from this number on, judged after each number of rounds."""
-        options, generator = self.options, self._generator(begin)
-        people = min(options.batch, options.people - begin)
-        rng = np.random.default_rng([self.seed, begin])
-        implants = prior_people(self.human, people, generator)
-        truth = self.scalars.of(implants, (people,), "the prior")
+    def batch(self, infer: Infer, batch: Batch) -> xr.Dataset:
+        """The people of a batch, judged after each number of rounds."""
+        options, generator = self.options, self._generator(batch.first)
+        rng = np.random.default_rng([self.seed, batch.first])
+        implants = prior_people(self.human, batch.people, generator)
+        truth = self.scalars.of(implants, (batch.people,), "the prior")
         recordings = play_rounds(self.human, implants, options.rounds[-1], self.setting, generator)
         judged = {}
         for number in options.rounds:
             inferred = infer(recordings.select_rounds(range(number)), _seed(generator))
             number_of_draws = len(next(iter(inferred.draws.values()), ()))
             source = f"infer() of {number} rounds"
-            draws = self.scalars.of(inferred.draws, (number_of_draws, people), source)
+            draws = self.scalars.of(inferred.draws, (number_of_draws, batch.people), source)
             pareto_k = None
             if inferred.pareto_k is not None:
                 pareto_k = inferred.pareto_k.detach().double().cpu().numpy()
             judged[number] = judge(truth, draws, self.discrete, rng, pareto_k)
-        return judged
+        return join_rounds(judged)
 
     def _generator(self, begin: int) -> torch.Generator:
         device = next(self.human.parameters()).device
         return torch.Generator(device).manual_seed(self.seed * 1_000_003 + begin + 1)
-
-
-def _each_batch(
-    trial: _Trial, infer: Infer, begins: range, jobs: int, parts: tuple[Path, str] | None
-) -> Iterator[tuple[int, dict[int, xr.Dataset]]]:
-    if jobs == 1:
-        for begin in begins:
-            yield begin, _batch(trial, infer, begin, parts)
-        return
-    import cloudpickle
-
-    for kind in type(trial.human).__mro__:
-        if kind.__module__.split(".")[0] not in ("mirror_ppl", "torch", "builtins"):
-            # The model of somebody's file, which other processes cannot import by its name.
-            cloudpickle.register_pickle_by_value(sys.modules[kind.__module__])
-
-    yield from run_tasks([partial(_numbered, trial, infer, begin, parts) for begin in begins], jobs)
-
-
-def _numbered(
-    trial: _Trial, infer: Infer, begin: int, parts: tuple[Path, str] | None
-) -> tuple[int, dict[int, xr.Dataset]]:
-    return begin, _batch(trial, infer, begin, parts)
-
-
-def _batch(
-    trial: _Trial, infer: Infer, begin: int, parts: tuple[Path, str] | None
-) -> dict[int, xr.Dataset]:
-    """Judged batches by number of rounds, from their files if these are there."""
-    if parts is None:
-        return trial.batch(infer, begin)
-    folder, run = parts
-    paths = {number: folder / f"{begin}-{number}.nc" for number in trial.options.rounds}
-    kept = {number: _kept(path, run) for number, path in paths.items()}
-    judged = {number: one for number, one in kept.items() if one is not None}
-    if len(judged) == len(paths):
-        return judged
-    judged = trial.batch(infer, begin)
-    for number, path in paths.items():
-        write_whole(path, judged[number].assign_attrs(run=run).to_netcdf(engine="h5netcdf"))
-    return judged
-
-
-def _kept(path: Path, run: str) -> xr.Dataset | None:
-    """What an earlier run left, if it was a run of the same thing."""
-    try:
-        data = read_netcdf(path, PosteriorError)["/"]
-    except PosteriorError:
-        return None
-    return data if data.attrs.pop("run", None) == run else None
 
 
 def _seed(generator: torch.Generator) -> int:

@@ -1,9 +1,9 @@
-"""Partial pooling: people are alike, and how alike is inferred with them.
+"""Partial pooling: a hierarchical prior, inferred together with the people.
 
 The population is a Pyro program above the human model. Every site of one number a person gets
-hyper-parameters, unless its prior hangs on other sites already (how soon each terminal is noticed,
-given how quick somebody is) or is knowledge of the world (`HumanModel.of_the_world`); the others,
-and weights of the residual, keep their prior::
+hyper-parameters, unless its prior depends on other sites already (how soon each terminal is
+noticed, given the person's mean over terminals) or is knowledge of the world
+(`WorldKnowledge.world_sites`); the others, and weights of the residual, keep their prior::
 
     concentration_d ~ LogNormal(log(n_d), 1)      discrete site d, of n_d values: large where
     chances_d  ~ Dirichlet(concentration_d p_d)     people differ as much as its prior p_d says
@@ -28,7 +28,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -40,8 +39,10 @@ from mirror_ppl.inference.population.sampler import (
     PeoplesDraws,
     sample_population,
 )
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
+from mirror_ppl.models.world_knowledge import world_sites
 from mirror_ppl.progress import Report, silent
 
 POOLINGS = ("none", "partial")
@@ -105,13 +106,14 @@ class Pooling:
 
     def __init__(self, human: HumanModel) -> None:
         self.human = human
+        parents = dependencies(human).prior
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             nodes = sample_sites(human, 1, PRIOR_DRAWS)
         nodes = {
             name: node
             for name, node in nodes.items()
-            if name not in human.of_the_world and not _has_parents(node)
+            if name not in world_sites(human) and not parents[name]
         }
         self.sites = {name: site for name, site in scalar_sites(human).items() if name in nodes}
         drawn = unconstrained(self.sites, values_of(nodes), PRIOR_DRAWS)
@@ -138,8 +140,8 @@ class Pooling:
         chances = {}
         for name, prior in self.prior_chances.items():
             size = prior.new_tensor(float(len(prior)))
-            alike = dist.LogNormal(size.log(), torch.full_like(size, CONCENTRATION_WIDTH))
-            concentration = pyro.sample(f"{name}_concentration", alike)
+            prior_of = dist.LogNormal(size.log(), torch.full_like(size, CONCENTRATION_WIDTH))
+            concentration = pyro.sample(f"{name}_concentration", prior_of)
             chances[name] = pyro.sample(f"{name}_chances", dist.Dirichlet(concentration * prior))
         mean, spread = {}, {}
         for name, centre, width in zip(self.sites, self.centre, self.width, strict=True):
@@ -263,10 +265,3 @@ class Pooling:
                 normal = dist.Normal(population.mean[name], population.spread[name])
                 given[name] = site(normal.sample(torch.Size([people])).T)[..., None]
             return values_of(sample_sites(self.human, people, number, given))
-
-
-def _has_parents(node: Mapping[str, Any]) -> bool:
-    """Whether a site's prior ``[S, 1, 1]`` differs from draw to draw of the others."""
-    prior, first = node["fn"], node["value"][:1]
-    log_density = prior.log_prob(first.expand(prior.shape()))
-    return bool((log_density - log_density[:1]).abs().max() > 1e-6)

@@ -8,13 +8,12 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mirror_ppl import __version__
 from mirror_ppl.checks import as_path, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError
-from mirror_ppl.inference.amortized import AmortizedGuide
+from mirror_ppl.inference.amortized_guide import AmortizedGuide
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.results.posterior_predictive import predict_people
@@ -23,7 +22,9 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.models.world_knowledge import fit_world
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.version import __version__
 
 if TYPE_CHECKING:
     import arviz as az
@@ -125,7 +126,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     checkpoint = None if checkpoint is None else as_path(checkpoint, "checkpoint")
     train, test = split_rounds(demonstrations, train_rounds)
     people = train.num_people
-    human.learn_world(train)
+    fit_world(human, train)
     run = None
     if checkpoint is not None:
         run = (

@@ -1,0 +1,109 @@
+"""One measurement of benchmarks/speed.py, by the package of the folder that it is started in.
+
+Run as a file, not as a module: folders of older versions lack it. Names have changed since version
+0.1.0, so that they are looked for under both. Printed is one line of JSON.
+"""
+
+import json
+import sys
+from importlib import import_module
+from statistics import median
+from time import perf_counter
+
+import torch
+
+ROUNDS = 20
+MOMENTS = 40
+MODULES = {
+    "fit_people": ("inference.results.fitting", "inference.fitting"),
+    "InferenceOptions": ("inference.engines", "inference.guides"),
+    "load_guide": ("training.guide_file", "inference.guide_file"),
+    "shipped_guide": ("training.guide_file", "inference.guide_file"),
+    "Person": ("communication",),
+}
+
+
+def named(name, *other):
+    """What the package calls so, wherever it stands."""
+    for module in MODULES[name]:
+        try:
+            found = import_module(f"mirror_ppl.{module}")
+        except ImportError:
+            continue
+        for one in (name, *other):
+            if hasattr(found, one):
+                return getattr(found, one)
+    raise SystemExit(f"the package has no {name}")
+
+
+def human_and_rounds(domain, setting, people):
+    """The package's own human model of a world, and rounds of simulated people that ship."""
+    from mirror_ppl.data import asset_path, load_demonstrations
+    from mirror_ppl.models.loading import load_human_model
+    from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+    recordings = load_demonstrations(asset_path(f"{domain}_{setting}_paper.nc"))
+    recordings = recordings.select_people(recordings.people[:people])
+    self_model, _ = load_self_model(shipped_weights(domain), domain)
+    return load_human_model(None, self_model), recordings
+
+
+def plan():
+    """Milliseconds of decisions with the default settings, in recorded moments of one driver."""
+    from mirror_ppl.communication import Communicator, ExpectedUtility, RoundSoFar
+
+    human, recordings = human_and_rounds("driving", "fog", 1)
+    options = named("InferenceOptions")(draws=64)
+    posterior = named("fit_people")(human, recordings, options, seed=0).posterior
+    person = named("Person")(human, posterior.draws)
+    import mirror_ppl.communication as communication
+
+    dynamics = next(
+        getattr(communication, name)
+        for name in ("SimulatorDynamics", "SimulatorWorld")
+        if hasattr(communication, name)
+    )
+    communicator = Communicator(person, ExpectedUtility(dynamics(human.domain)))
+    observation, seconds = recordings.observation(), []
+    for place in range(MOMENTS):
+        number, step = ROUNDS + place % 10, place * 7 % human.domain.horizon
+        past = RoundSoFar(
+            {name: value[0, number, : step + 1] for name, value in observation.items()},
+            recordings.actions[0, number, :step],
+            {name: mask[0, number, :step] for name, mask in recordings.told.items()},
+        )
+        began = perf_counter()
+        communicator.plan(past)
+        seconds.append(perf_counter() - began)
+    return {"median_ms": 1e3 * median(seconds[1:]), "slowest_ms": 1e3 * max(seconds[1:])}
+
+
+def add(domain, setting, network):
+    """Milliseconds to add a round to a person's posterior and draw 200, over three people."""
+    from mirror_ppl.inference.online import OnlinePosterior
+
+    human, recordings = human_and_rounds(domain, setting, 3)
+    guide = named("load_guide")(named("shipped_guide")(domain), human)[0] if network else None
+    first, others = [], []
+    for name in recordings.people:
+        own = recordings.select_people([name])
+        online = OnlinePosterior(human, guide)
+        for number in range(ROUNDS):
+            one = own.select_rounds([number])
+            began = perf_counter()
+            online.add(one)
+            online.draws(200)
+            (others if number else first).append(perf_counter() - began)
+    return {"first_ms": 1e3 * median(first), "median_ms": 1e3 * median(others)}
+
+
+def main():
+    """Measure what the command line names."""
+    torch.set_num_threads(1)
+    what, *arguments = sys.argv[1:]
+    found = plan() if what == "plan" else add(arguments[0], arguments[1], arguments[2] == "network")
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""The network of the amortized guide: ``q(psi | rounds)`` as a Pyro program.
+
+It reads what rounds say of some ways to decide, see :mod:`mirror_ppl.inference.amortized`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor, nn
+
+from mirror_ppl.errors import InputError
+from mirror_ppl.inference.margins import PriorMargins, prior_knots
+from mirror_ppl.inference.mixture import GaussianMixture
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import Draws, scalar_sites, unconstrained
+
+WAYS = 64
+COMPONENTS = 4
+HIDDEN = 128
+DROPOUT = 0.2
+TEMPERATURES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+PRIOR_DRAWS = 20_000
+LEAST_EVIDENCE = -30.0
+SOFTPLUS_ONE = 0.5413  # its softplus is 1
+
+
+def guide_screening() -> Screening:
+    """The screening that an amortized guide needs: its ways are what the network reads."""
+    return Screening(policies=WAYS)
+
+
+class AmortizedGuide(nn.Module):
+    """``q(psi | rounds)`` of the scalar sites of a human model, in unconstrained space.
+
+    Before it has learned anything it is about the prior's margins, and independent.
+
+    Args:
+        places: of the ways that evidence is about, ``[W, D]``.
+        prior: of draws from the prior, for its margins, ``[S, D]``; the ways if not given.
+
+    Attributes:
+        knots: of the prior's margins, see :class:`PriorMargins`, ``[D, K]``.
+        ways: places of the ways, in which the prior is standard normal, ``[W, D]``.
+        gate: how much of the mean, at each temperature of the evidence, is that of importance
+            sampling from the prior, ``[temperatures, D]``.
+    """
+
+    ways: Tensor
+    knots: Tensor
+
+    def __init__(self, places: Tensor, prior: Tensor | None = None) -> None:
+        super().__init__()
+        number, self.dimensions = places.shape
+        self.register_buffer("knots", prior_knots(places if prior is None else prior))
+        self.register_buffer("ways", PriorMargins(self.knots).inv(places))
+        moments = 2 * self.dimensions + 1
+        triangle = self.dimensions * (self.dimensions + 1) // 2
+        self.body = nn.Sequential(
+            nn.Linear(number + len(TEMPERATURES) * moments + 1, HIDDEN),
+            nn.ReLU(),
+            nn.Dropout(DROPOUT),
+            nn.Linear(HIDDEN, HIDDEN),
+            nn.ReLU(),
+            nn.Dropout(DROPOUT),
+        )
+        self.head = nn.Linear(HIDDEN, COMPONENTS * (1 + self.dimensions + triangle))
+        nn.init.normal_(self.head.weight, std=0.01)
+        nn.init.normal_(self.head.bias, std=0.1)
+        self.gate = nn.Parameter(torch.zeros(len(TEMPERATURES), self.dimensions))
+
+    def features(self, log_evidence: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+        """What the network reads ``[..., F]`` of evidence ``[..., W]`` of so many steps ``[...]``.
+
+        Besides the evidence itself: what importance sampling from the prior would give for mean
+        and spread, also with evidence tempered, where few ways have all the weight. These means
+        once more, ``[..., temperatures, D]``.
+        """
+        relative = log_evidence - log_evidence.amax(-1, keepdim=True)
+        parts, means = [relative.clamp(min=LEAST_EVIDENCE) / 10.0], []
+        for temperature in TEMPERATURES:
+            weights = torch.softmax(relative / temperature, -1)
+            mean = weights @ self.ways
+            spread = (weights @ self.ways.square() - mean.square()).clamp(min=0).sqrt()
+            effective = 1 / weights.square().sum(-1, keepdim=True)
+            parts += [mean, spread, effective / len(self.ways)]
+            means.append(mean)
+        parts.append(torch.log1p(steps.to(relative))[..., None] / 5.0)
+        return torch.cat(parts, -1), torch.stack(means, -2)
+
+    def reads(self, places: Tensor) -> bool:
+        """Whether it learned to read evidence about ways at these places ``[W, D]``."""
+        if self.ways.shape != places.shape:
+            return False
+        own = torch.as_tensor(PriorMargins(self.knots)(self.ways))
+        return torch.allclose(own, places.to(own), atol=1e-3)
+
+    def mixture_parameters(self, log_evidence: Tensor, steps: Tensor) -> Tensor:
+        """What the network says of this evidence: parameters ``[..., COMPONENTS, M]`` of ``q``."""
+        features, means = self.features(log_evidence, steps)
+        out = self.head(self.body(features)).unflatten(-1, (COMPONENTS, -1))
+        towards = (self.gate * means).sum(-2)[..., None, :]
+        return out + nn.functional.pad(towards, [1, out.shape[-1] - 1 - self.dimensions])
+
+    def density(self, log_evidence: Tensor, steps: Tensor) -> dist.TorchDistribution:
+        """``q`` over places ``[..., D]`` in unconstrained space."""
+        return self.mixture(self.mixture_parameters(log_evidence, steps))
+
+    def mixture(self, parameters: Tensor) -> dist.TorchDistribution:
+        """The density over places ``[..., D]`` that has parameters ``[..., COMPONENTS, M]``."""
+        size = self.dimensions
+        logits, mean, triangle = parameters.split([1, size, size * (size + 1) // 2], -1)
+        rows, columns = torch.tril_indices(size, size)
+        lower = mean.new_zeros(*triangle.shape[:-1], size, size)
+        lower[..., rows, columns] = triangle
+        # Without anything learned it is one, as the prior's.
+        diagonal = nn.functional.softplus(lower.diagonal(dim1=-2, dim2=-1) + SOFTPLUS_ONE) + 1e-3
+        lower = torch.tril(lower, -1) + torch.diag_embed(diagonal)
+        mixture = GaussianMixture(
+            dist.Categorical(logits=logits.squeeze(-1)),
+            dist.MultivariateNormal(mean, scale_tril=lower),
+        )
+        return dist.TransformedDistribution(mixture, [PriorMargins(self.knots)])
+
+    def forward(
+        self, sites: Mapping[str, dist.transforms.Transform], log_evidence: Tensor, steps: Tensor
+    ) -> None:
+        """The guide as a Pyro program over the scalar sites of P people, ``[P, W]`` and ``[P]``."""
+        person = pyro.plate("person", len(log_evidence), dim=-2)
+        sample_scalars(sites, self.density(log_evidence[:, None], steps[:, None]), person)
+
+
+def sample_scalars(
+    sites: Mapping[str, dist.transforms.Transform],
+    density: dist.TorchDistribution,
+    person: pyro.plate,
+) -> Draws:
+    """A Pyro program over the scalar sites of P people, whose places have a density ``[P, 1]``.
+
+    Returns:
+        The values ``[P, 1]`` by site.
+    """
+    values = {}
+    with person:
+        place = pyro.sample("place", density, infer={"is_auxiliary": True})
+        for column, (name, site) in enumerate(sites.items()):
+            value = site(place[..., column])
+            stretch = site.log_abs_det_jacobian(place[..., column], value)
+            values[name] = pyro.sample(name, dist.Delta(value, log_density=-stretch))
+    return values
+
+
+def reference_places(human: HumanModel, number: int = WAYS) -> Tensor:
+    """Places ``[W, D]`` of ways from the prior; always the same of a human model."""
+    builder = ViewTableBuilder(human, Screening(policies=number))
+    return unconstrained(scalar_sites(human), builder.draw_policies())
+
+
+def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:
+    """Refuse networks that were trained for another human model.
+
+    Raises:
+        InputError: this is one.
+    """
+    if not network.reads(reference_places(human)):
+        raise InputError(
+            f"the network is for another human model than {type(human).__name__} in "
+            f"{human.domain.name}; see load_guide"
+        )

@@ -1,0 +1,61 @@
+"""Training of the amortized guide by the ELBO."""
+
+import itertools
+
+import pytest
+import torch
+
+from mirror_ppl.inference.amortized_guide import AmortizedGuide, reference_places
+from mirror_ppl.models.toy import ToyHuman
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training import guide_elbo
+from mirror_ppl.training.guide import GuideOptions, train_guide
+from mirror_ppl.training.guide_elbo import ELBOTraining, simulated_groups
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return ToyHuman(load_self_model(shipped_weights("driving"))[0])
+
+
+@pytest.fixture(scope="module")
+def group(toy):
+    generator = torch.Generator().manual_seed(0)
+    return next(simulated_groups(toy, (2,), generator))
+
+
+def compilation_loss(network, group):
+    """Mean negative log density of the truth."""
+    with torch.no_grad():
+        density = network.density(group.log_evidence[:, 0], group.steps[:, 0])
+        return float(-density.log_prob(group.place).mean())
+
+
+def test_a_group_is_what_was_simulated(toy, group):
+    people = guide_elbo.GROUP
+    assert group.compiled.people == people
+    assert group.log_evidence.shape == (people, 1, 64)
+    assert group.place.shape == (people, 2)
+    recorded = group.compiled.table.steps.sum((1, 2))
+    assert torch.equal(group.steps[:, 0], recorded)
+
+
+def test_the_elbo_teaches_the_network_where_people_are(toy, group):
+    torch.manual_seed(0)
+    network = AmortizedGuide(reference_places(toy)).eval()
+    before = compilation_loss(network, group)
+    training = ELBOTraining(network, itertools.repeat(group), 3e-3)
+    losses = [training.step() for _ in range(120)]
+    assert sum(losses[-20:]) / 20 < sum(losses[:5]) / 5
+    # It is not told the truth, but gets nearer to it.
+    assert compilation_loss(network, group) < before - 0.2
+
+
+def test_training_takes_as_many_steps_as_asked(toy, monkeypatch):
+    taken = []
+    monkeypatch.setattr(ELBOTraining, "step", lambda self: taken.append(1))
+    options = GuideOptions(people=10, rounds=(1,), steps=7, elbo_steps=5, together=10)
+    train_guide(toy, options, 0)
+    assert len(taken) == 5
+    with pytest.raises(ValueError, match="elbo_steps must be at least 0, not -1"):
+        GuideOptions(elbo_steps=-1)

@@ -1,0 +1,541 @@
+"""Every guide against a person whose posterior is known exactly, and what guides have in common."""
+
+import json
+import math
+from dataclasses import replace
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+from running import command
+from scipy import stats
+from test_views import ragged
+
+from mirror_ppl import calibrate as calibrate_command
+from mirror_ppl import fit, simulate, train
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
+from mirror_ppl.inference import importance
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
+from mirror_ppl.inference.amortized import AmortizedOptions, evidence_of, sample_amortized
+from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, reference_places
+from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
+from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
+from mirror_ppl.inference.nuts import NUTSOptions
+from mirror_ppl.inference.results import fitting
+from mirror_ppl.inference.sampler import Sampler
+from mirror_ppl.inference.svi import SVIOptions
+from mirror_ppl.likelihood.enumeration import acts_on_beliefs
+from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import build_view_table, rounds_of
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.prior import scalar_sites, unconstrained
+from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.toy import RATES, ToyHuman, toy_posterior
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training import guide as guide_training
+from mirror_ppl.training.guide import GuideOptions, simulate_examples, train_guide
+from mirror_ppl.training.guide_file import load_guide, network_for, save_guide
+
+DRAWS = 400
+TRAINING = GuideOptions(people=150, rounds=(1, 3), steps=600, batch=64, together=50)
+
+
+@pytest.fixture(scope="module")
+def self_model():
+    return load_self_model(shipped_weights("driving"))[0]
+
+
+@pytest.fixture(scope="module")
+def toy(self_model):
+    return ToyHuman(self_model)
+
+
+@pytest.fixture(scope="module")
+def recordings(toy):
+    generator = torch.Generator().manual_seed(3)
+    return play_rounds(toy, prior_people(toy, 6, generator), 3, "fog", generator)
+
+
+@pytest.fixture(scope="module")
+def network(toy):
+    return train_guide(toy, TRAINING, seed=0)[0]
+
+
+def options_of(guide):
+    return InferenceOptions(guide, DRAWS, SVIOptions(steps=400) if guide == "svi" else None)
+
+
+QUICK = {
+    "importance": ImportanceOptions(256, 100.0),
+    "amortized": AmortizedOptions(256, 100.0),
+}
+"""Settings of the engines that are calibrated here."""
+
+
+def bound(variance, draws):
+    """What a mean of draws may be off by once in a million."""
+    return -stats.norm.ppf(5e-7) * (variance / draws) ** 0.5
+
+
+# --- against the exact posterior --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("guide", ["importance", "amortized"])
+def test_importance_finds_the_exact_posterior(toy, recordings, network, guide):
+    found = infer(toy, recordings, options_of(guide), 1, network)
+    exact = toy_posterior(toy, recordings)
+    # Resampled draws count for less than independent ones.
+    worth = DRAWS / 4
+    for site in RATES:
+        value = found.draws[site][..., 0].double()
+        assert value.shape == (DRAWS, 6)
+        off = (value.mean(0) - exact.mean(site)).abs()
+        assert (off < bound(exact.variance(site), worth)).all()
+        assert (value.var(0) / exact.variance(site) - 1).abs().max() < 0.8
+    bins = torch.arange(exact.reach.shape[1])[:, None, None]
+    share = (found.draws["reach"][..., 0] == bins).double().mean(1).T
+    assert (
+        (share - exact.reach).abs() < bound(exact.reach * (1 - exact.reach) + 1e-4, worth)
+    ).all()
+    assert (found.pareto_k < 0.7).all()
+
+
+def test_variational_posteriors_are_about_right(toy, recordings):
+    found = infer(toy, recordings, options_of("svi"), 1)
+    exact = toy_posterior(toy, recordings)
+    bins = torch.arange(exact.reach.shape[1])[:, None, None]
+    share = (found.draws["reach"][..., 0] == bins).double().mean(1).T
+    assert (share - exact.reach).abs().sum(-1).max() / 2 < 0.3
+    for site in RATES:
+        off = (found.draws[site][..., 0].double().mean(0) - exact.mean(site)).abs()
+        assert (off < 1.0 * exact.variance(site).sqrt()).all()
+    assert found.pareto_k is None and len(found.losses) == 400
+
+
+def test_hamiltonian_draws_are_of_the_exact_posterior(toy, recordings):
+    one = recordings.select_people([0])
+    found = infer(toy, one, InferenceOptions("nuts", 150), 1)
+    exact = toy_posterior(toy, one)
+    for site in RATES:
+        off = (found.draws[site][..., 0].double().mean(0) - exact.mean(site)).abs()
+        assert (off < bound(exact.variance(site), 150 / 5)).all()
+    bins = torch.arange(exact.reach.shape[1])[:, None, None]
+    share = (found.draws["reach"][..., 0] == bins).double().mean(1).T
+    assert (share - exact.reach).abs().sum(-1).max() / 2 < 0.35
+    assert list(found.draws) == ["reach", *RATES]
+
+
+def test_the_exact_posterior_by_hand(toy, recordings):
+    """Of one person, by running the program for every bin and many rates."""
+    one = recordings.select_people([2]).select_rounds([0, 1])
+    table = build_view_table(toy, one)
+    exact = toy_posterior(toy, one)
+    grid = (torch.arange(60) + 0.5) / 60
+    first, second = torch.meshgrid(grid, grid, indexing="ij")
+    sampler = Sampler(toy, table)
+    policy = {"in_sight": first.reshape(-1, 1, 1), "otherwise": second.reshape(-1, 1, 1)}
+    joint = sampler._joint(policy, 3600).double()
+    for site, (a, b) in RATES.items():
+        joint = joint + dist.Beta(a, b).log_prob(policy[site].flatten())[:, None]
+    weight = torch.softmax(joint.flatten(), 0).view(joint.shape)
+    torch.testing.assert_close(weight.sum(0), exact.reach[0], atol=2e-3, rtol=0)
+    for site in RATES:
+        mean = (weight.sum(1) * policy[site].flatten()).sum()
+        torch.testing.assert_close(mean, exact.mean(site)[0], atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("guide", ["importance", "amortized"])
+def test_importance_is_calibrated(toy, network, guide):
+    options = CalibrationOptions(people=120, rounds=(1, 3), batch=60)
+    result = calibrate(toy, Infer(toy, guide, network), options, "fog", seed=5)
+    assert result.table()["p_value"].min() > 1e-5
+
+
+class Infer:
+    """What :func:`calibrate` asks for."""
+
+    def __init__(self, human, guide, network, change=lambda name, value: value):
+        self.human, self.guide, self.network, self.change = human, guide, network, change
+
+    def __call__(self, recordings, seed):
+        options = InferenceOptions(self.guide, 99, QUICK[self.guide])
+        found = infer(self.human, recordings, options, seed, self.network)
+        draws = {name: self.change(name, value) for name, value in found.draws.items()}
+        return Inferred(draws, found.pareto_k)
+
+
+@pytest.mark.parametrize("kind", ["narrow", "shifted"])
+def test_calibration_notices_wrong_posteriors(toy, network, kind):
+    def wrong(name, value):
+        if name == "reach":
+            return value
+        if kind == "narrow":
+            return value.mean(0) + 0.5 * (value - value.mean(0))
+        return value + 0.5 * value.std(0)
+
+    options = CalibrationOptions(people=120, rounds=(3,), batch=120)
+    result = calibrate(toy, Infer(toy, "amortized", network, wrong), options, "fog", seed=5)
+    assert {site for site, _ in result.rejected} == set(RATES)
+
+
+# --- weights ----------------------------------------------------------------------------------
+
+
+def test_weights_do_not_depend_on_what_was_proposed(toy, recordings):
+    table = build_view_table(toy, recordings.select_people([1]))
+    exact = toy_posterior(toy, recordings.select_people([1]))
+    for mean, width in ((0.0, 1.0), (-1.0, 2.0)):
+        torch.manual_seed(0)
+        sampler = Sampler(toy, table)
+        sampler.draw(500)
+        sampler.propose(dist.Normal(torch.full((2,), mean), width).to_event(1), 1500)
+        found = sampler.weighted()
+        for site in RATES:
+            value = (found.log_weights.exp() * found.policy[site].flatten()).sum()
+            off = abs(float(value - exact.mean(site)[0]))
+            assert off < float(bound(exact.variance(site)[0], found.effective / 2))
+
+
+def test_weights_that_cannot_be_relied_on_are_told(toy, recordings):
+    table = build_view_table(toy, recordings.select_people([1]))
+    torch.manual_seed(0)
+    sampler = Sampler(toy, table)
+    sampler.draw(1)
+    sampler.propose(dist.Normal(torch.full((2,), 6.0), 0.3).to_event(1), 400)
+    assert sampler.weighted().pareto_k > 0.7
+
+
+def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
+    table = build_view_table(toy, recordings.select_people([0]))
+    whole, pruned = Sampler(toy, table), Sampler(toy, table)
+    for sampler in (whole, pruned):
+        torch.manual_seed(0)
+        sampler.draw(100)
+    pruned.prune(0.5)
+    kept = torch.isin(whole.combinations.first, pruned.combinations.first)
+    assert 0 < int(kept.sum()) < len(whole.combinations)
+    torch.manual_seed(1)
+    policy, joint = whole._policies[0], whole._joints[0]
+    assert torch.equal(pruned._joints[0], joint[:, kept])
+    torch.testing.assert_close(pruned._joint(policy, len(joint)), joint[:, kept])
+    behind = (joint.max() - joint).amin(0)
+    assert torch.equal(kept, behind <= 0.5)
+
+
+@pytest.mark.parametrize("guide", ["importance", "svi"])
+def test_models_with_little_to_infer(toy, recordings, guide):
+    """Sight alone, and an implant that actions do not depend on."""
+    some, few = recordings.select_people([0]), SVIOptions(steps=2) if guide == "svi" else None
+
+    class OnlySight(ToyHuman):
+        def act(self, implants, belief, values):
+            rate = torch.where(belief[..., 0] > 0, 0.8, 0.1)
+            return torch.stack([torch.log1p(-rate), torch.log(rate)], -1)
+
+    class OnlyReach(OnlySight):
+        def prior(self):
+            like = next(self.self_model.parameters())
+            bins = like.new_ones(7) / 7
+            return {"reach": pyro.sample("reach", dist.Categorical(bins))}
+
+    human = OnlySight(toy.self_model)
+    draws = infer(human, some, InferenceOptions(guide, 40, few), 0).draws
+    assert draws["reach"].shape == draws["in_sight"].shape == (40, 1, 1)
+    if guide == "importance":  # svi needs a continuous site for its guide
+        draws = infer(OnlyReach(toy.self_model), some, InferenceOptions(guide, 40), 0).draws
+        assert list(draws) == ["reach"] and draws["reach"].shape == (40, 1, 1)
+
+
+def test_a_prior_that_depends_on_what_is_seen_is_refused(toy, recordings):
+    class Hierarchical(ToyHuman):
+        def prior(self):
+            implants = super().prior()
+            far = (implants["reach"] > 2).float()
+            implants["in_sight"] = pyro.sample("depends", dist.Beta(1 + far, 2 - far))
+            return implants
+
+    human = Hierarchical(toy.self_model)
+    for guide in ("importance", "svi"):
+        with pytest.raises(HumanModelError, match='"depends" depends on a discrete site'):
+            infer(human, recordings, InferenceOptions(guide, 5), 0)
+
+
+def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):
+    nobody = ragged(recordings, [[]] * 6)
+    for guide in ("importance", "amortized"):
+        found = infer(toy, nobody, options_of(guide), 2, network)
+        values = found.draws["otherwise"][..., 0].flatten()
+        assert stats.kstest(values.numpy(), stats.beta(1, 4).cdf).pvalue > 1e-4
+        counts = torch.bincount(found.draws["reach"].flatten(), minlength=7)
+        assert stats.chisquare(counts.numpy()).pvalue > 1e-5
+
+
+# --- what the amortized guide reads -----------------------------------------------------------
+
+
+def sightings_of(human, recordings, person, order):
+    builder = ViewTableBuilder(human, guide_screening())
+    rounds = list(rounds_of(recordings, person))
+    for number in order:
+        builder.add(*rounds[number])
+    return builder
+
+
+def test_the_order_of_rounds_does_not_matter(toy, recordings, network):
+    forward = sightings_of(toy, recordings, 0, [0, 1, 2])
+    backward = sightings_of(toy, recordings, 0, [2, 0, 1])
+    one, other = evidence_of(forward), evidence_of(backward)
+    torch.testing.assert_close(one.log_evidence, other.log_evidence)
+    assert one.steps == other.steps == 45
+    found = []
+    for builder in (forward, backward):
+        torch.manual_seed(4)
+        found.append(sample_amortized(toy, network, builder))
+    torch.testing.assert_close(found[0].log_weights, found[1].log_weights, atol=1e-4, rtol=1e-3)
+
+
+def test_evidence_adds_up_by_hand(toy, recordings):
+    builder = sightings_of(toy, recordings, 3, [0, 1])
+    evidence = evidence_of(builder)
+    exact = torch.zeros(64)
+    two = recordings.select_people([3]).select_rounds([0, 1])
+    table = build_view_table(toy, two)
+    for way in range(64):
+        policy = {name: value[way] for name, value in evidence.ways.items()}
+        likelihood = log_likelihoods(toy, policy, table)[0]
+        views = table.index[0]
+        exact[way] = torch.logsumexp(likelihood[views].sum(0) - math.log(7), 0)
+    torch.testing.assert_close(evidence.log_evidence, exact, atol=1e-3, rtol=0)
+
+
+def test_a_guide_learns_and_starts_at_the_prior_s_place(toy):
+    guide, quality = train_guide(toy, TRAINING, seed=1)
+    assert quality["learned"] == pytest.approx(quality["prior_loss"] - quality["loss"])
+    assert quality["learned"] > 0.3
+    place = guide.density(torch.zeros(64), torch.tensor(0)).sample((2000,))
+    assert place.shape == (2000, 2) and place.isfinite().all()
+
+
+def test_the_guide_is_a_program_with_the_density_it_says(toy, recordings, network):
+    evidence = evidence_of(sightings_of(toy, recordings, 0, [0]))
+    log_evidence, steps = evidence.log_evidence[None], torch.tensor([evidence.steps])
+    sites = scalar_sites(toy)
+    trace = pyro.poutine.trace(network).get_trace(sites, log_evidence, steps)
+    values = {site: trace.nodes[site]["value"] for site in RATES}
+    place = unconstrained(sites, {site: value[None] for site, value in values.items()})
+    expected = network.density(evidence.log_evidence, steps[0]).log_prob(place)
+    for column, site in enumerate(sites.values()):
+        value = site(place[:, column])
+        expected = expected - site.log_abs_det_jacobian(place[:, column], value)
+    found = trace.log_prob_sum()
+    torch.testing.assert_close(found, expected.sum(), atol=1e-4, rtol=1e-4)
+
+
+def test_training_goes_on_where_it_was(toy, tmp_path):
+    options = GuideOptions(people=12, rounds=(1, 2), steps=1, together=4)
+    path = tmp_path / "guide.checkpoint"
+
+    def stop(name, done, total, message):
+        if done == 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_examples(toy, options, 0, stop, path)
+    done = []
+    whole = simulate_examples(toy, options, 0, lambda *told: done.append(told[1]), path)
+    assert done == [8, 12]
+    again = simulate_examples(toy, options, 0)
+    for name, value in vars(again).items():
+        assert torch.equal(getattr(whole, name), value), name
+    with pytest.raises(CheckpointError, match="other options"):
+        simulate_examples(toy, options, 1, checkpoint=path)
+    # Nor is another model gone on with, even one of the same file.
+    other = Other(toy.self_model)
+    assert run_identity(Peeking(toy.self_model), None, []) != run_identity(other, None, [])
+    with pytest.raises(CheckpointError, match="other options"):
+        simulate_examples(other, options, 0, checkpoint=path)
+
+
+# --- one interface ----------------------------------------------------------------------------
+
+
+def test_people_do_not_depend_on_who_else_is_there(toy, recordings, network):
+    for guide in ("importance", "amortized"):
+        together = infer(toy, recordings.select_people([0, 1]), options_of(guide), 0, network)
+        alone = infer(toy, recordings.select_people([0]), options_of(guide), 0, network)
+        for name, value in alone.draws.items():
+            assert torch.equal(together.draws[name][:, :1], value)
+            assert value.dtype == (torch.long if name == "reach" else torch.float)
+
+
+def test_inference_goes_on_from_its_checkpoint(toy, recordings, tmp_path, monkeypatch):
+    monkeypatch.setattr(importance, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    run = (tmp_path / "fit.checkpoint", "this run")
+
+    def stop(name, done, total, message):
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        infer(toy, recordings, options_of("importance"), 0, None, stop, run)
+    done = []
+    resumed = infer(
+        toy, recordings, options_of("importance"), 0, None, lambda *told: done.append(told[1]), run
+    )
+    assert done == [4, 5, 6]
+    whole = infer(toy, recordings, options_of("importance"), 0)
+    for name, value in whole.draws.items():
+        assert torch.equal(resumed.draws[name], value)
+    assert torch.equal(resumed.pareto_k, whole.pareto_k)
+    with pytest.raises(CheckpointError, match="other options"):
+        infer(toy, recordings, options_of("importance"), 0, checkpoint=(run[0], "another"))
+
+
+class Other(ToyHuman):
+    """Of this file, too."""
+
+
+class Peeking(ToyHuman):
+    """Acts on what is within reach without believing in it."""
+
+    def act(self, implants, belief, values):
+        far = (implants["reach"] > 3)[..., None]
+        seen = torch.where(far, 1.0, belief)
+        return super().act(implants, seen, values)
+
+
+def test_models_whose_views_are_not_enough_are_refused(self_model, recordings):
+    human = Peeking(self_model)
+    some = recordings.select_people([0]).select_rounds([0])
+    table = build_view_table(human, some)
+    assert not acts_on_beliefs(human, table)
+    assert acts_on_beliefs(ToyHuman(self_model), table)
+    with pytest.raises(HumanModelError, match="only the engines svi and nuts"):
+        infer(human, some, InferenceOptions("importance"), 0)
+    for engine, few in (("svi", SVIOptions(steps=2)), ("nuts", NUTSOptions(warmup=5))):
+        draws = infer(human, some, InferenceOptions(engine, 50, few), 0).draws
+        assert draws["reach"].shape == (50, 1, 1)
+
+
+def test_guides_that_are_not_there(toy, recordings):
+    with pytest.raises(UnknownNameError, match=r'unknown engine "magic"; known: .*importance'):
+        InferenceOptions("magic")
+    with pytest.raises(ValueError, match="draws must be from 1 to 100000, not 0"):
+        InferenceOptions(draws=0)
+    with pytest.raises(ValueError, match="needs its network"):
+        infer(toy, recordings, InferenceOptions("amortized"), 0)
+
+
+def test_the_package_s_own_model_and_its_prior(self_model):
+    human = HumanModel(self_model)
+    some = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    some = some.select_people([0]).select_rounds([0, 1])
+    found = infer(
+        human, some, InferenceOptions("importance", 50, settings=ImportanceOptions(128, 10.0)), 0
+    )
+    assert list(found.draws)[:4] == [f"sight_{name}" for name in human.domain.directions]
+    assert found.draws["residual_in"].shape[:3] == (50, 1, 1)
+    guide = AmortizedGuide(reference_places(human))
+    assert guide.ways.shape == (64, 2)
+    untrained = sample_amortized(human, guide, sightings_of(human, some, 0, [0, 1]))
+    assert untrained.effective > 10  # weights make up for what it has not learned
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def test_a_guide_is_read_as_it_was_written(toy, network, tmp_path):
+    path = tmp_path / "toy.safetensors"
+    save_guide(network, toy, path, {"quality": {"loss": 1.0}})
+    again, card = load_guide(path, toy)
+    assert card == {"quality": {"loss": 1.0}}
+    for name, value in network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value)
+    assert network_for("importance", path, toy) is None
+    assert isinstance(network_for("amortized", path, toy), AmortizedGuide)
+
+
+def test_guides_of_something_else_are_refused(toy, network, tmp_path):
+    path = tmp_path / "toy.safetensors"
+    save_guide(network, toy, path, {})
+    other = HumanModel(toy.self_model)
+    with pytest.raises(AssetError, match="is for human model ToyHuman, not mirror; train a"):
+        load_guide(path, other)
+
+    class Changed(ToyHuman):
+        def prior(self):
+            rate = pyro.sample("in_sight", dist.Beta(5.0, 2.0))
+            with pyro.poutine.block(hide=["in_sight"]):
+                return super().prior() | {"in_sight": rate}
+
+    Changed.__name__ = "ToyHuman"
+    with pytest.raises(AssetError, match="is for another prior"):
+        load_guide(path, Changed(toy.self_model))
+    with pytest.raises(AssetError, match="not a guide of this program"):
+        load_guide(shipped_weights("driving"), toy)
+    path.write_bytes(b"nonsense")
+    with pytest.raises(AssetError, match="cannot be read"):
+        load_guide(path, toy)
+
+
+def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, capsys):
+    (tmp_path / "toy.py").write_text(
+        "from mirror_ppl.models.toy import ToyHuman\n\n\nclass Toy(ToyHuman):\n    pass\n"
+    )
+    monkeypatch.setattr(
+        guide_training, "GuideOptions", lambda people: replace(TRAINING, people=people, steps=50)
+    )
+    path, human = tmp_path / "guide.safetensors", ("--human-model", f"{tmp_path / 'toy.py'}:Toy")
+    assert command(train, "--what", "guide", "--people", 40, *human, "--out", path) == 0
+    out = capsys.readouterr().out
+    assert "--what guide" in out and "--people 40" in out and "--phases" not in out
+    assert "learned" in out
+    assert command(train, "--card", path) == 0
+    assert "nats a person" in capsys.readouterr().out
+    assert [each.name for each in tmp_path.iterdir() if "checkpoint" in each.name] == []
+    guide = ("--guide", "amortized", "--guide-file", path)
+    small = ("--people", 10, "--rounds", 1, "--draws", 9, "--jobs", 1)
+    assert command(calibrate_command, *human, *guide, *small, "--out", tmp_path / "c") == 0
+    demos = tmp_path / "some.nc"
+    assert command(simulate, "--people", 1, "--rounds", 2, "--out", demos) == 0
+    fit_args = ("--demos", demos, "--draws", 9, "--out", tmp_path / "f")
+    assert command(fit, *human, *guide, *fit_args) == 0
+    summary = json.loads((tmp_path / "f" / "summary.json").read_text())
+    assert summary["guide"] == "amortized"
+    assert "pareto_k" in summary["people"][0]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("--what", "nothing"), "--what must be self-model or guide, not nothing"),
+        (("--what", "guide", "--people", "3"), "--people must be at least 10, not 3"),
+        (("--what", "guide", "--device", "cuda"), "--device is for --what self-model"),
+        (("--what", "guide", "--phases", "3"), "--phases is for --what self-model"),
+        (("--people", "30"), "--people is for --what guide"),
+        (("--what", "guide", "--out", "."), "it is not a regular file"),
+    ],
+)
+def test_impossible_trainings(args, message, tmp_path, capsys):
+    assert command(train, "--out", tmp_path / "x", *args) == 2
+    assert message in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
+def test_people_whose_weights_cannot_be_relied_on_are_named(tmp_path, monkeypatch, capsys):
+    def doubtful(*args):
+        found = infer(*args)
+        return replace(found, pareto_k=torch.tensor([0.9, 0.2]))
+
+    monkeypatch.setattr(fitting, "infer", doubtful)
+    (tmp_path / "toy.py").write_text(
+        "from mirror_ppl.models.toy import ToyHuman\n\n\nclass Toy(ToyHuman):\n    pass\n"
+    )
+    demos = tmp_path / "some.nc"
+    assert command(simulate, "--people", 2, "--rounds", 2, "--out", demos) == 0
+    human = ("--human-model", f"{tmp_path / 'toy.py'}:Toy")
+    assert command(fit, "--demos", demos, *human, "--draws", 9, "--out", tmp_path / "f") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "not to be relied on for person-01 (Pareto k above 0.7)" in out

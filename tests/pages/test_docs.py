@@ -1,0 +1,589 @@
+"""What is shown is true: commands, links, examples, tables and numbers of README and pages."""
+
+import importlib
+import re
+import shlex
+from collections import defaultdict
+from dataclasses import asdict
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+import tyro
+from example_course import gone_through
+from paths import ROOT
+from pyro import poutine
+from pyro.infer import TraceEnum_ELBO, config_enumerate
+
+from mirror_ppl import assist, console, evaluate
+from mirror_ppl.__main__ import COMMANDS
+from mirror_ppl.data import load_demonstrations
+from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.evaluation.assistance import COMMUNICATORS
+from mirror_ppl.inference.adaptive_importance import PRUNING_DRAWS, ImportanceOptions
+from mirror_ppl.inference.engines import InferenceOptions
+from mirror_ppl.inference.results.fitting import fit_people
+from mirror_ppl.inference.svi import SVIOptions, continuous_guide
+from mirror_ppl.likelihood.compiled import compile
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.densities import PLATES
+from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import Screening, build_view_table
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.variants import VARIANTS
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.people import PEOPLE
+from mirror_ppl.training import views as training_views
+from mirror_ppl.training.self_model import SelfModelOptions
+
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLE = "docs/examples/late_reactions.py:LatePerson"
+
+
+def name_of(path):
+    return path.name
+
+
+def page(name):
+    return (ROOT / name).read_text()
+
+
+def blocks(text, language):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def commands():
+    """Every line of a console block, with the page that it is on."""
+    return [
+        (p.name, line)
+        for p in PAGES
+        for block in blocks(p.read_text(), "console")
+        for line in block.strip().splitlines()
+    ]
+
+
+def anchors(text):
+    """Anchors of the headings, as they are made on the usual hosts of repositories."""
+    without_code = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    headings = re.findall(r"^#+ (.+)$", without_code, re.MULTILINE)
+    return {
+        re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings
+    }
+
+
+def table_of(text, heading):
+    """Rows of the first table whose header begins with ``heading``, as lists of cells."""
+    table = re.search(rf"^\| {re.escape(heading)} \|.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE)
+    assert table, f"no table {heading}"
+    return [
+        [cell.strip() for cell in row.strip("|").split(" |")]
+        for row in table[1].strip().splitlines()
+    ]
+
+
+def make_targets():
+    return set(re.findall(r"^([a-z]+):", page("Makefile"), re.MULTILINE))
+
+
+def run_command(line, *further):
+    module = importlib.import_module(shlex.split(line)[2])
+    args = [*shlex.split(line)[3:], *further]
+    return console.run(module.Options, module.main, prog=module.PROGRAM, description="", args=args)
+
+
+@pytest.fixture(scope="module")
+def self_model():
+    return load_self_model(shipped_weights("driving"))[0]
+
+
+# --- commands ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("where", "line"), commands())
+def test_every_command_is_real(where, line):
+    words = shlex.split(line)
+    if words[0] == "make":
+        assert set(words[1:]) <= make_targets()
+        return
+    assert words[:2] == ["python", "-m"], f"{where} shows {line}"
+    module = importlib.import_module(words[2])
+    assert words[2].removeprefix("mirror_ppl.") in COMMANDS
+    options = vars(tyro.cli(module.Options, args=words[3:]))
+    # Whom to assist is told by the posterior, and whom to fit by recordings, unless it is said.
+    if module is evaluate:
+        assert evaluate._cells(evaluate.Options(**options))
+        return
+    domain = get_domain(options.get("domain") or "driving")
+    assert options.get("setting") in (*domain.settings, None)
+    assert options.get("population") in (*PEOPLE[domain.name].populations, None)
+    for option in ("card", "human_model"):
+        path = str(options.get(option) or "").partition(":")[0]
+        assert not path or path in VARIANTS or (ROOT / path).is_file()
+
+
+def test_commands_in_the_text_are_real():
+    for path in PAGES:
+        for module in re.findall(r"python -m ([\w.]+)", path.read_text()):
+            importlib.import_module(module if module != "mirror_ppl" else "mirror_ppl.__main__")
+        assert set(re.findall(r"`make ([a-z]+)", path.read_text())) <= make_targets()
+
+
+def test_the_readme_begins_with_the_picture_and_the_two_commands():
+    first = page("README.md").split("## ")[0]
+    assert "docs/images/sight.png" in first
+    assert blocks(first, "console") == ["make demo\nmake test\n"]
+
+
+# --- links ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
+def test_links_lead_somewhere(path):
+    text = re.sub(r"```.*?```", "", path.read_text(), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith("https://"):
+            continue
+        file, _, anchor = target.partition("#")
+        found = path.parent / file if file else path
+        assert found.exists(), f"{path.name} links to {target}"
+        assert not anchor or anchor in anchors(found.read_text()), f"{path.name}: {target}"
+
+
+def test_every_page_is_listed_in_the_readme():
+    for path in (ROOT / "docs").glob("*.md"):
+        assert f"docs/{path.name}" in page("README.md")
+
+
+# --- tables and numbers -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "heading", "options"),
+    [
+        ("docs/self_model.md", "Setting", SelfModelOptions()),
+        ("docs/human_model.md", "Setting of `svi` (`SVIOptions`)", SVIOptions()),
+        (
+            "docs/human_model.md",
+            "Setting of `importance` (`ImportanceOptions`)",
+            ImportanceOptions(),
+        ),
+    ],
+)
+def test_tables_of_settings_are_the_defaults(name, heading, options):
+    shown = {row[0].strip("`"): float(row[1]) for row in table_of(page(name), heading)}
+    settings = asdict(options)
+    settings.pop("kinds", None)  # told by the table of views
+    assert shown == {key: pytest.approx(float(value)) for key, value in settings.items()}
+
+
+def test_options_and_communicators_of_assist_are_told_as_they_are():
+    text, options = page("docs/communicator.md"), assist.Options()
+    shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
+    assert shown.pop("communicator") == "all of them" and options.communicator == ()
+    for name in ("horizon", "enumerate_above", "patience", "min_standard_errors"):
+        assert shown.pop(name) == "the domain's" and getattr(options, name) is None
+    assert shown == {name: str(getattr(options, name)) for name in shown}
+    first = " ".join(row[0] for row in table_of(text, "Communicator"))
+    assert tuple(re.findall(r"`([\w-]+)`", first)) == COMMUNICATORS
+
+
+def test_views_of_training_are_told_with_their_shares():
+    rows = {row[0]: row for row in table_of(page("docs/self_model.md"), "View")}
+    assert SelfModelOptions().kinds == training_views.KIND_PROBABILITIES
+    assert "`SelfModelOptions.kinds`" in page("docs/self_model.md")
+    assert {name: row[1] for name, row in rows.items()} == {
+        kind: f"{share:.0%}"
+        for kind, share in zip(training_views.KINDS, training_views.KIND_PROBABILITIES, strict=True)
+    }
+    told = [f"{training_views.ALIKE_PROBABILITY:.0%}", f"{training_views.TOLD_PROBABILITY:.0%}"]
+    assert re.findall(r"in (\d+%)", rows["sight"][2]) == told
+    share = f"in {training_views.ASSUMPTION_PROBABILITY:.0%}"
+    for name in ("docs/self_model.md", "docs/decisions.md"):
+        # Once for each assumption.
+        assert page(name).lower().count(share) == 2, name
+
+
+def test_priors_are_told_as_they_are(self_model):
+    human = HumanModel(self_model)
+    with pyro.plate("person", 1, dim=-2):
+        sites = poutine.trace(human.prior).get_trace().nodes
+    spread = sites["consistency"]["fn"]
+    rows = {
+        row[0].split()[0].strip("`"): row[1]
+        for row in table_of(page("docs/human_model.md"), "Site")
+    }
+    assert rows["sight_*"] == f"uniform over {len(human.domain.reach_bins)} bins"
+    assert (
+        rows["consistency"]
+        == f"LogNormal(log {spread.loc.exp().item():.0f}, {spread.scale.item():g})"
+    )
+    lapse = sites["lapse"]["fn"]
+    assert (
+        rows["lapse"] == f"Beta({lapse.concentration1.item():g}, {lapse.concentration0.item():g})"
+    )
+    assert rows["residual_in"] == "Normal(0, 48^-1/2), 49 x 8"
+    assert sites["residual_in"]["fn"].event_shape == (49, 8)
+    assert sites["residual_out"]["fn"].event_shape == (9, 2)
+    scale = sites["residual_out"]["fn"].base_dist.scale.max().item()
+    assert rows["residual_out"] == f"Normal(0, {scale:.1f}), 9 x 2"
+
+
+def test_shortcuts_are_told_with_their_tolerances():
+    text = page("docs/human_model.md")
+    assert f"more than {Screening().margin:.0f} nats" in text
+    assert f"of {Screening().policies} policies" in text
+    assert f"under each of {Screening().merge_policies} of those policies" in text
+    assert f"a grid of {Screening().resolution} nats" in text
+    assert f"the same at {SVIOptions().prune_margin:.0f} nats" in text
+    assert SVIOptions().prune_margin == ImportanceOptions().prune_margin
+    assert f"under {PRUNING_DRAWS} draws of the prior" in text
+
+
+def test_quality_of_the_self_model_is_that_of_the_card():
+    _, card = load_self_model(shipped_weights("driving"))
+    part = page("docs/self_model.md").split("<!-- numbers: self-model -->")[1]
+    shown = {row[0].replace(" ", "_"): float(row[1]) for row in table_of(part, "Measure")}
+    assert shown == {
+        name: pytest.approx(value, abs=6e-4) for name, value in card["quality"].items()
+    }
+
+
+# --- python on the pages ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """A folder in which a user has recorded two people and fitted them with the example."""
+    folder = tmp_path_factory.mktemp("user")
+    (folder / "docs").symlink_to(ROOT / "docs")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        simulate = next(line for _, line in commands() if "simulate" in line and "runs/" in line)
+        assert run_command(simulate, "--people", "2", "--rounds", "4") == 0
+        example = next(line for _, line in commands() if EXAMPLE in line)
+        small = ("--demos", "runs/people.nc", "--steps", "3", "--draws", "8", "--out", "runs/demo")
+        assert run_command(example, *small) == 0
+    return folder
+
+
+def test_the_commands_of_the_readme_write_what_it_says(results):
+    demo = results / "runs" / "demo"
+    names = {path.name for path in demo.iterdir()}
+    assert names == {"posterior.nc", "summary.json", "sight.png", "samples.png", "open.png"}
+    assert all(f"`{name}`" in page("README.md").replace("runs/demo/", "") for name in names)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "README.md",
+        "docs/people.md",
+        "docs/self_model.md",
+        "docs/human_model.md",
+        "docs/extending.md",
+        "docs/trust.md",
+    ],
+)
+def test_python_blocks_run(name, results, monkeypatch):
+    shown = blocks(page(name), "python")
+    assert shown
+    monkeypatch.chdir(results)
+    exec("\n".join(shown), {"__name__": "page"})
+
+
+def test_python_of_the_communicator_runs(results, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ("--demos", f"{results}/runs/people.nc", "--steps", "3", "--draws", "64")
+    assert run_command("python -m mirror_ppl.fit", *small, "--out", "runs/demo") == 0
+    capsys.readouterr()
+    exec("\n".join(blocks(page("docs/communicator.md"), "python")), {"__name__": "page"})
+    assert "p(switch)" in capsys.readouterr().out
+
+
+def test_the_example_on_the_page_is_the_file():
+    source = page("docs/examples/late_reactions.py")
+    assert blocks(page("docs/extending.md"), "python")[0].strip() in source
+    source = page("docs/examples/distracted.py")
+    assert any(block.strip() in source for block in blocks(page("docs/extending.md"), "python"))
+
+
+def test_groups_and_variables_of_results_are_told(results):
+    import arviz as az
+
+    text = page("docs/human_model.md")
+    told = defaultdict(str)
+    for row in _filled(table_of(text, "Group")):
+        for group in re.findall(r"`(\w+)`", row[0]):
+            told[group] += f"{row[1]} {row[2]}; "
+    told["predictions_constant_data"] += told["constant_data"]
+    data = az.from_netcdf(results / "runs" / "demo" / "posterior.nc")
+    assert set(told) - set(data.groups()) == {"population", "newcomer"}  # of pooled people
+    for group in data.groups():
+        for name, variable in data[group].data_vars.items():
+            known = "`sight_*`" if name.startswith("sight_") else f"`{name}`"
+            known = "`truth_*`" if name.startswith("truth_") else known
+            assert known in told.get(group, "") or name == "late", f"{group}: {name}"
+            own = [
+                d for d in variable.dims if d in ("person", "round", "test_round", "step", "time")
+            ]
+            assert all(dimension in told[group] for dimension in own), f"{group}: {name} {own}"
+
+
+def _filled(rows):
+    """Rows whose empty first cells mean: as above."""
+    first = ""
+    for row in rows:
+        first = row[0].strip("| ") or first
+        yield [first, *row[1:]]
+
+
+# --- the worked example -----------------------------------------------------------------------
+
+
+def test_the_example_has_one_late_a_person(results):
+    import arviz as az
+
+    data = az.from_netcdf(results / "runs" / "demo" / "posterior.nc")
+    for group in ("posterior", "prior"):
+        late = data[group]["late"]
+        assert late.dims == ("chain", "draw", "person")
+        assert late.sizes["person"] == 2
+        assert ((late > 0) & (late < 1)).all()
+        assert (late.std("draw") > 0).all()
+    assert data.posterior.attrs["human_model"] == "LatePerson"
+
+
+def test_late_gets_a_gradient_for_each_person(results, self_model):
+    human = load_human_model(f"{ROOT}/{EXAMPLE}", self_model)
+    check_contract(human)
+    recordings = load_demonstrations(results / "runs" / "people.nc").select_rounds(slice(0, 3))
+    compiled = compile(human, recordings, screening=Screening())
+    with pyro.settings.context(module_local_params=True):
+        guide = continuous_guide(compiled)
+        model = config_enumerate(compiled.program, "parallel")
+        TraceEnum_ELBO(max_plate_nesting=PLATES)(model, guide)().backward()
+    gradients = {name: value.grad for name, value in guide.named_parameters()}
+    for part in ("locs", "scales"):
+        gradient = next(g for name, g in gradients.items() if name.startswith(f"{part}.late"))
+        assert gradient.shape == (2, 1)
+        assert (gradient.abs() > 1e-4).all()
+
+
+def test_late_is_the_mixture_that_it_says(self_model):
+    human = load_human_model(f"{ROOT}/{EXAMPLE}", self_model)
+    own = torch.randn(2, 5, self_model.latent)
+
+    def act(model, sites, belief):
+        with poutine.condition(data=sites), pyro.plate("person", 2, dim=-2):
+            return model.act(model.prior(), belief, model.action_values(belief)).exp()
+
+    sites = known(human, 2, reach_bin=2)
+    sites["residual_in"] = torch.randn(2, 1, 49, 8)
+    sites["residual_out"] = torch.randn(2, 1, 9, 2)
+    prompt = act(HumanModel(self_model), sites, own)
+    late = torch.tensor([0.25, 0.75])[:, None]
+    # Step after step: at the first there is no belief before.
+    before = torch.cat([own[:, :1], own[:, :-1]], 1)
+    mixed = act(human, sites | {"late": late}, torch.cat([own, before], -1))
+    torch.testing.assert_close(mixed[:, 0], prompt[:, 0])
+    share = late[..., None]
+    expected = (1 - share) * prompt[:, 1:] + share * prompt[:, :-1]
+    torch.testing.assert_close(mixed[:, 1:], expected)
+
+
+def test_a_late_person_remembers_the_belief_of_one_step_before(self_model, results):
+    human, prompt = load_human_model(f"{ROOT}/{EXAMPLE}", self_model), HumanModel(self_model)
+    recordings = load_demonstrations(results / "runs" / "people.nc")
+    rounds = recordings.shape[1] * recordings.num_people
+    steps = recordings.shape[2]
+    observation = {
+        name: value.flatten(0, 1)[:, :steps] for name, value in recordings.observation().items()
+    }
+    told = {name: value.flatten(0, 1) for name, value in recordings.told.items()}
+    actions = recordings.actions.flatten(0, 1)
+    sites = {
+        name: value[:1, 0].expand(rounds)
+        for name, value in known(human, 1, reach_bin=2).items()
+        if not value.is_floating_point()
+    }
+    own = gone_through(prompt, sites, observation, told, actions)
+    now, before = gone_through(human, sites, observation, told, actions).chunk(2, -1)
+    torch.testing.assert_close(now, own)
+    torch.testing.assert_close(before[:, 1:], own[:, :-1])
+    torch.testing.assert_close(before[:, 0], own[:, 0])
+
+
+def known(human, people, reach_bin):
+    """Values of the sites of the package's own model: sight to a bin, little else."""
+    ones = torch.ones(people, 1)
+    sites = {f"sight_{direction}": reach_bin * ones.long() for direction in human.domain.directions}
+    return sites | {
+        "assumes_clear": 0 * ones.long(),
+        "assumes_closing": 0 * ones.long(),
+        "consistency": 3.0 * ones,
+        "lapse": 0.01 * ones,
+        "residual_out": torch.zeros(people, 1, 9, 2),
+    }
+
+
+@torch.no_grad()
+def test_a_late_person_is_told_from_a_prompt_one(self_model, generator):
+    late_person = type(load_human_model(f"{ROOT}/{EXAMPLE}", self_model))
+
+    class InFullView(late_person):
+        """Everybody sees everything, so that all the work goes into how they act."""
+
+        def perceive(self, implants, knowledge, observation, told, step):
+            everything = {
+                name: value[0, 0] for name, value in sites.items() if not value.is_floating_point()
+            }
+            return super().perceive(everything, knowledge, observation, told, step)
+
+    human = InFullView(self_model)
+    sites = known(human, 2, reach_bin=len(human.domain.reach_bins) - 1)
+    sites["late"] = torch.tensor([[0.9], [0.05]])
+    recordings = play_rounds(human, sites, 20, "clear", generator)
+
+    # Exact, given the other implants: one half lies far out in the tails of both posteriors.
+    table = build_view_table(human, recordings)
+    grid = torch.linspace(0.005, 0.995, 100)
+    log_weights = dist.Beta(1.0, 4.0).log_prob(grid)[:, None].repeat(1, 2)
+    for row, value in enumerate(grid):
+        data = sites | {"late": value.expand(2, 1)}
+        with poutine.condition(data=data), pyro.plate("person", 2, dim=-2):
+            log_weights[row] += log_likelihoods(human, human.prior(), table).sum(-1)
+    below_half = log_weights.softmax(0)[grid < 0.5].sum(0)
+    assert below_half[0] < 1e-3
+    assert below_half[1] > 1 - 1e-3
+
+    # So half divides the posteriors of the fit too, which does not know the other implants.
+    with torch.enable_grad():
+        fit = fit_people(human, recordings, InferenceOptions(draws=100), 0, 20)
+    late, prompt = (person["implants"]["late"] for person in fit.summary["people"])
+    assert late["median"] > 0.5 > prompt["q95"]
+    assert late["q05"] > prompt["q95"]
+
+
+# --- common mistakes --------------------------------------------------------------------------
+
+
+class NoSight(HumanModel):
+    def prior(self):
+        return {"late": pyro.sample("late", dist.Beta(1.0, 4.0))}
+
+
+class SamplesInAct(HumanModel):
+    def act(self, implants, belief, values):
+        late = pyro.sample("late", dist.Beta(1.0, 4.0))
+        return late[..., None] + super().act(implants, belief, values)
+
+
+class MissingDimensions(HumanModel):
+    def prior(self):
+        return super().prior() | {"late": pyro.sample("late", dist.Beta(1.0, 4.0))}
+
+    def act(self, implants, belief, values):
+        return implants["late"] + super().act(implants, belief, values)
+
+
+class LostAction(HumanModel):
+    def act(self, implants, belief, values):
+        return super().act(implants, belief, values)[..., :-1]
+
+
+class UntoldMemory(HumanModel):
+    def believe(self, belief, evidence, action, still=None):
+        return torch.cat([super().believe(belief, evidence, action, still).mean, belief], -1)
+
+
+class Probabilities(HumanModel):
+    def act(self, implants, belief, values):
+        return super().act(implants, belief, values).exp()
+
+
+class ReadsContinuous(HumanModel):
+    def perceive(self, implants, knowledge, observation, told, step):
+        assert "lapse" in implants or implants["lapse"]
+        return super().perceive(implants, knowledge, observation, told, step)
+
+
+class ManyValues(HumanModel):
+    def prior(self):
+        uniform = dist.Categorical(torch.ones(100) / 100)
+        return super().prior() | {"a": pyro.sample("a", uniform)}
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        assert (implants["a"] >= 0).all()
+        return super().perceive(implants, knowledge, observation, told, step)
+
+
+class SampledTwice(HumanModel):
+    def prior(self):
+        consistency = pyro.sample("consistency", dist.LogNormal(1.0, 0.2))
+        return super().prior() | {"consistency": consistency}
+
+
+class NotAnEvent(HumanModel):
+    def prior(self):
+        return super().prior() | {"late": pyro.sample("late", dist.Normal(torch.zeros(2, 3), 1.0))}
+
+
+class Endless(HumanModel):
+    def prior(self):
+        return super().prior() | {"late": pyro.sample("late", dist.Poisson(1.0))}
+
+
+class Parameter(HumanModel):
+    def prior(self):
+        return super().prior() | {"late": pyro.param("late", torch.tensor(0.1))}
+
+
+MISTAKES = [
+    NoSight,
+    SamplesInAct,
+    MissingDimensions,
+    LostAction,
+    UntoldMemory,
+    Probabilities,
+    ReadsContinuous,
+    ManyValues,
+    SampledTwice,
+    NotAnEvent,
+    Endless,
+    Parameter,
+]
+
+
+def documented():
+    """Messages of the page as patterns; three dots stand for anything."""
+    messages = [row[0].strip("`") for row in table_of(page("docs/extending.md"), "Message")]
+    return [re.escape(message).replace(r"\.\.\.", ".*") for message in messages]
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_raise_what_the_page_says(mistake, results, self_model):
+    recordings = load_demonstrations(results / "runs" / "people.nc")
+    human = mistake(self_model)
+    with pytest.raises(HumanModelError) as raised:
+        check_contract(human)
+        build_view_table(human, recordings)
+    message = " ".join(str(raised.value).split())
+    assert any(re.search(pattern, message) for pattern in documented()[3:]), message
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [("", ""), ("class Other: pass", ":Other"), ("1 / 0", ":Late")],
+    ids=["no class", "another class", "does not import"],
+)
+def test_files_that_are_no_human_model_are_refused_as_the_page_says(
+    content, name, tmp_path, self_model
+):
+    (tmp_path / "late.py").write_text(content)
+    with pytest.raises(HumanModelError) as raised:
+        load_human_model(f"{tmp_path}/late.py{name}", self_model)
+    assert any(re.search(pattern, str(raised.value)) for pattern in documented()[:3])
