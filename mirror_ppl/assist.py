@@ -60,12 +60,12 @@ class Options:
     unless given."""
     discount: float = 1.0
     """Worth of a reward one step later, from above 0 to 1."""
-    sure: float | None = None
+    min_standard_errors: float | None = None
     """How many standard errors of its gain a message has to gain to be sent; 0 is enough for the
     best on average. 2 in driving, 1 in search_rescue and 0 in bomb_defusal unless given."""
     patience: int | None = None
     """Steps over which a message is compared with saying it later; 1 compares with silence only."""
-    branch: float | None = None
+    enumerate_above: float | None = None
     """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
     course a draw; 0.1 in driving and 0.4 in the other domains unless given."""
     kl_weight: float = 1.0
@@ -97,10 +97,12 @@ class Options:
         check_numbers(self, "seed", "people_seed")
         if not 0 < self.discount <= 1:
             raise OptionError(f"--discount must be above 0 and at most 1, not {self.discount}")
-        if self.branch is not None and not 0 <= self.branch <= 1:
-            raise OptionError(f"--branch must be from 0 to 1, not {self.branch}")
-        if self.sure is not None and not self.sure >= 0:
-            raise OptionError(f"--sure must be at least 0, not {self.sure}")
+        if self.enumerate_above is not None and not 0 <= self.enumerate_above <= 1:
+            raise OptionError(f"--enumerate-above must be from 0 to 1, not {self.enumerate_above}")
+        if self.min_standard_errors is not None and not self.min_standard_errors >= 0:
+            raise OptionError(
+                f"--min-standard-errors must be at least 0, not {self.min_standard_errors}"
+            )
         if not 0 < self.kl_weight < math.inf:
             raise OptionError(f"--kl-weight must be a positive number, not {self.kl_weight}")
         if self.kl_measure not in ("kl", "squared"):
@@ -164,9 +166,9 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
         posterior.attributes["domain"],
         horizon=options.horizon,
         discount=options.discount,
-        branch=options.branch,
+        enumerate_above=options.enumerate_above,
         patience=options.patience,
-        sure=options.sure,
+        min_standard_errors=options.min_standard_errors,
         kl_weight=options.kl_weight,
         kl_measure=options.kl_measure,
     )

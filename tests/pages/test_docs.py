@@ -182,9 +182,9 @@ def test_tables_of_settings_are_the_defaults(name, heading, options):
 
 def test_options_and_communicators_of_assist_are_told_as_they_are():
     text, options = page("docs/communicator.md"), assist.Options()
-    shown = {row[0].strip("`-"): row[1] for row in table_of(text, "Option")}
+    shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
     assert shown.pop("communicator") == "all of them" and options.communicator == ()
-    for name in ("horizon", "branch", "patience", "sure"):
+    for name in ("horizon", "enumerate_above", "patience", "min_standard_errors"):
         assert shown.pop(name) == "the domain's" and getattr(options, name) is None
     assert shown == {name: str(getattr(options, name)) for name in shown}
     first = " ".join(row[0] for row in table_of(text, "Communicator"))
