@@ -6,8 +6,8 @@ import pytest
 from paths import EXAMPLES
 from running import command, command_on_cluster
 
-from mirror_ppl import assist, fit
 from mirror_ppl.arviz import az
+from mirror_ppl.commands import assist, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation import assistance_cells

@@ -7,7 +7,7 @@ import torch
 from running import command
 from scipy import stats
 
-from mirror_ppl import fit
+from mirror_ppl.commands import fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import InputError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
