@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
 from mirror_ppl.inference.amortized_guide import (
     PRIOR_DRAWS,
@@ -107,7 +108,7 @@ def main() -> None:
     rows: list[dict] = []
 
     def measure(name: str, network: AmortizedGuide, refine: int = 0) -> None:
-        settings = AmortizedOptions(PROPOSALS, stages=1, refine=refine)
+        settings = AmortizedOptions(PROPOSALS, ImportanceOptions(stages=0), refine)
         for rounds, person, builder in tested:
             torch.manual_seed(person)
             found = sample_amortized(human, network, builder, settings)

@@ -67,7 +67,7 @@ def main(options: Options) -> None:
     channels = Channels(human.domain)
     counts = [2 ** int(channels.join(human.domain.communicable(past.now)).sum()) for past in pasts]
     print(
-        f"{options.draws} draws, {person.eye_count} distinct ways to see; candidates: median "
+        f"{options.draws} draws, {person.percept_count} distinct ways to see; candidates: median "
         f"{median(counts):.0f}, largest {max(counts)}; {options.threads} threads",
         file=sys.stderr,
     )

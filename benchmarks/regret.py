@@ -18,7 +18,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from mirror_ppl import fit
+from mirror_ppl.commands import fit
 from mirror_ppl.communication import RoundSoFar
 from mirror_ppl.evaluation.assistance import PlannerOptions, Truth, play, speaker
 from mirror_ppl.evaluation.assistance_cells import Pairing

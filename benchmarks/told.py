@@ -23,7 +23,8 @@ from mirror_ppl.domains import Observation, Visibility, get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.course import go_through
+from mirror_ppl.models.belief_tracking import BeliefState, Transition
+from mirror_ppl.models.human import at_step, messages_at
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, assumption_sites, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import draw_starts, simulated_drivers
@@ -142,9 +143,23 @@ def tell(
 def divergence(person: Person, rounds: Told) -> Tensor:
     """Nats an action by which the model of a person misses their true probabilities."""
     human = person.human
-    implants = {name: value[0] for name, value in person.eyes.items()}
-    steps = go_through(human, implants, rounds.observation, rounds.told, rounds.actions)
-    belief = torch.stack([belief for _, belief in steps], 1).flatten(0, 1)[None]
+    implants = {name: value[0] for name, value in person.percepts.items()}
+    number, steps = rounds.actions.shape
+    row, none = torch.arange(number), torch.full((number, 1), len(human.domain.actions))
+    before = torch.cat([none, rounds.actions], 1)
+    states = BeliefState.initial(human, number).through(
+        [
+            Transition(
+                implants,
+                before[:, step],
+                at_step(rounds.observation, step),
+                messages_at(rounds.told, step),
+                row,
+            )
+            for step in range(steps)
+        ]
+    )
+    belief = torch.stack([state.believed for state in states], 1).flatten(0, 1)[None]
     predicted = person.act(belief, human.self_model.action_values(belief))[0]
     true = rounds.chances.flatten(0, 1)
     return (true * (true.clamp(min=1e-9).log() - predicted)).sum(-1).mean()

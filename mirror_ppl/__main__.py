@@ -3,21 +3,12 @@
 import sys
 from collections.abc import Sequence
 
+from mirror_ppl.commands import COMMANDS
 from mirror_ppl.console import guarded
 from mirror_ppl.errors import OptionError
 from mirror_ppl.version import __version__
 
 PROGRAM = "python -m mirror_ppl"
-
-COMMANDS = {
-    "fit": "infer what people see and how they decide from their recorded rounds",
-    "assist": "pair communicators with people, and see who helps how much",
-    "calibrate": "see whether posteriors are as sure as they have a right to be",
-    "compare": "compare human models by how well they predict what people do",
-    "evaluate": "compare MIRROR with its ablations and baselines, as the paper does",
-    "train": "train a domain's self-model",
-    "simulate": "record rounds of simulated people",
-}
 
 
 def overview() -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from mirror_ppl.checks import require_kind, seed_number, whole_number
 from mirror_ppl.communication.communicator import Communicator as PlannedCommunicator
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.console import usable_device
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
@@ -198,7 +198,9 @@ class Communicator(PlannedCommunicator):
             require_known(name, "setting", known)
         options = PlannerOptions.of(listener.human.domain.name, **settings)
         made = planner_of(planner, listener, options, seed_number(seed))
-        super().__init__(made.person, made.objective, made.search, made.sure, made.seed)
+        super().__init__(
+            made.person, made.objective, made.search, made.min_standard_errors, made.seed
+        )
 
 
 def load_recordings(

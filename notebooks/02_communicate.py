@@ -320,10 +320,10 @@ plot_action(decision)
 # - **Patience.** `Automatic(3)`, the default, compares each good message with the same message one
 #   or two steps later. What can wait waits: it may turn out not to be needed. `Automatic(1)` asks
 #   only whether a message is better than silence for good.
-# - **How sure.** With `sure=2`, the default, a message has to gain more than two standard errors of
-#   its gain, and so has each of its items, compared with leaving it out. `sure=0` takes
-#   what is best on average, however uncertain that is. `sure=20` drops messages that gain little,
-#   and prefers a gain that is certain to one that is a bit larger.
+# - **How sure.** With `min_standard_errors=2`, the default, a message has to gain more than two
+#   standard errors of its gain, and so has each of its items, compared with leaving it out. With 0
+#   it takes what is best on average, however uncertain that is. With 20 it drops messages that gain
+#   little, and prefers a gain that is certain to one that is a bit larger.
 #
 # Here is what each would say in the round above, up to the step before the collision. All are given
 # the same past, in which the shipped settings spoke.
@@ -333,8 +333,8 @@ utility = ExpectedUtility(SimulatorWorld(domain))
 others = {
     "as shipped": communicator,
     "no patience": Communicator(person, utility, Automatic(1)),
-    "sure=0": Communicator(person, utility, sure=0.0),
-    "sure=20": Communicator(person, utility, sure=20.0),
+    "0 s.e.": Communicator(person, utility, min_standard_errors=0.0),
+    "20 s.e.": Communicator(person, utility, min_standard_errors=20.0),
 }
 pd.DataFrame(
     [

@@ -3,7 +3,7 @@
 import torch
 
 from mirror_ppl.models import View
-from mirror_ppl.models.course import at_step, go_through, messages_at
+from mirror_ppl.models.human import at_step, messages_at
 
 
 def view_at(view, step):
@@ -36,3 +36,34 @@ def gone_through(human, implants, observation, told, actions):
     """Beliefs ``[..., T, Z]`` of whole rounds; see `go_through`."""
     steps = go_through(human, implants, observation, told, actions)
     return torch.stack([belief for _, belief in steps], -2)
+
+
+def perceived(human, implants, observation, told):
+    """Views of rounds, masks ``[..., T, K]``."""
+    return View.stack(list(views(human, implants, observation, told)))
+
+
+def go_through(human, implants, observation, told, actions):
+    """The view and the belief ``[..., Z]`` at each step of rounds, each inferred by itself.
+
+    Batch dimensions of implants and of rounds broadcast.
+    """
+    none = actions.new_full(actions.shape[:-1], len(human.domain.actions))
+    belief = next(human.parameters()).new_zeros(human.belief_size)
+    for step, view in enumerate(views(human, implants, observation, told)):
+        evidence = human.evidence(view, at_step(observation, step))
+        before = actions[..., step - 1] if step else none
+        shape = torch.broadcast_shapes(evidence.shape[:-1], before.shape)
+        belief = belief.expand(*shape, -1)
+        belief = human.belief_after(belief, evidence, before.expand(shape), view.still)
+        yield view, belief
+
+
+def views(human, implants, observation, told):
+    """The view of each step of rounds."""
+    knowledge = human.domain.nothing_known(1, device=observation["ego"].device)
+    for step in range(observation["ego"].shape[-2]):
+        view, knowledge = human.perceive(
+            implants, knowledge, at_step(observation, step), messages_at(told, step), step
+        )
+        yield view

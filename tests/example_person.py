@@ -5,10 +5,11 @@ from functools import cache
 import torch
 
 from mirror_ppl.communication import Channels, Person, RoundSoFar
-from mirror_ppl.communication.minds import Beliefs, through
+from mirror_ppl.communication.person import transitions
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.belief_tracking import BeliefState
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, SIGHT, assumption_sites, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
@@ -98,9 +99,10 @@ def person(number=1, model=None, **values):
 
 
 def beliefs_before(person, past):
-    """Beliefs before the present step, and which of them each eye has."""
-    *_, last = Beliefs.at_first(person), *through(person, past)
-    return last
+    """Beliefs before the present step, and which of them each percept has."""
+    state = BeliefState.initial(person.human, person.percept_count)
+    steps = transitions(person, past)
+    return (state.through(steps)[-1] if steps else state).distinct()
 
 
 def varied_draws(number, generator, model=None):

@@ -1,17 +1,17 @@
 """What to tell a person, when, through which channel, and why.
 
-Three layers: the person (`minds`, posterior draws of a human model carried through a round), value
+Three layers: the person (`person`, posterior draws of a human model tracked through a round), value
 (`objectives`, what candidate messages are worth) and search (`search`, which candidates there are).
 `Communicator` puts them together.
 """
 
 from mirror_ppl.communication.communicator import Communicator, Decision, Gain
 from mirror_ppl.communication.messages import Channels, Message, every_message
-from mirror_ppl.communication.minds import Person, Standing
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective, Valued
+from mirror_ppl.communication.person import Person, PlanningContext
+from mirror_ppl.communication.rollouts import RolloutTree, SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, CrossEntropy, Exhaustive, Patient, Search
-from mirror_ppl.communication.worlds import Futures, SelfModelWorld, SimulatorWorld, World
 
 __all__ = [
     "Automatic",
@@ -22,7 +22,7 @@ __all__ = [
     "Divergence",
     "Exhaustive",
     "ExpectedUtility",
-    "Futures",
+    "RolloutTree",
     "Gain",
     "Message",
     "Objective",
@@ -32,7 +32,7 @@ __all__ = [
     "Search",
     "SelfModelWorld",
     "SimulatorWorld",
-    "Standing",
+    "PlanningContext",
     "Valued",
     "World",
     "every_message",

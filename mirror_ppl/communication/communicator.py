@@ -19,8 +19,8 @@ from torch import Tensor
 
 from mirror_ppl.checks import real_number, require_kind, require_methods, seed_number
 from mirror_ppl.communication.messages import Channels, Message
-from mirror_ppl.communication.minds import Person, Standing
 from mirror_ppl.communication.objectives import Objective, Value, Valued
+from mirror_ppl.communication.person import Person, PlanningContext
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
 from mirror_ppl.domains.base import Domain, Observation, Visibility
@@ -251,8 +251,8 @@ class Communicator:
         person: posterior draws of the human model.
         objective: what messages are for.
         search: how candidates are found.
-        sure: how many standard errors of its gain a message has to gain; 0 takes whatever is
-            best on average.
+        min_standard_errors: how many standard errors of its gain a message has to gain; 0 takes
+            whatever is best on average.
         seed: of everything random; the same seed and round give the same decision.
 
     Raises:
@@ -262,7 +262,7 @@ class Communicator:
     person: Person
     objective: Objective
     search: Search = Automatic()
-    sure: float = 2.0
+    min_standard_errors: float = 2.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -274,7 +274,8 @@ class Communicator:
         own = self.person.human.domain.name
         if world is not None and world.name != own:
             raise InputError(f"the objective must be of the world {own}, not of {world.name}")
-        object.__setattr__(self, "sure", real_number(self.sure, "sure", 0.0))
+        name = "min_standard_errors"
+        object.__setattr__(self, name, real_number(self.min_standard_errors, name, 0.0))
         object.__setattr__(self, "seed", seed_number(self.seed))
 
     @torch.no_grad()
@@ -298,15 +299,15 @@ class Communicator:
         over = steps_left < 1 or bool(domain.over(domain.state_behind(now)))
         if over or not allowed.any():
             return self._silence(now, allowed, over)
-        standing = Standing.of(self.person, past)
-        allowed = standing.telling(allowed)
+        context = PlanningContext.of(self.person, past)
+        allowed = context.telling(allowed)
         if not allowed.any():
             return self._silence(now, allowed)
         seed = self.seed * (domain.horizon + 1) + past.time
-        value = self.objective.at(standing, steps_left, seed)
+        value = self.objective.at(context, steps_left, seed)
         found = self.search(value, allowed, seed)
-        chosen = choose(found.valued, self.sure)
-        found, chosen = slimmed(value, found, chosen, self.sure)
+        chosen = choose(found.valued, self.min_standard_errors)
+        found, chosen = slimmed(value, found, chosen, self.min_standard_errors)
         flags = found.candidates[chosen, 0]
         gain = gain_over_silence(found.valued, chosen)
         message = channels.message(flags)
@@ -326,22 +327,22 @@ class Communicator:
         return planning_domain(self.person.human, self.person.draws)
 
 
-def choose(valued: Valued, sure: float) -> int:
-    """The candidate whose gain over silence is largest after ``sure`` standard errors of it.
+def choose(valued: Valued, standard_errors: float) -> int:
+    """The candidate whose gain over silence is largest less so many ``standard_errors`` of it.
 
     Silence, candidate 0, where none gains anything; of equally good ones the first.
     """
-    least = _least(valued.utility - valued.utility[:1], sure)
+    least = _least(valued.utility - valued.utility[:1], standard_errors)
     best = int(least.argmax())
     return best if float(least[best]) > TIE else 0
 
 
-def slimmed(value: Value, found: Found, chosen: int, sure: float) -> tuple[Found, int]:
+def slimmed(value: Value, found: Found, chosen: int, standard_errors: float) -> tuple[Found, int]:
     """A plan in which every item that is communicated now is itself surely worth it.
 
     A plan can gain much by what it says later, and a message by one of its items. So the plan is
     compared with itself less each item that it communicates now, and the item of which least is
-    left after ``sure`` standard errors is dropped if that is nothing, until none is.
+    left after so many ``standard_errors`` is dropped if that is nothing, until none is.
 
     Returns:
         The candidates with those that were valued besides, and which of them is chosen.
@@ -354,17 +355,19 @@ def slimmed(value: Value, found: Found, chosen: int, sure: float) -> tuple[Found
         less = plan.repeat(len(places), 1, 1)
         less[torch.arange(len(places)), 0, places] = False
         found, place = joined(found, less, value)
-        least = _least(found.valued.utility[chosen] - found.valued.utility[place], sure)
+        least = _least(found.valued.utility[chosen] - found.valued.utility[place], standard_errors)
         worst = int(least.argmin())
         if float(least[worst]) > TIE:
             return found, chosen
         chosen = int(place[worst])
 
 
-def _least(gain: Tensor, sure: float) -> Tensor:
+def _least(gain: Tensor, standard_errors: float) -> Tensor:
     """What is left of gains ``[C, S]`` after so many standard errors, ``[C]``."""
     mean = gain.mean(-1)
-    return mean - sure * gain.std(-1) / gain.shape[-1] ** 0.5 if gain.shape[-1] > 1 else mean
+    if gain.shape[-1] == 1:
+        return mean
+    return mean - standard_errors * gain.std(-1) / gain.shape[-1] ** 0.5
 
 
 def gain_over_silence(valued: Valued, index: int) -> Gain:

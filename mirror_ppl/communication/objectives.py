@@ -16,8 +16,8 @@ from torch import Tensor
 
 from mirror_ppl.checks import require_methods, whole_number
 from mirror_ppl.communication.messages import Channels
-from mirror_ppl.communication.minds import Looks, Standing
-from mirror_ppl.communication.worlds import Futures, World, robot_belief
+from mirror_ppl.communication.person import PlanningContext
+from mirror_ppl.communication.rollouts import RolloutTree, World, robot_belief
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.combinations import discrete_sites
@@ -47,11 +47,11 @@ Value = Callable[[Tensor], Valued]
 class Objective(Protocol):
     """What a communicator wants."""
 
-    def at(self, standing: Standing, steps_left: int, seed: int) -> Value:
+    def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
         """What candidates are worth at this point of a round.
 
         Args:
-            standing: the person at this point.
+            context: the person at this point.
             steps_left: how many actions are left, at least 1.
             seed: of the random numbers that all candidates share.
         """
@@ -63,10 +63,10 @@ class ExpectedUtility:
     """``U(c) = E[ sum_{h<H} discount^h ( r_{t+h} - cost(c_{t+h}) ) ]``.
 
     The expectation is over posterior draws, draws of the world, and the person's actions. Of the
-    latter it is a tree in which branches less probable than ``branch`` are kept by chance, with a
-    weight that makes up for it: at 0 the expectation over actions is exact, at 1 each draw follows
-    a single course of actions. In between, what is probable is exact and the improbable cheap, and
-    the expectation is right at every value.
+    latter it is a tree in which courses less probable than ``enumerate_above`` are kept by chance,
+    with a weight that makes up for it: at 0 the expectation over actions is exact, at 1 each draw
+    follows a single course of actions. In between, what is probable is exact and the improbable
+    cheap, and the expectation is right at every value.
 
     Where what could be gained after the horizon counts, it is added up as what could be gained now
     and the advantages on the way, ``r_t + discount * V(s_{t+1}) - V(s_t)``. The sum is the same,
@@ -76,32 +76,32 @@ class ExpectedUtility:
         world: what is rolled forward.
         horizon: steps H that are looked ahead.
         discount: per step.
-        branch: probability of a course of actions below which it is kept by chance.
-        beyond: whether what could be gained at best after the last of these steps counts too,
-            where the round goes on.
+        enumerate_above: probability of a course of actions below which it is kept by chance.
+        terminal_value: whether what could be gained at best after the last of these steps counts
+            too, where the round goes on.
     """
 
     world: World
     horizon: int = 10
     discount: float = 1.0
-    branch: float = 0.1
-    beyond: bool = False
+    enumerate_above: float = 0.1
+    terminal_value: bool = False
 
     def __post_init__(self) -> None:
-        require_methods(self.world, ["futures"], "world", "a world such as SimulatorWorld(domain)")
+        require_methods(self.world, ["rollouts"], "world", "a world such as SimulatorWorld(domain)")
         object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
         if not 0 < self.discount <= 1:
             raise ValueError(f"discount must be above 0 and at most 1, not {self.discount}")
-        if not 0 <= self.branch <= 1:
-            raise ValueError(f"branch must be from 0 to 1, not {self.branch}")
+        if not 0 <= self.enumerate_above <= 1:
+            raise ValueError(f"enumerate_above must be from 0 to 1, not {self.enumerate_above}")
 
-    def at(self, standing: Standing, steps_left: int, seed: int) -> Value:
+    def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
         """See :class:`Objective`."""
-        person, past = standing.person, standing.past
+        person, past = context.person, context.past
         horizon = min(self.horizon, steps_left)
         device = past.actions.device
         generator = torch.Generator(device).manual_seed(seed)
-        futures = self.world.futures(past, horizon, generator)
+        rollouts = self.world.rollouts(past, horizon, generator)
         domain = person.human.domain
         number, channels = len(domain.actions), Channels(domain)
         ends = steps_left <= horizon
@@ -109,23 +109,23 @@ class ExpectedUtility:
 
         @torch.no_grad()
         def value(candidates: Tensor) -> Valued:
-            tree = _Tree(standing, candidates, self.world.draws)
+            tree = _Tree(context, candidates, self.world.draws)
             count = len(candidates)
             utility = torch.zeros(count * person.number, device=device)
-            if self.beyond:
+            if self.terminal_value:
                 world = torch.arange(person.number, device=device) % self.world.draws
-                utility += futures.values(0)[world, 0].repeat(count)
+                utility += rollouts.values(0)[world, 0].repeat(count)
             predicted = torch.zeros(count, horizon, number, device=device)
             for step in range(horizon):
                 observation = {
-                    name: part.flatten(0, 1) for name, part in futures.observation(step).items()
+                    name: part.flatten(0, 1) for name, part in rollouts.observation(step).items()
                 }
                 told = candidates[:, step] if step < candidates.shape[1] else None
                 chances = tree.act(observation, told, channels)
                 gains = (
-                    futures.advantages(step, self.discount)
-                    if self.beyond
-                    else futures.rewards(step)
+                    rollouts.advantages(step, self.discount)
+                    if self.terminal_value
+                    else rollouts.rewards(step)
                 )
                 gained = gains[tree.draw_of_world(), tree.path]
                 utility.index_add_(
@@ -134,11 +134,11 @@ class ExpectedUtility:
                     discounts[step] * (chances * gained).sum(-1),
                 )
                 predicted[:, step].index_add_(0, tree.candidate, chances / person.number)
-                if step < horizon - 1 or (self.beyond and ends):
-                    tree.branch(chances, futures, step, self.branch, seed)
-            if self.beyond and ends:
+                if step < horizon - 1 or (self.terminal_value and ends):
+                    tree.branch(chances, rollouts, step, self.enumerate_above, seed)
+            if self.terminal_value and ends:
                 # What could be gained is lost where the round ends.
-                left = futures.values(horizon)[tree.draw_of_world(), tree.path]
+                left = rollouts.values(horizon)[tree.draw_of_world(), tree.path]
                 utility.index_add_(
                     0,
                     tree.candidate * person.number + tree.draw,
@@ -156,13 +156,13 @@ class _Tree:
 
     Attributes:
         candidate, draw, path, weight: of each course ``[E]``.
-        belief: what the person believes on it ``[E]``, an index into ``beliefs``.
-        beliefs: of the last step that was looked at.
+        belief: what the person believes and knows on it ``[E]``, an index into ``state``.
+        state: after the last step that was looked at.
     """
 
-    def __init__(self, standing: Standing, candidates: Tensor, worlds: int) -> None:
+    def __init__(self, context: PlanningContext, candidates: Tensor, worlds: int) -> None:
         device = candidates.device
-        person = self.person = standing.person
+        person = self.person = context.person
         self.worlds = worlds
         self.actions = len(person.human.domain.actions)
         count = len(candidates)
@@ -170,9 +170,9 @@ class _Tree:
         self.candidate = torch.arange(count, device=device).repeat(person.number)
         self.path = torch.zeros_like(self.draw)
         self.weight = torch.ones(len(self.draw), device=device)
-        self.beliefs = standing.before
-        self.belief = standing.own[person.eye[self.draw]]
-        self.last = torch.full_like(self.draw, standing.last_action)
+        self.state = context.before
+        self.belief = context.own[person.percept[self.draw]]
+        self.last = torch.full_like(self.draw, context.last_action)
 
     def draw_of_world(self) -> Tensor:
         """Which draw of the world each course is in, ``[E]``."""
@@ -182,9 +182,9 @@ class _Tree:
         """Look at the world and choose: weights ``[E, A]`` of each course and its next action."""
         paths = len(observation["ego"]) // self.worlds
         row = self.draw_of_world() * paths + self.path
-        eye = self.person.eye[self.draw]
+        percept = self.person.percept[self.draw]
         message = self.candidate if told is not None else torch.zeros_like(self.candidate)
-        key = (self.belief * self.person.eye_count + eye) * (int(row.max()) + 1) + row
+        key = (self.belief * self.person.percept_count + percept) * (int(row.max()) + 1) + row
         key = key * (int(self.candidate.max()) + 1) + message
         _, look = torch.unique(key, return_inverse=True)
         first = torch.full((int(look.max()) + 1,), len(key), device=key.device)
@@ -195,35 +195,31 @@ class _Tree:
             # What is no longer there to be told cannot be told later, whatever the plan says.
             communicable = channels.join(self.person.human.domain.communicable(observation))
             flags = told[message[first]] & communicable[row[first]]
-        looks = Looks(
-            parent=self.belief[first],
-            eye=eye[first],
-            action=self.last[first],
-            row=row[first],
-            observation=observation,
-            told=channels.split(flags),
+        transition = self.person.transition(
+            percept[first], self.last[first], observation, channels.split(flags), row[first]
         )
-        self.beliefs, index = self.beliefs.after(looks)
+        before = self.state.at(self.belief[first])
+        self.state, index = before.after(transition).distinct()
         self.belief = index[look]
-        beliefs = self.beliefs.mean
+        beliefs = self.state.mean
         values = self.person.human.action_values(beliefs)
         # Courses of a draw share its policy implants: one row a draw, padded to the longest.
         counts = torch.bincount(self.draw, minlength=self.person.number)
         begin = counts.cumsum(0) - counts
         place = torch.arange(len(self.draw), device=key.device) - begin[self.draw]
         padded = torch.zeros(len(counts), int(counts.max()), dtype=torch.long, device=key.device)
-        padded[self.draw, place] = self.belief
+        padded[self.draw, place] = self.state.belief[self.belief]
         log_chances = self.person.act(beliefs[padded], values[padded])[self.draw, place]
         return self.weight[:, None] * log_chances.exp()
 
     def branch(
-        self, chances: Tensor, futures: Futures, step: int, threshold: float, seed: int
+        self, chances: Tensor, rollouts: RolloutTree, step: int, threshold: float, seed: int
     ) -> None:
         """Go on to the courses of one action more.
 
         Args:
             chances: their weights ``[E, A]``.
-            futures: what they lead to.
+            rollouts: what they lead to.
             step: how many actions the courses have.
             threshold: see :class:`ExpectedUtility`.
             seed: of what is left to chance, which is the same for all candidates.
@@ -235,14 +231,14 @@ class _Tree:
             # kept as their weights ask for, give or take a fraction.
             total = torch.where(small, chances, 0.0).cumsum(-1) / threshold
             place = torch.full_like(self.draw, step)
-            luck = uniform_of(seed, place, self.draw, futures.names(step)[self.path])
+            luck = uniform_of(seed, place, self.draw, rollouts.names(step)[self.path])
             shifted = total + luck[:, None]
             passed = shifted.floor()
             before = torch.cat([torch.zeros_like(passed[:, :1]), passed[:, :-1]], -1)
             weight = torch.where(small, threshold * (passed - before), chances)
         course, action = (weight > 0).nonzero(as_tuple=True)
         self.weight = weight[course, action]
-        self.path = futures.follow(step, self.path[course], action)
+        self.path = rollouts.follow(step, self.path[course], action)
         self.last = action
         self.candidate, self.draw = self.candidate[course], self.draw[course]
         self.belief = self.belief[course]
@@ -270,24 +266,24 @@ class Divergence:
         if not self.weight > 0:
             raise ValueError(f"weight must be positive, not {self.weight}")
 
-    def at(self, standing: Standing, steps_left: int, seed: int) -> Value:
+    def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
         """See :class:`Objective`; steps left and seed do not matter.
 
         Raises:
             HumanModelError: the beliefs of the human model have no density like the robot's.
         """
-        person = standing.person
+        person = context.person
         require_density(person.human)
         channels = Channels(person.human.domain)
-        robot = robot_belief(person.human.self_model, standing.past)
+        robot = robot_belief(person.human.self_model, context.past)
 
         @torch.no_grad()
         def value(candidates: Tensor) -> Valued:
             message = candidates[:, 0]
-            beliefs, index = standing.told(message)
-            assert beliefs.scale is not None
-            apart = self._apart(robot, Gaussian(beliefs.mean, beliefs.scale))[index]
-            utility = -self.weight * apart[:, person.eye]
+            state, index = context.told(message)
+            assert state.scale is not None
+            apart = self._apart(robot, Gaussian(state.mean, state.scale))[state.belief[index]]
+            utility = -self.weight * apart[:, person.percept]
             return Valued(utility - channels.cost(message)[:, None], None)
 
         return value

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from mirror_ppl.communication.communicator import Communicator
-from mirror_ppl.communication.minds import Person
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective
+from mirror_ppl.communication.person import Person
+from mirror_ppl.communication.rollouts import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.search import Automatic
-from mirror_ppl.communication.worlds import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models.world_knowledge import planning_domain
 
@@ -22,24 +22,24 @@ class PlannerOptions:
     Attributes:
         horizon: steps looked ahead.
         discount: per step.
-        branch: see :class:`ExpectedUtility`.
+        enumerate_above: see :class:`ExpectedUtility`.
         patience: length of the plans that are compared, see :class:`Automatic`.
         items: most items of a message, see :class:`Automatic`.
-        sure: standard errors that a gain must exceed, see :class:`Communicator`.
-        beyond: see :class:`ExpectedUtility`.
+        min_standard_errors: standard errors that a gain must exceed, see :class:`Communicator`.
+        terminal_value: see :class:`ExpectedUtility`.
         kl_weight: units of reward that mirror-kl gives for a nat.
         kl_measure: what mirror-kl measures, see :class:`Divergence`.
     """
 
     horizon: int = 10
     discount: float = 1.0
-    branch: float = 0.1
+    enumerate_above: float = 0.1
     patience: int = 3
     items: int | None = None
-    sure: float = 2.0
+    min_standard_errors: float = 2.0
     kl_weight: float = 1.0
     kl_measure: str = "kl"
-    beyond: bool = False
+    terminal_value: bool = False
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
@@ -49,25 +49,33 @@ class PlannerOptions:
 
 
 BY_DOMAIN: dict[str, dict[str, Any]] = {
-    "search_rescue": {"horizon": 16, "beyond": True, "branch": 0.4, "items": 2, "sure": 1.0},
+    "search_rescue": {
+        "horizon": 16,
+        "terminal_value": True,
+        "enumerate_above": 0.4,
+        "items": 2,
+        "min_standard_errors": 1.0,
+    },
     # Costs grow so fast that no third item is worth its own; the oracle looks at two, too. A bomb
     # does nothing by itself, so what helps cannot wait; and where the next stage takes as long,
     # steps that are looked at are used up all the same, whenever this one ends.
     # A wrong button costs much more than a message: it is rash to be silent until a gain is sure.
     "bomb_defusal": {
         "horizon": 12,
-        "beyond": True,
-        "branch": 0.4,
+        "terminal_value": True,
+        "enumerate_above": 0.4,
         "items": 2,
         "patience": 1,
-        "sure": 0.0,
+        "min_standard_errors": 0.0,
     },
 }
 """Settings of planners that differ by domain."""
 
 
 def _utility(world: World, options: PlannerOptions) -> Objective:
-    return ExpectedUtility(world, options.horizon, options.discount, options.branch, options.beyond)
+    return ExpectedUtility(
+        world, options.horizon, options.discount, options.enumerate_above, options.terminal_value
+    )
 
 
 def _mirror(person: Person, options: PlannerOptions) -> Objective:
@@ -109,4 +117,4 @@ def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) ->
     if name in MYOPIC:
         search = replace(search, steps=1)
     objective = PLANNERS[name](person, options)
-    return Communicator(person, objective, search, options.sure, seed)
+    return Communicator(person, objective, search, options.min_standard_errors, seed)

@@ -18,7 +18,7 @@ from torch import Tensor
 from mirror_ppl.communication import rules
 from mirror_ppl.communication.communicator import Decision
 from mirror_ppl.communication.messages import Channels
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward

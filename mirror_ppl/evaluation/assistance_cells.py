@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.evaluation.assistance import (
     RATES_FROM,

@@ -55,9 +55,9 @@ class ImportanceOptions:
     prune_margin: float = 12.0
 
     def __post_init__(self) -> None:
-        for name in ("proposals", "stages"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        for name, least in (("proposals", 1), ("stages", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
 
 
 @torch.no_grad()
@@ -83,28 +83,26 @@ def sample_importance(
         near: draws from much the same posterior, whose moments are used from the first stage on.
     """
     sampler = Sampler(human, table)
-    dependent = dependent_sites(human, sampler.sites)
-
-    def near_to(place: Tensor, log_weights: Tensor) -> Proposal:
-        if not sampler.sites:
-            return NoScalars()
-
-        def fit(some: Tensor) -> MultivariateStudentT:
-            return _heavy_tailed(some, log_weights, options.wider)
-
-        if not dependent:
-            return fit(place)
-        return RelativeProposal(human, sampler.sites, dependent, place, fit)
-
     few = min(PRUNING_DRAWS, options.proposals)
     sampler.draw(few)
     sampler.prune(options.prune_margin)
     if near is not None and sampler.sites:
-        found = unconstrained(sampler.sites, near.policy)
-        near = near.tempered(LEARNED_FROM)
-        sampler.propose(near_to(found, near.log_weights), options.proposals)
+        place = unconstrained(sampler.sites, near.policy)
+        proposal = _near_to(sampler, place, near.tempered(LEARNED_FROM), options)
+        sampler.propose(proposal, options.proposals)
     elif options.proposals > few:
         sampler.draw(options.proposals - few)
+    return adapt(sampler, options)
+
+
+@torch.no_grad()
+def adapt(sampler: Sampler, options: ImportanceOptions) -> Weighted:
+    """Propose stage after stage, near to all weighted draws so far, until enough are effective.
+
+    Args:
+        sampler: of one person; it has some draws. See :func:`sample_importance`.
+        options: settings.
+    """
     for stage in range(options.stages if sampler.sites or sampler.supports else 0):
         found = sampler.weighted()
         if found.effective >= options.enough:
@@ -114,8 +112,24 @@ def sample_importance(
         if not sampler.proposes_residual and (few or stage >= PLAIN_STAGES):
             sampler.learn_residual(found)
         sampler.learn_discrete(found)
-        sampler.propose(near_to(sampler.place, found.log_weights), options.proposals)
+        sampler.propose(_near_to(sampler, sampler.place, found, options), options.proposals)
     return sampler.weighted()
+
+
+def _near_to(
+    sampler: Sampler, place: Tensor, found: Weighted, options: ImportanceOptions
+) -> Proposal:
+    """A proposal with the moments of weighted draws at places ``[S, D]``."""
+    if not sampler.sites:
+        return NoScalars()
+
+    def fit(some: Tensor) -> MultivariateStudentT:
+        return _heavy_tailed(some, found.log_weights, options.wider)
+
+    dependent = dependent_sites(sampler.human, sampler.sites)
+    if not dependent:
+        return fit(place)
+    return RelativeProposal(sampler.human, sampler.sites, dependent, place, fit)
 
 
 def _heavy_tailed(place: Tensor, log_weights: Tensor, wider: float) -> MultivariateStudentT:

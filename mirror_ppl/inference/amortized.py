@@ -9,8 +9,8 @@ and a new round is one more term. From it the network proposes how this person d
     psi   ~ q(. | e_1 .. e_W, number of steps)               scalar sites, a mixture of Gaussians
     m     ~ p(m | psi, actions)                              exact
 
-and importance weights take care of what it gets wrong
-(:mod:`mirror_ppl.inference.adaptive_importance`).
+and importance weights correct what it gets wrong. Where too few draws are effective, the stages of
+adaptive importance sampling go on from there (:mod:`mirror_ppl.inference.adaptive_importance`).
 
 The network is trained on people drawn from the prior and simulated in the true domain (inference
 compilation: Le, Baydin and Wood, 2017), see :mod:`mirror_ppl.training.guide`.
@@ -25,11 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.inference.adaptive_importance import (
-    LEARNED_FROM,
-    PLAIN_STAGES,
-    ImportanceOptions,
-)
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, adapt
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
@@ -47,23 +43,18 @@ class AmortizedOptions:
     """Settings of proposing by a network.
 
     Attributes:
-        proposals: draws from the guide of a stage.
-        enough: effective draws at which no stage is added.
-        stages: the largest number of stages.
-        prune_margin: see :class:`ImportanceOptions`.
+        proposals: draws from the network's density.
+        adaptation: of the stages after it, which propose near to all draws so far.
         refine: gradient steps on the person's rounds before the network's density is used.
     """
 
-    proposals: int = 64
-    enough: float = 400.0
-    stages: int = 16
-    prune_margin: float = 12.0
+    proposals: int = 128
+    adaptation: ImportanceOptions = ImportanceOptions(proposals=256)
     refine: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("proposals", "stages"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.proposals < 1:
+            raise ValueError(f"proposals must be at least 1, not {self.proposals}")
 
 
 @dataclass(frozen=True)
@@ -115,6 +106,8 @@ def sample_amortized(
 ) -> Weighted:
     """Weighted draws of one person: the guide's, and the ways that evidence is about.
 
+    Where these are too few, stages of adaptive importance sampling start from them.
+
     Args:
         human: the model of people that the guide was trained for.
         guide: the trained network.
@@ -126,22 +119,15 @@ def sample_amortized(
     evidence = evidence_of(builder)
     sampler = Sampler(human, evidence.table, evidence.combinations, sites)
     sampler.add_prior_draws(evidence.ways, evidence.joint)
-    sampler.prune(options.prune_margin)
+    sampler.prune(options.adaptation.prune_margin)
     if options.refine and sampler.sites:
         compiled = ViewTables(human, sampler.table)
         density = refined(guide, compiled, evidence.log_evidence, evidence.steps, options.refine)
     else:
         steps = torch.tensor(evidence.steps, device=evidence.log_evidence.device)
         density = guide.density(evidence.log_evidence, steps)
-    for stage in range(options.stages):
-        sampler.propose(density, options.proposals)
-        found = sampler.weighted()
-        if found.effective >= options.enough:
-            break
-        # The network says nothing about the residual; draws do, once there are some.
-        if stage >= PLAIN_STAGES and not sampler.proposes_residual:
-            sampler.learn_residual(found.tempered(LEARNED_FROM))
-    return found
+    sampler.propose(density, options.proposals)
+    return adapt(sampler, options.adaptation)
 
 
 def infer_amortized(job: Job) -> Inferred:

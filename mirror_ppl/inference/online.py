@@ -23,7 +23,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites
 from mirror_ppl.models.recorded import check_rounds
 
-AT_ONCE = AmortizedOptions(enough=64.0)
+AT_ONCE = AmortizedOptions(adaptation=ImportanceOptions(128, enough=64.0))
 """Fewer effective draws than otherwise, but enough for an answer that cannot wait."""
 
 

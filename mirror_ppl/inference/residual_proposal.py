@@ -27,13 +27,13 @@ from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel
 
 SITE = "residual_out"
-NEWTON_STEPS, CURVATURES = 4, 2
+NEWTON_STEPS, CURVATURES = 3, 1
 """Steps to the best weights; at so many of them is it worked out how curved the likelihood is."""
 DRAWS = 128
 """What is worked out at once; bounds memory."""
-MOMENTS = 1024
+MOMENTS = 512
 """So many moments are looked at, those that are expected to have come about most often."""
-COUNTED = 0.99
+COUNTED = 0.97
 """Or fewer, if this share of all that was done was done at them."""
 
 

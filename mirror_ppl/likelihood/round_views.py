@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mirror_ppl.domains import Observation
-from mirror_ppl.likelihood.belief_nodes import beliefs_and_values
+from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.view_table import NO_VIEW
-from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.view import View
+from mirror_ppl.models.belief_tracking import CHUNK, BeliefState, Memory, Transition
+from mirror_ppl.models.human import HumanModel, at_step, messages_at
 from mirror_ppl.row_hashing import distinct_rows
 
 
@@ -72,21 +72,70 @@ class RoundViews:
         return RoundViews(moments, self.belief[used], self.values[used], self.acted[used])
 
 
+@torch.no_grad()
 def round_views(
     human: HumanModel,
-    view: View,
+    implants: Mapping[str, Tensor],
+    number: int,
     observation: Observation,
+    told: Visibility,
     actions: Tensor,
-    real: Tensor,
-    combinations: int,
+    steps: int,
 ) -> tuple[RoundViews, Tensor]:
-    """Distinct views of one round, and which of them each combination has."""
-    view = view.map(lambda part: part.expand(combinations, *part.shape[1:]))
-    numbers = view.numbers() * real
-    first, inverse = distinct_rows(numbers)
-    some = view.map(lambda part: part[first])
-    belief, values, node = beliefs_and_values(human, some, numbers[first], observation, actions)
-    acted = actions.expand(node.shape)
-    at = acted.new_zeros(len(belief)).scatter(0, node.flatten(), acted.flatten())
-    moments = torch.where(real, node, NO_VIEW)
-    return RoundViews(moments, belief, values, at), inverse
+    """Distinct views of one round, and which of them each combination has.
+
+    Args:
+        human: the model of people.
+        implants: combinations of values ``[M]`` of the discrete sites that perception reads.
+        number: M.
+        observation: ``[1, T, ...]``.
+        told: ``[1, T, K]``.
+        actions: ``[1, T]``.
+        steps: how many of the T steps are no padding.
+    """
+    state = BeliefState.initial(human, number, Memory.of_round(human, observation))
+    state, numbers = moments_along(state, implants, observation, told, actions, range(steps))
+    return views_of_moments(state, numbers)
+
+
+def moments_along(
+    state: BeliefState,
+    implants: Mapping[str, Tensor],
+    observation: Observation,
+    told: Visibility,
+    actions: Tensor,
+    steps: range,
+) -> tuple[BeliefState, Tensor]:
+    """Track beliefs through some steps of a round; arguments as of :func:`round_views`.
+
+    Returns:
+        The state after these steps, and the number of the moment at each, ``[n, T]``, ``NO_VIEW``
+        outside of them: a belief of the state and what was done there.
+    """
+    number, action_count = len(state.belief), len(state.human.domain.actions)
+    moments = state.belief.new_full((number, actions.shape[1]), NO_VIEW)
+    transitions = []
+    for step in steps:
+        before = actions[0, step - 1] if step else actions.new_tensor(action_count)
+        now, heard = at_step(observation, step), messages_at(told, step)
+        transitions.append(Transition(implants, before.expand(number), now, heard))
+    states = state.through(transitions) if steps else []
+    for step, now in zip(steps, states, strict=True):
+        moments[:, step] = now.belief * action_count + actions[0, step]
+    return [state, *states][-1], moments
+
+
+def views_of_moments(state: BeliefState, numbers: Tensor) -> tuple[RoundViews, Tensor]:
+    """Distinct rows of the moments ``[n, T]`` of a round, and which of them each row is ``[n]``."""
+    human = state.human
+    first, which = distinct_rows(numbers)
+    moments = numbers[first]
+    real = moments != NO_VIEW
+    used, place = moments[real].unique(return_inverse=True)
+    moments[real] = place
+    if not len(used):  # of padding alone; act() is asked about something all the same
+        used = used.new_zeros(1)
+    action_count = len(human.domain.actions)
+    belief = state.mean[used // action_count]
+    values = torch.cat([human.action_values(some) for some in belief.split(CHUNK)])
+    return RoundViews(moments, belief, values, used % action_count), which

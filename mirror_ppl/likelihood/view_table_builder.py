@@ -21,7 +21,6 @@ from torch.nn.functional import pad
 
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.likelihood.attention import KEPT, VALUES, AttentionValues, Proposal
-from mirror_ppl.likelihood.belief_nodes import CHUNK
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.chained_views import chained_views
 from mirror_ppl.likelihood.combination_sets import fixed_prior
@@ -38,7 +37,7 @@ from mirror_ppl.likelihood.densities import (
 )
 from mirror_ppl.likelihood.round_views import RoundViews, round_views
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable, along_views
-from mirror_ppl.models.course import perceived
+from mirror_ppl.models.belief_tracking import CHUNK
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
@@ -171,8 +170,8 @@ class ViewTableBuilder:
             candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
             candidates |= {name: value.repeat(number) for name, value in attended.values.items()}
             number = number * each
-        view = perceived(self.human, candidates, observation, told)
-        part, which = round_views(self.human, view, observation, actions, real, number)
+        steps = int(real.sum())
+        part, which = round_views(self.human, candidates, number, observation, told, actions, steps)
         if self.screening is not None and self.screening.resolution > 0:
             part, place = self._merged(part, self.screening)
             which = place[which]
@@ -204,10 +203,9 @@ class ViewTableBuilder:
         """The same where attention is summed out exactly."""
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
-        found = chained_views(self.human, candidates, len(alive), observation, told, actions, real)
-        values = torch.cat([self.human.action_values(some) for some in found.belief.split(CHUNK)])
-        part = RoundViews(found.moments, found.belief, values, found.acted)
-        chain = found.chain
+        part = chained_views(self.human, candidates, len(alive), observation, told, actions, real)
+        chain = part.chain
+        assert chain is not None
         if self.screening is not None:
             if self.screening.resolution > 0:
                 part, place = self._merged(part, self.screening)

@@ -10,8 +10,9 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains.base import Observation, Visibility, map_state, roll_out, total_reward
-from mirror_ppl.models.human import HumanModel, Implants, messages_at, require_standard_program
+from mirror_ppl.domains.base import Observation, map_state, roll_out, total_reward
+from mirror_ppl.models.belief_tracking import BeliefState, Transition
+from mirror_ppl.models.human import HumanModel, require_standard_program
 
 
 @torch.no_grad()
@@ -44,18 +45,25 @@ def play_rounds(
     def by_person(part: Tensor) -> Tensor:
         return part.unflatten(0, (people, rounds))
 
+    def by_round(sites: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {
+            name: value.expand(people, rounds, *value.shape[2:]).flatten(0, 1)
+            for name, value in sites.items()
+        }
+
     begin = domain.initial(people * rounds, generator, scenario)
     state = map_state(by_person, begin)
     observed = [domain.observe(state)]
     actions = torch.zeros(people, rounds, steps, dtype=torch.long, device=device)
-    told = {
-        m.name: torch.zeros(people, rounds, steps, len(m.items), dtype=torch.bool, device=device)
+    nothing = {
+        m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=device)
         for m in domain.modalities
     }
     lengths = torch.zeros(people, rounds, dtype=torch.long, device=device)
     under_way = lengths == 0
     varies = human.has_round_latents
-    beliefs = _Beliefs(human, told, actions)
+    beliefs = BeliefState.initial(human, people * rounds)
+    every = torch.arange(people * rounds, device=device)
     # What the program itself draws comes from the generator, too, whatever else is drawn from it.
     own = torch.Generator(device)
     own.set_state(generator.get_state())
@@ -69,7 +77,18 @@ def play_rounds(
         lengths += under_way
         with torch.random.fork_rng(devices=[]), pyro.plate("person", people, dim=-2):
             latents = _round_latents(human, drawn, observed, seed + 1) if varies else {}
-            log_probability = beliefs.act(drawn, latents, observed[-1], step)
+            last = actions[..., step - 1] if step else actions.new_full((), len(domain.actions))
+            beliefs = beliefs.after(
+                Transition(
+                    by_round({**drawn, **latents}),
+                    last.expand(people, rounds).flatten(),
+                    {name: value.flatten(0, 1) for name, value in observed[-1].items()},
+                    nothing,
+                    every,
+                )
+            )
+            belief = by_person(beliefs.believed)
+            log_probability = human.act(drawn, belief, human.action_values(belief))
         probability = log_probability.exp().flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)
         actions[..., step] = chosen.view(people, rounds)
@@ -106,25 +125,3 @@ def _round_latents(
     torch.manual_seed(seed)
     with pyro.plate("round", observed[0]["ego"].shape[1], dim=-1):
         return human.round_latents(implants | human.covariates(so_far))
-
-
-class _Beliefs:
-    """What people know and believe, step after step."""
-
-    def __init__(self, human: HumanModel, told: Visibility, actions: Tensor) -> None:
-        self.human, self.told, self.actions = human, told, actions
-        people, rounds, _ = actions.shape
-        self.knowledge = human.domain.nothing_known(people, rounds, device=actions.device)
-        like = next(human.parameters())
-        self.belief = like.new_zeros(people, rounds, human.belief_size)
-        self.none = torch.full_like(actions[..., 0], len(human.domain.actions))
-
-    def act(self, implants: Implants, latents: Implants, now: Observation, step: int) -> Tensor:
-        """Log-probabilities ``[P, B, A]`` of actions at a step; runs inside the person plate."""
-        human, told = self.human, messages_at(self.told, step)
-        last = self.actions[..., step - 1] if step else self.none
-        sites = {**implants, **latents}
-        view, self.knowledge = human.perceive(sites, self.knowledge, now, told, step)
-        evidence = human.evidence(view, now)
-        self.belief = human.belief_after(self.belief, evidence, last, view.still)
-        return human.act(implants, self.belief, human.action_values(self.belief))

@@ -42,12 +42,14 @@ class View:
     def stack(cls, steps: Sequence[View]) -> View:
         """A view of a round ``[..., T, K]`` of those of its steps."""
 
+        def joined(parts: Sequence[Tensor], place: int) -> Tensor:
+            if len(parts) == 1:
+                return parts[0].unsqueeze(place)  # no copy
+            return torch.stack(torch.broadcast_tensors(*parts), place)
+
         def stacked(parts: Sequence[dict[str, Tensor]], behind: int) -> dict[str, Tensor]:
             return {
-                name: torch.stack(
-                    torch.broadcast_tensors(*(part[name] for part in parts)),
-                    -2 if name == "ego" else -1 - behind,
-                )
+                name: joined([part[name] for part in parts], -2 if name == "ego" else -1 - behind)
                 for name in parts[0]
             }
 
@@ -56,7 +58,7 @@ class View:
             stacked([step.visible for step in steps], 1),
             stacked([step.taken for step in steps], 1),
             stacked([step.imagined for step in steps], 2),
-            torch.stack(torch.broadcast_tensors(*still), -1) if still else None,
+            joined(still, -1) if still else None,
         )
 
     def numbers(self) -> Tensor:

@@ -14,10 +14,11 @@ from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
 from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person, transitions
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.driving import CAR_LANES, CARS, ROAD_END, DrivingState
+from mirror_ppl.models.belief_tracking import BeliefState
 from mirror_ppl.people.driving import Memory
 from mirror_ppl.plots.communication import WORDS, in_words
 from mirror_ppl.plots.driving import DARK_TO_LIGHT, DISTANCES, draw_car, draw_road
@@ -46,17 +47,17 @@ def share_known(person: Person, past: RoundSoFar) -> Tensor:
     Returns:
         ``[t + 1, K]``; at the last step, before the next action, nothing is told yet.
     """
-    eyes = torch.arange(person.eye_count, device=past.actions.device)
-    observation = {
-        name: value.expand(len(eyes), *value.shape) for name, value in past.observation.items()
+    nothing = {
+        name: value.new_zeros(value.shape[1], dtype=torch.bool)
+        for name, value in past.observation.items()
+        if name in past.told
     }
-    told = {
-        name: torch.nn.functional.pad(mask, [0, 0, 0, 1]).expand(len(eyes), -1, -1)
-        for name, mask in past.told.items()
-    }
-    visible = person.see(eyes, observation, told).visible
+    whole = past.then(nothing, 0, past.now)  # nothing is told at the present step
+    state = BeliefState.initial(person.human, person.percept_count)
+    view, _ = state.perceive(transitions(person, whole))
+    visible = view.visible
     observed = torch.stack(list(visible.values())).any(0).long().cummax(1).values
-    return observed[person.eye].float().mean(0)
+    return observed[person.percept].float().mean(0)
 
 
 def share_seen(person: Person, lane: int) -> Tensor:
@@ -71,15 +72,21 @@ def share_seen(person: Person, lane: int) -> Tensor:
     """
     domain = person.human.domain
     places = len(DISTANCES)
-    eyes = torch.arange(person.eye_count, device=person.eye.device).repeat_interleave(places)
+    percepts = torch.arange(person.percept_count, device=person.percept.device).repeat_interleave(
+        places
+    )
+    rows = torch.arange(len(percepts), device=percepts.device)
     # One look for each distance, with all cars there.
-    position = torch.as_tensor(DISTANCES, device=eyes.device).repeat(person.eye_count)
-    position = position[:, None, None].expand(-1, 1, len(CARS))
+    position = torch.as_tensor(DISTANCES, device=percepts.device).repeat(person.percept_count)
+    position = position[:, None].expand(-1, len(CARS))
     lanes = torch.full_like(position[..., 0], lane)
     observation = domain.observe(DrivingState(lanes, position, torch.zeros_like(position)))
     nothing = {m.name: torch.zeros_like(position, dtype=torch.bool) for m in domain.modalities}
-    seen = person.see(eyes, observation, nothing).visible["visual"]
-    share = seen.unflatten(0, (person.eye_count, places))[person.eye].float().mean((0, 2))
+    action = torch.zeros_like(percepts)
+    transition = person.transition(percepts, action, observation, nothing, rows)
+    view, _ = BeliefState.initial(person.human, len(percepts)).perceive([transition])
+    seen = view.visible["visual"]
+    share = seen.unflatten(0, (person.percept_count, places))[person.percept].float().mean((0, 2))
     return share[:, [CAR_LANES.index(side) for side in range(len(MIDDLES))]].T
 
 

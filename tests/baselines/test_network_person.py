@@ -11,7 +11,7 @@ from example_rounds import untrained
 from mirror_ppl.baselines import NetworkPerson
 from mirror_ppl.baselines.person import NETWORK
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
-from mirror_ppl.communication.minds import Looks, Standing
+from mirror_ppl.communication.person import PlanningContext
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.driving import STAY, SWITCH
@@ -73,20 +73,18 @@ def test_acts_as_the_network_does(domain, generator):
     torch.testing.assert_close(found[real], expected[0][real], rtol=1e-4, atol=1e-5)
 
     person = Person(human, human.draws(2))
-    assert person.eye_count == 1
+    assert person.percept_count == 1
     for number in range(recordings.shape[1]):
         past, last = first_of(recordings, number)
-        standing = Standing.of(person, past)
-        looks = Looks(
-            parent=standing.own[:1],
-            eye=torch.zeros(1, dtype=torch.long),
-            action=torch.tensor([standing.last_action]),
-            row=torch.zeros(1, dtype=torch.long),
-            observation={name: value[None] for name, value in past.now.items()},
-            told={name: mask[None] for name, mask in last.items()},
+        context = PlanningContext.of(person, past)
+        transition = person.transition(
+            torch.zeros(1, dtype=torch.long),
+            torch.tensor([context.last_action]),
+            {name: value[None] for name, value in past.now.items()},
+            {name: mask[None] for name, mask in last.items()},
         )
-        beliefs, index = standing.before.after(looks)
-        belief = beliefs.mean[index].expand(2, 1, -1)
+        state = context.before.at(context.own[:1]).after(transition)
+        belief = state.believed.expand(2, 1, -1)
         planned = person.act(belief, human.action_values(belief))
         for draw in planned[:, 0]:
             torch.testing.assert_close(draw, expected[0, number, past.time], rtol=1e-4, atol=1e-5)

@@ -6,8 +6,8 @@ import pytest
 from paths import EXAMPLES
 from running import command, command_on_cluster
 
-from mirror_ppl import assist, fit
 from mirror_ppl.arviz import az
+from mirror_ppl.commands import assist, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation import assistance_cells
@@ -242,8 +242,8 @@ def test_posteriors_of_something_else_are_refused(posterior, tmp_path, capsys, a
         (("--patience", "0"), "--patience must be at least 1, not 0"),
         (("--discount", "1.5"), "--discount must be above 0 and at most 1, not 1.5"),
         (("--discount", "nan"), "--discount must be above 0 and at most 1, not nan"),
-        (("--branch", "-1"), "--branch must be from 0 to 1, not -1.0"),
-        (("--sure", "-1"), "--sure must be at least 0, not -1.0"),
+        (("--enumerate-above", "-1"), "--enumerate-above must be from 0 to 1, not -1.0"),
+        (("--min-standard-errors", "-1"), "--min-standard-errors must be at least 0, not -1.0"),
         (("--kl-weight", "0"), "--kl-weight must be a positive number, not 0.0"),
         (("--kl-weight", "inf"), "--kl-weight must be a positive number, not inf"),
         (("--seed", "-1"), "--seed must be at least 0, not -1"),

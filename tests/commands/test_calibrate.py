@@ -4,7 +4,7 @@ import pytest
 from PIL import Image
 from running import command, command_on_cluster
 
-from mirror_ppl import calibrate
+from mirror_ppl.commands import calibrate
 from mirror_ppl.inference.calibration.study import Calibration
 from mirror_ppl.inference.engines import Inferred, infer
 

@@ -16,7 +16,8 @@ import xarray as xr
 from example_recordings import fields
 from running import command
 
-from mirror_ppl import __main__, assist, calibrate, evaluate, fit, simulate, train
+from mirror_ppl import __main__
+from mirror_ppl.commands import assist, calibrate, evaluate, fit, simulate, train
 from mirror_ppl.data import (
     Demonstrations,
     asset_path,
@@ -436,15 +437,16 @@ def test_help_tells_every_option(module, capsys):
         if (module, name) != (evaluate, "study"):  # which is no option
             assert f"--{name.replace('_', '-')} " in out
     assert module.DESCRIPTION.split(".")[0].split("\n")[0].split(",")[0] in out
-    assert f"python -m {module.__name__}" == module.PROGRAM
+    assert f"python -m {module.__name__.replace('.commands', '')}" == module.PROGRAM
 
 
 def test_overview_lists_every_command_there_is(capsys):
     assert __main__.main([]) == 0
     out = capsys.readouterr().out
     package = Path(fit.__file__).parent
-    commands = {path.stem for path in package.glob("*.py") if "\nPROGRAM = " in path.read_text()}
-    assert set(__main__.COMMANDS) == commands - {"__main__"}
+    commands = {path.stem for path in package.glob("*.py")} - {"__init__"}
+    assert set(__main__.COMMANDS) == commands
+    assert all((package.parent / f"{name}.py").is_file() for name in commands)
     for name in __main__.COMMANDS:
         assert f"python -m mirror_ppl.{name}" in out
 

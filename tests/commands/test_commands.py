@@ -14,7 +14,7 @@ import torch
 
 import mirror_ppl
 from mirror_ppl import errors
-from mirror_ppl.__main__ import COMMANDS
+from mirror_ppl.commands import COMMANDS
 from mirror_ppl.console import run
 from mirror_ppl.errors import MirrorError, UnknownNameError
 from mirror_ppl.progress import Progress

@@ -3,7 +3,8 @@
 import pytest
 from running import command
 
-from mirror_ppl import assist, calibrate, compare, evaluate, fit, limits, simulate, train
+from mirror_ppl import limits
+from mirror_ppl.commands import assist, calibrate, compare, evaluate, fit, simulate, train
 from mirror_ppl.errors import OptionError
 from mirror_ppl.limits import LIMITS, free_memory, require_memory, share
 

@@ -3,7 +3,7 @@
 import pytest
 import xarray as xr
 
-from mirror_ppl import fit, simulate, train
+from mirror_ppl.commands import fit, simulate, train
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import HumanModelError, OptionError, OutputError
 from mirror_ppl.models.loading import load_human_model

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from running import command
 
-from mirror_ppl import calibrate
+from mirror_ppl.commands import calibrate
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.user_code import remember_file
 from mirror_ppl.workers import run_tasks

@@ -24,8 +24,8 @@ from mirror_ppl.communication import (
     ExpectedUtility,
     Gain,
     Person,
+    PlanningContext,
     SimulatorWorld,
-    Standing,
     Valued,
 )
 from mirror_ppl.communication.communicator import TIE, choose, gain_over_silence
@@ -95,11 +95,11 @@ def test_a_gain_by_hand():
     assert silence == Gain(0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("sure", [-0.1, -3.0])
-def test_less_than_no_assurance_is_refused(sure):
+@pytest.mark.parametrize("least", [-0.1, -3.0])
+def test_less_than_no_assurance_is_refused(least):
     with pytest.raises(ValueError) as error:
-        Communicator(person(), ExpectedUtility(WORLD), sure=sure)
-    assert str(error.value) == f"sure must be at least 0, not {sure}"
+        Communicator(person(), ExpectedUtility(WORLD), min_standard_errors=least)
+    assert str(error.value) == f"min_standard_errors must be at least 0, not {least}"
 
 
 # --- what it asks for -------------------------------------------------------------------------
@@ -111,8 +111,8 @@ class Asked:
     def __init__(self, worth=0.0):
         self.worth, self.given = worth, []
 
-    def at(self, standing, steps_left, seed):
-        self.given.append({"time": standing.past.time, "steps_left": steps_left, "seed": seed})
+    def at(self, context, steps_left, seed):
+        self.given.append({"time": context.past.time, "steps_left": steps_left, "seed": seed})
         return lambda candidates: Valued(self.worth * candidates[:, 0].sum(-1, True).float(), None)
 
     def __call__(self, value, allowed, seed):
@@ -220,12 +220,12 @@ def test_silence_to_somebody_who_sees_everything(assumes_clear, assumes_closing,
     ahead, behind = ["front-left", "front-right"], ["rear-left", "rear-right"]
     messages = [flags(visual=ahead[:1]), flags(visual=ahead[1:]), flags(visual=ahead)]
     messages += [flags(verbal=ahead[:1]), flags(verbal=ahead + behind)]
-    value = someone.objective.at(Standing.of(someone.person, past), 14, 0)
+    value = someone.objective.at(PlanningContext.of(someone.person, past), 14, 0)
     utility = value(torch.stack([plan(None), *map(plan, messages)])).utility
     expected = -torch.tensor([0.01, 0.01, 0.04, 0.03, 0.48])[:, None].expand(5, 4)
     torch.testing.assert_close(utility[1:] - utility[0], expected)
     # At first sight, to be shown what they see is no news either.
-    first = someone.objective.at(Standing.of(someone.person, begun(*scene)), 15, 0)
+    first = someone.objective.at(PlanningContext.of(someone.person, begun(*scene)), 15, 0)
     utility = first(torch.stack([plan(None), *map(plan, messages[:3])])).utility
     torch.testing.assert_close(utility[1:] - utility[0], expected[:3])
 
@@ -270,7 +270,7 @@ def test_who_was_told_need_not_be_told_again(name, speed, closing, news):
     message, now = flags(**{name: ["front-left"]}), (0, [5, 9, -9, -9], [speed, 1, -1, -1])
     first = begun(0, [5 - speed, 8, -8, -8], now[2])
     past = first.then(CHANNELS.split(message), 0, begun(*now).now)
-    value = communicator.objective.at(Standing.of(communicator.person, past), 14, 0)
+    value = communicator.objective.at(PlanningContext.of(communicator.person, past), 14, 0)
     utility = value(torch.stack([plan(None), plan(message)])).utility
     gain = utility[1] - utility[0] + CHANNELS.cost(message)
     assert (gain > 0.5).all() if news else (gain.abs() < 1e-5).all()
@@ -301,7 +301,7 @@ def test_a_car_in_the_fog_is_told_of(assumes_clear, lane):
 class Later:
     """To speak is worth 2 at the next step and 1 at others; to do both is worth no more."""
 
-    def at(self, standing, steps_left, seed):
+    def at(self, context, steps_left, seed):
         worth = torch.tensor([1.0, 2.0, 1.0])
 
         def value(candidates):
@@ -356,14 +356,14 @@ def rounds(generator):
 def test_nothing_is_kept_between_decisions(rounds, generator):
     """In whatever order rounds come, and whatever is drawn elsewhere, decisions are the same."""
     someone = Person(human(), varied_draws(6, generator))
-    communicator = Communicator(someone, ExpectedUtility(WORLD, 4, branch=0.3), seed=5)
+    communicator = Communicator(someone, ExpectedUtility(WORLD, 4, enumerate_above=0.3), seed=5)
     forward = [communicator.plan(past) for past in rounds]
     torch.manual_seed(1)
     state = torch.get_rng_state()
     backward = [communicator.plan(past) for past in reversed(rounds)][::-1]
     assert torch.equal(torch.get_rng_state(), state)
     fresh = Communicator(
-        Person(human(), someone.draws), ExpectedUtility(WORLD, 4, branch=0.3), seed=5
+        Person(human(), someone.draws), ExpectedUtility(WORLD, 4, enumerate_above=0.3), seed=5
     )
     for past, one, other in zip(rounds, forward, backward, strict=True):
         assert same(one, other)
@@ -373,7 +373,9 @@ def test_nothing_is_kept_between_decisions(rounds, generator):
 def test_another_seed_is_other_luck(rounds, generator):
     someone = Person(human(), varied_draws(6, generator))
     one, other = (
-        Communicator(someone, ExpectedUtility(WORLD, 4, branch=1), seed=seed).plan(rounds[0])
+        Communicator(someone, ExpectedUtility(WORLD, 4, enumerate_above=1), seed=seed).plan(
+            rounds[0]
+        )
         for seed in (0, 1)
     )
     assert not torch.equal(one.found.valued.utility[0], other.found.valued.utility[0])
@@ -397,7 +399,7 @@ def test_cross_entropy_finds_what_trying_everything_finds(seed):
     past, _ = random_round(3, generator)
     utility = ExpectedUtility(WORLD, 3)
     every, searched = (
-        Communicator(someone, utility, search, sure=0.0).plan(past)
+        Communicator(someone, utility, search, min_standard_errors=0.0).plan(past)
         for search in (Exhaustive(), CrossEntropy(1))
     )
     assert searched.gain.mean == pytest.approx(every.gain.mean, abs=1e-4)

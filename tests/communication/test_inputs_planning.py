@@ -349,9 +349,9 @@ def test_a_person_is_of_a_human_model():
 
 
 def test_numbers_of_any_kind_make_the_same_communicator(someone):
-    one = Communicator(someone, ExpectedUtility(WORLD, 2), sure=1.0, seed=3)
+    one = Communicator(someone, ExpectedUtility(WORLD, 2), min_standard_errors=1.0, seed=3)
     utility = ExpectedUtility(WORLD, np.int64(2))
-    other = Communicator(someone, utility, sure=np.float32(1), seed=np.int64(3))
+    other = Communicator(someone, utility, min_standard_errors=np.float32(1), seed=np.int64(3))
     assert one.plan(going_on(1)).gain == other.plan(going_on(1)).gain
 
 
@@ -363,9 +363,9 @@ OTHERS = {
     ),
     "a class": ({"objective": ExpectedUtility}, "with the method at, not ExpectedUtility"),
     "a number": ({"search": 3}, "search must be a search, with the method __call__, not 3"),
-    "text": ({"sure": "2"}, "sure must be a number, not '2'"),
-    "nan": ({"sure": NAN}, "sure must be at least 0, not nan"),
-    "below 0": ({"sure": -0.5}, "sure must be at least 0, not -0.5"),
+    "text": ({"min_standard_errors": "2"}, "min_standard_errors must be a number, not '2'"),
+    "nan": ({"min_standard_errors": NAN}, "min_standard_errors must be at least 0, not nan"),
+    "below 0": ({"min_standard_errors": -0.5}, "min_standard_errors must be at least 0, not -0.5"),
     "half a seed": ({"seed": 1.5}, "seed must be a whole number, not 1.5"),
     "a large seed": (
         {"seed": 2**60},

@@ -1,5 +1,6 @@
 """What was told or seen lasts: in what people perceive and believe, and in planning."""
 
+import example_course
 import pytest
 import torch
 from example_course import beliefs_of
@@ -17,9 +18,8 @@ from example_person import (
     person,
 )
 
-from mirror_ppl.communication.minds import Looks
 from mirror_ppl.domains.driving import CARS, DrivingState
-from mirror_ppl.models import View, course
+from mirror_ppl.models import View
 from mirror_ppl.models.implants import assumption_sites
 
 STEPS = 4
@@ -71,7 +71,7 @@ def far_off(steps=STEPS):
 def perceived(implants=None, steps=STEPS, **told):
     nothing = torch.zeros(1, steps, 4, dtype=torch.bool)
     given = dict.fromkeys(NAMES, nothing) | told
-    return course.perceived(human(), implants or viewer(), far_off(steps), given)
+    return example_course.perceived(human(), implants or viewer(), far_off(steps), given)
 
 
 def parts_of(view):
@@ -235,17 +235,16 @@ def test_beliefs_about_a_car_shown_once_are_those_of_one_that_closes_in(car):
 # --- planning step by step --------------------------------------------------------------------
 
 
-def look(parent, past, message, action):
-    """One look at the present of a round."""
+def after(beliefs, which, past, message, action):
+    """Beliefs after a step, and which of them somebody has."""
     one = torch.zeros(1, dtype=torch.long)
-    return Looks(
-        parent=parent,
-        eye=one,
-        action=one + action,
-        row=one,
-        observation={name: value[None] for name, value in past.now.items()},
-        told=CHANNELS.split(message[None]),
+    transition = person().transition(
+        one,
+        one + action,
+        {name: value[None] for name, value in past.now.items()},
+        CHANNELS.split(message[None]),
     )
+    return beliefs.at(which).after(transition).distinct()
 
 
 def names(mask):
@@ -272,7 +271,7 @@ def steps_of_planning(*messages):
     beliefs, which = beliefs_before(person(), past)
     result, action = [], len(DOMAIN.actions)
     for message in messages:
-        beliefs, which = beliefs.after(look(which, past, message, action))
+        beliefs, which = after(beliefs, which, past, message, action)
         action = 0
         result.append(lasting(beliefs, which))
     return result
@@ -303,10 +302,10 @@ def test_planning_goes_on_from_what_was_told_in_the_round_so_far():
     past = past.then(CHANNELS.split(flags()), 0, past.now)
     beliefs, which = beliefs_before(person(), past)
     assert lasting(beliefs, which) == (["rear-right"], ["front-left"])
-    after, then = beliefs.after(look(which, past, flags(verbal=["front-right"]), 0))
-    assert lasting(after, then) == (["front-right", "rear-right"], ["front-left"])
-    never = DOMAIN.assume(after.knowledge, past.now)[0]["clear"]["visual"]
+    later, then = after(beliefs, which, past, flags(verbal=["front-right"]), 0)
+    assert lasting(later, then) == (["front-right", "rear-right"], ["front-left"])
+    never = DOMAIN.assume(later.knowledge, past.now)[0]["clear"]["visual"]
     assert names(never[then[0]]) == ["rear-left"]
     # A second sight counts, the first having been before planning began.
-    after, then = beliefs.after(look(which, past, flags(visual=["front-left"]), 0))
-    assert lasting(after, then) == (["front-left", "rear-right"], [])
+    later, then = after(beliefs, which, past, flags(visual=["front-left"]), 0)
+    assert lasting(later, then) == (["front-left", "rear-right"], [])

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from example_course import beliefs_of, gone_through
+from example_course import beliefs_of, gone_through, perceived
 from example_person import (
     CHANNELS,
     DOMAIN,
@@ -24,18 +24,17 @@ from torch.distributions import Independent, Normal, kl_divergence
 from mirror_ppl.communication import (
     Divergence,
     ExpectedUtility,
-    Futures,
     Person,
+    PlanningContext,
+    RolloutTree,
     SelfModelWorld,
     SimulatorWorld,
-    Standing,
     every_message,
 )
 from mirror_ppl.domains.base import total_reward
 from mirror_ppl.domains.driving import CARS, DrivingState
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.course import perceived
 
 ACTIONS = len(DOMAIN.actions)
 
@@ -163,14 +162,14 @@ class HandSet:
     def __init__(self, rewards):
         self.rewards, self.draws = rewards, len(rewards[0])
 
-    def futures(self, past, horizon, generator):
+    def rollouts(self, past, horizon, generator):
         now = {
             name: value[None, None].expand(self.draws, 1, *value.shape)
             for name, value in past.now.items()
         }
         path = torch.zeros(self.draws, 1, dtype=torch.long)
         state = Named(**vars(DOMAIN.state_behind(now)), path=path)
-        return Futures(self, state, now, ACTIONS, horizon)
+        return RolloutTree(self, state, now, ACTIONS, horizon)
 
     def observe(self, state):
         return DOMAIN.observe(state)
@@ -208,8 +207,8 @@ def test_utilities_are_those_of_every_course(
     else:
         real, own = Learned(past, state), SelfModelWorld(self_model())
     expected, predicted = reference(someone, past, real, candidates, horizon, discount)
-    value = ExpectedUtility(own, horizon, discount, branch=0).at(
-        Standing.of(someone, past), 15 - time, 0
+    value = ExpectedUtility(own, horizon, discount, enumerate_above=0).at(
+        PlanningContext.of(someone, past), 15 - time, 0
     )
     valued = value(candidates)
     torch.testing.assert_close(valued.utility, expected, rtol=0, atol=1e-4)
@@ -242,8 +241,8 @@ def test_what_can_no_longer_be_told_at_its_step_changes_nothing_but_its_cost(
     past = begun(0, positions, speeds)
     someone = person(3, front_own=[0, 2, 4], assumes_clear=clear, assumes_closing=closing)
     told, other = flags(**{name: [car]}), flags(verbal=["rear-left"])
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 3, 0.9, branch=0).at(
-        Standing.of(someone, past), 15, 0
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 3, 0.9, enumerate_above=0).at(
+        PlanningContext.of(someone, past), 15, 0
     )
     candidates = [plan(None, None), plan(None, told), plan(told, None), plan(None, told | other)]
     valued = value(torch.stack([*candidates, plan(None, other)]))
@@ -261,7 +260,7 @@ def test_what_can_no_longer_be_told_at_its_step_changes_nothing_but_its_cost(
 def test_silence_after_a_message_is_the_message_alone(generator):
     past, _ = random_round(2, generator)
     someone = Person(human(), varied_draws(4, generator))
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4).at(Standing.of(someone, past), 13, 0)
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4).at(PlanningContext.of(someone, past), 13, 0)
     told = flags(visual=["front-left"], verbal=["rear-right"])
     short, long = value(plan(told)[None]), value(plan(told, None, None)[None])
     torch.testing.assert_close(short.utility, long.utility)
@@ -283,7 +282,7 @@ def test_keeping_some_courses_by_chance_is_right_on_average(seed, branch):
     def value(number, branch, seed):
         someone = person(number, consistency=0.3, lapse=0.1)
         return ExpectedUtility(SimulatorWorld(DOMAIN), 4, 0.9, branch).at(
-            Standing.of(someone, past), 15, seed
+            PlanningContext.of(someone, past), 15, seed
         )
 
     exact, valued = value(1, 0, 0)(candidates), value(number, branch, seed)(candidates)
@@ -305,7 +304,9 @@ def test_at_branch_one_each_draw_follows_a_single_course():
     rewards = [torch.zeros(1, 2), torch.zeros(1, 4), torch.arange(4.0).repeat_interleave(2)[None]]
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(200, consistency=0.3)
-    value = ExpectedUtility(HandSet(rewards), 3, branch=1).at(Standing.of(someone, past), 15, 0)
+    value = ExpectedUtility(HandSet(rewards), 3, enumerate_above=1).at(
+        PlanningContext.of(someone, past), 15, 0
+    )
     followed = value(plan(None)[None]).utility[0]
     torch.testing.assert_close(followed, followed.round(), rtol=0, atol=1e-5)
     assert set(followed.round().long().tolist()) == {0, 1, 2, 3}
@@ -317,9 +318,9 @@ def test_what_could_be_gained_beyond_the_steps_looked_at_counts_if_asked_for():
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(3, consistency=0.0)
 
-    def worth(beyond, steps_left, discount=1.0, branch=0):
-        objective = ExpectedUtility(HandSet(rewards), 2, discount, branch, beyond)
-        value = objective.at(Standing.of(someone, past), steps_left, 0)
+    def worth(terminal_value, steps_left, discount=1.0, enumerate_above=0):
+        objective = ExpectedUtility(HandSet(rewards), 2, discount, enumerate_above, terminal_value)
+        value = objective.at(PlanningContext.of(someone, past), steps_left, 0)
         return value(torch.stack([plan(None), plan(flags(verbal=["front-left"]))])).utility
 
     cost = torch.tensor([[0.0], [0.03]])
@@ -327,10 +328,10 @@ def test_what_could_be_gained_beyond_the_steps_looked_at_counts_if_asked_for():
         expected = discount**2 * 101.5 - cost
         torch.testing.assert_close(worth(True, 15, discount), expected.expand(2, 3))
     assert torch.equal(worth(False, 15), -cost.expand(2, 3))
-    # At the end of the round there is nothing beyond.
+    # At the end of the round there is nothing to gain after it.
     assert torch.equal(worth(True, 2), -cost.expand(2, 3))
     # A single course each, kept by chance: its last step is the mean of both actions.
-    alone = worth(True, 15, branch=1)
+    alone = worth(True, 15, enumerate_above=1)
     torch.testing.assert_close(alone + cost, (alone + cost).round(), rtol=0, atol=1e-4)
     assert set(alone[0].tolist()) <= {101, 102}
 
@@ -339,9 +340,9 @@ def test_what_is_kept_by_chance_is_small_however_much_is_to_gain():
     """Four courses end at 100 to 103, each with a weight of 0 or 0.8 for its 0.25."""
     rewards = [torch.zeros(1, 2), torch.zeros(1, 4)]
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
-    objective = ExpectedUtility(HandSet(rewards), 2, branch=0.8, beyond=True)
-    standing = Standing.of(person(2000, consistency=0.0), past)
-    worth = objective.at(standing, 15, 0)(plan(None)[None]).utility[0]
+    objective = ExpectedUtility(HandSet(rewards), 2, enumerate_above=0.8, terminal_value=True)
+    context = PlanningContext.of(person(2000, consistency=0.0), past)
+    worth = objective.at(context, 15, 0)(plan(None)[None]).utility[0]
     assert abs(worth.mean() - 101.5) < 4.5 * worth.std() / len(worth) ** 0.5
     assert worth.std() > 0
     assert worth.min() > 99
@@ -350,15 +351,15 @@ def test_what_is_kept_by_chance_is_small_however_much_is_to_gain():
 
 def test_paths_are_worked_out_when_they_are_asked_for():
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
-    futures = SimulatorWorld(DOMAIN).futures(past, 5, torch.Generator())
+    rollouts = SimulatorWorld(DOMAIN).rollouts(past, 5, torch.Generator())
     path, action = torch.tensor([0, 0, 0]), torch.tensor([1, 0, 1])
-    first = futures.follow(0, path, action)
+    first = rollouts.follow(0, path, action)
     assert first.tolist() == [1, 0, 1]
-    assert futures.names(1).tolist() == [0, 1]
-    later = futures.follow(1, first, torch.tensor([1, 1, 1]))
-    assert futures.names(2)[later].tolist() == [3, 1, 3]
-    more = futures.follow(1, torch.tensor([1, 0]), torch.tensor([0, 1]))
-    assert futures.names(2)[more].tolist() == [2, 1]
+    assert rollouts.names(1).tolist() == [0, 1]
+    later = rollouts.follow(1, first, torch.tensor([1, 1, 1]))
+    assert rollouts.names(2)[later].tolist() == [3, 1, 3]
+    more = rollouts.follow(1, torch.tensor([1, 0]), torch.tensor([0, 1]))
+    assert rollouts.names(2)[more].tolist() == [2, 1]
     # Those that were there already are the same as before.
     assert more[1] == later[1]
     # What is seen and gained on a path is what happens if its actions are taken.
@@ -368,20 +369,20 @@ def test_paths_are_worked_out_when_they_are_asked_for():
         following = DOMAIN.transition(state, action)
         here = [0, 1][step]
         reward = total_reward(DOMAIN.rewards(state, action, following))
-        assert futures.rewards(step)[0, here, done] == reward
+        assert rollouts.rewards(step)[0, here, done] == reward
         state = following
     seen = DOMAIN.observe(state)
-    for name, value in futures.observation(2).items():
+    for name, value in rollouts.observation(2).items():
         assert torch.equal(value[0, more[0]], seen[name])
     torch.testing.assert_close(
-        futures.values(2)[0, more[0]], DOMAIN.reference_values(state, 1.0).amax(-1)
+        rollouts.values(2)[0, more[0]], DOMAIN.reference_values(state, 1.0).amax(-1)
     )
 
 
 def test_more_steps_than_can_be_named_are_refused():
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     with pytest.raises(ValueError, match="of 2 actions at most 62 steps can be looked ahead"):
-        SimulatorWorld(DOMAIN).futures(past, 63, torch.Generator())
+        SimulatorWorld(DOMAIN).rollouts(past, 63, torch.Generator())
 
 
 def test_all_candidates_have_the_same_luck():
@@ -392,8 +393,8 @@ def test_all_candidates_have_the_same_luck():
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(20, consistency=0.0)
     candidates = every_message(torch.ones(8, dtype=torch.bool))[:, None]
-    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0.4).at(
-        Standing.of(someone, past), 15, 0
+    value = ExpectedUtility(SimulatorWorld(DOMAIN), 4, enumerate_above=0.4).at(
+        PlanningContext.of(someone, past), 15, 0
     )
     utility = value(candidates).utility
     assert utility[0].std() > 0.1
@@ -410,9 +411,13 @@ def test_steps_after_the_end_of_the_round_do_not_count(generator):
     someone = Person(human(), varied_draws(4, generator))
     candidates = candidates_of(past, generator, 4)
     world = SimulatorWorld(DOMAIN)
-    cut = ExpectedUtility(world, 6, 0.9, 0).at(Standing.of(someone, past), 2, 0)(candidates)
-    short = ExpectedUtility(world, 2, 0.9, 0).at(Standing.of(someone, past), 11, 0)(candidates)
-    longer = ExpectedUtility(world, 3, 0.9, 0).at(Standing.of(someone, past), 11, 0)(candidates)
+    cut = ExpectedUtility(world, 6, 0.9, 0).at(PlanningContext.of(someone, past), 2, 0)(candidates)
+    short = ExpectedUtility(world, 2, 0.9, 0).at(PlanningContext.of(someone, past), 11, 0)(
+        candidates
+    )
+    longer = ExpectedUtility(world, 3, 0.9, 0).at(PlanningContext.of(someone, past), 11, 0)(
+        candidates
+    )
     assert cut.actions.shape == (5, 2, ACTIONS)
     torch.testing.assert_close(cut.utility, short.utility)
     torch.testing.assert_close(cut.actions, short.actions)
@@ -430,7 +435,7 @@ def test_messages_are_charged_at_the_step_at_which_they_are_sent(discount):
     silence = plan(None, None, None)
     candidates = torch.stack([silence, plan(two, None, None), plan(None, two, three)])
     value = ExpectedUtility(SimulatorWorld(DOMAIN), 5, discount).at(
-        Standing.of(someone, past), 15, 0
+        PlanningContext.of(someone, past), 15, 0
     )
     gain = value(candidates).utility - value(candidates).utility[:1]
     expected = torch.tensor([0, -0.04, -(0.04 * discount + 0.27 * discount**2)])
@@ -441,7 +446,9 @@ def test_messages_are_charged_at_the_step_at_which_they_are_sent(discount):
 def test_rewards_are_discounted_by_step(discount, total):
     past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
     world = HandSet([torch.ones(1, ACTIONS ** (h + 1)) for h in range(4)])
-    value = ExpectedUtility(world, 4, discount, branch=0).at(Standing.of(person(), past), 15, 0)
+    value = ExpectedUtility(world, 4, discount, enumerate_above=0).at(
+        PlanningContext.of(person(), past), 15, 0
+    )
     assert value(plan(None)[None]).utility.item() == pytest.approx(total, abs=1e-5)
 
 
@@ -449,7 +456,9 @@ def test_draws_are_dealt_out_over_draws_of_the_world():
     past = begun(0, [30, 30, -30, -30], [1, 1, -1, -1])
     own = torch.tensor([1.0, 10.0, 100.0])[:, None]
     world = HandSet([own.expand(3, ACTIONS ** (h + 1)) for h in range(2)])
-    value = ExpectedUtility(world, 2, branch=0).at(Standing.of(person(7), past), 15, 0)
+    value = ExpectedUtility(world, 2, enumerate_above=0).at(
+        PlanningContext.of(person(7), past), 15, 0
+    )
     expected = torch.tensor([[2.0, 20, 200, 2, 20, 200, 2]])
     torch.testing.assert_close(value(plan(None)[None]).utility, expected)
 
@@ -460,8 +469,8 @@ def test_draws_are_dealt_out_over_draws_of_the_world():
         ({"horizon": 0}, "horizon must be at least 1, not 0"),
         ({"discount": 0.0}, "discount must be above 0 and at most 1, not 0.0"),
         ({"discount": 1.1}, "discount must be above 0 and at most 1, not 1.1"),
-        ({"branch": -0.1}, "branch must be from 0 to 1, not -0.1"),
-        ({"branch": 1.5}, "branch must be from 0 to 1, not 1.5"),
+        ({"enumerate_above": -0.1}, "enumerate_above must be from 0 to 1, not -0.1"),
+        ({"enumerate_above": 1.5}, "enumerate_above must be from 0 to 1, not 1.5"),
     ],
 )
 def test_impossible_options_are_refused(options, message):
@@ -499,7 +508,7 @@ def test_divergence_is_that_of_two_gaussians(generator, time, measure, weight):
     past, _ = random_round(time, generator)
     someone = Person(human(), varied_draws(4, generator))
     candidates = candidates_of(past, generator, 2)
-    valued = Divergence(weight, measure).at(Standing.of(someone, past), 5, 0)(candidates)
+    valued = Divergence(weight, measure).at(PlanningContext.of(someone, past), 5, 0)(candidates)
     assert valued.actions is None
     mine = robot(past)
     for c, candidate in enumerate(candidates):
@@ -521,7 +530,7 @@ def test_models_without_a_density_are_refused(generator):
     past, _ = random_round(1, generator)
     model = Averaging(self_model())
     with pytest.raises(HumanModelError) as error:
-        Divergence().at(Standing.of(Person(model, implants(2, model)), past), 5, 0)
+        Divergence().at(PlanningContext.of(Person(model, implants(2, model)), past), 5, 0)
     assert str(error.value) == (
         "beliefs of Averaging have no density like the robot's, which mirror-kl compares: its "
         "believe returns no Gaussian, or one of another size"

@@ -19,7 +19,7 @@ from pyro import poutine
 from pyro.infer import Predictive
 
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
-from mirror_ppl.communication.minds import Standing
+from mirror_ppl.communication.person import PlanningContext
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.prior import draw_prior
@@ -86,20 +86,20 @@ def test_predictions_of_messages_are_those_of_the_program(kind, generator):
     draws = draws_of(human, generator)
     past, state = random_round(TIME, generator)
     person = Person(human, draws)
-    standing = Standing.of(person, past)
+    context = PlanningContext.of(person, past)
     latents = {
-        name: value[standing.person.eye].view(-1, 1, 1)
-        for name, value in standing.person.eyes.items()
+        name: value[context.person.percept].view(-1, 1, 1)
+        for name, value in context.person.percepts.items()
         if name not in draws
     }
     assert bool(latents) == human.has_round_latents
-    objective = ExpectedUtility(SimulatorWorld(DOMAIN), horizon=2, branch=0.0)
+    objective = ExpectedUtility(SimulatorWorld(DOMAIN), horizon=2, enumerate_above=0.0)
     allowed = CHANNELS.join(DOMAIN.communicable(past.now))
     items = [torch.eye(len(allowed), dtype=torch.bool)[place] for place in range(len(allowed))]
     silence = torch.zeros_like(allowed)
     some = [silence, allowed, items[0] & allowed, items[5] & allowed]
     candidates = torch.stack([torch.stack(pair) for pair in product(some, some[:2])])
-    found = objective.at(standing, 2, 0)(candidates).actions
+    found = objective.at(context, 2, 0)(candidates).actions
     for candidate, actions in zip(candidates, found, strict=True):
         expected = torch.zeros(len(DOMAIN.actions))
         for action in range(len(DOMAIN.actions)):

@@ -2,7 +2,7 @@
 
 import torch
 
-from mirror_ppl.communication import Channels, Person, RoundSoFar, Standing
+from mirror_ppl.communication import Channels, Person, PlanningContext, RoundSoFar
 from mirror_ppl.domains import get_domain
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.self_model import SelfModel
@@ -12,7 +12,7 @@ CHANNELS = Channels(WORLD)
 TELLING = {"middle-left", "middle-right", "top-left", "top-middle", "top-right"}
 
 
-def standing(radius):
+def context(radius):
     """Somebody at the entrance who sees so far; three draws of all else."""
     torch.manual_seed(0)
     human = HumanModel(SelfModel(WORLD))
@@ -27,7 +27,7 @@ def standing(radius):
     state = WORLD.initial(1, torch.Generator(), torch.tensor([1]))
     now = {name: value[0] for name, value in WORLD.observe(state).items()}
     past = RoundSoFar.begin(WORLD, now)
-    return Standing.of(Person(human, draws), past)
+    return PlanningContext.of(Person(human, draws), past)
 
 
 def items(flags):
@@ -36,16 +36,16 @@ def items(flags):
 
 def test_what_a_portion_shows_for_less_need_not_be_said():
     everything = torch.ones(len(CHANNELS), dtype=torch.bool)
-    found = items(standing(1.5).telling(everything))
+    found = items(context(1.5).telling(everything))
     assert found == {("visual", item) for item in TELLING}
     # Where it cannot be shown, it is said.
     speech = torch.tensor([name == "verbal" for name, _ in CHANNELS.pairs])
-    assert items(standing(1.5).telling(speech)) == items(speech)
+    assert items(context(1.5).telling(speech)) == items(speech)
 
 
 def test_who_sees_the_house_is_told_nothing():
     everything = torch.ones(len(CHANNELS), dtype=torch.bool)
-    assert not standing(10.0).telling(everything).any()
+    assert not context(10.0).telling(everything).any()
 
 
 def test_costs_of_one_item_more():

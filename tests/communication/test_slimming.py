@@ -28,12 +28,14 @@ class Additive:
         return Valued(utility + self.later * candidates[:, 1:].flatten(1).any(1)[:, None], None)
 
 
-def chosen_of(value, *candidates, sure=2.0):
+def chosen_of(value, *candidates, min_standard_errors=2.0):
     """The plan that is left of the best of these."""
     candidates = torch.stack([plan(None, None), *candidates])
     found = Found(candidates, value(candidates))
     value.valued = 0
-    found, index = slimmed(value, found, choose(found.valued, sure), sure)
+    found, index = slimmed(
+        value, found, choose(found.valued, min_standard_errors), min_standard_errors
+    )
     assert torch.equal(value(found.candidates).utility, found.valued.utility)
     return found.candidates[index]
 
@@ -57,12 +59,12 @@ def test_the_least_sure_item_goes_first_until_all_are_sure():
     assert value.valued == 3 + 2 + 0 + 7
 
 
-@pytest.mark.parametrize(("sure", "kept"), [(0.0, True), (1.5, True), (2.5, False)])
-def test_an_item_has_to_be_worth_it_surely(sure, kept):
+@pytest.mark.parametrize(("min_standard_errors", "kept"), [(0.0, True), (1.5, True), (2.5, False)])
+def test_an_item_has_to_be_worth_it_surely(min_standard_errors, kept):
     # One draw in four gains 1, at a cost of 0: the mean is 0.25, its standard error 0.25; with
     # 0.25 more for all, 0.5 and 0.25.
     value = Additive([(FRONT, [1.25, 0.25, 0.25, 0.25]), (REAR, 1.0)])
-    left = chosen_of(value, plan(FRONT | REAR, None), sure=sure)
+    left = chosen_of(value, plan(FRONT | REAR, None), min_standard_errors=min_standard_errors)
     assert torch.equal(left, plan(FRONT | REAR if kept else REAR, None))
 
 

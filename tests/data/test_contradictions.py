@@ -7,7 +7,7 @@ import pytest
 import torch
 from running import command
 
-from mirror_ppl import fit
+from mirror_ppl.commands import fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain

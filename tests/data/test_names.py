@@ -7,7 +7,7 @@ import pytest
 from matplotlib.text import Text
 from running import command
 
-from mirror_ppl import compare, fit
+from mirror_ppl.commands import compare, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations, to_dataset
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.plots.picture import Picture, displayable, label_of

@@ -4,12 +4,12 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from example_course import perceived
 from example_person import DOMAIN, human, self_model
 
 from mirror_ppl.domains.driving import CAR_LANES, DrivingState
 from mirror_ppl.domains.driving_knowledge import ROAD_END, CarKnowledge, assumed_cars
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import assumption_sites, sight_sites
 from mirror_ppl.people.driving import Memory, in_sight, remember
 

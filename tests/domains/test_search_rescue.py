@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from example_course import perceived
 
 from mirror_ppl.domains import Domain
 from mirror_ppl.domains.rescue_house import (
@@ -23,7 +24,6 @@ from mirror_ppl.domains.search_rescue import UTTERANCES, RescueState, SearchResc
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.course import perceived
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.training.views import draw_views
 

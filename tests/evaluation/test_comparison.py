@@ -13,8 +13,8 @@ import xarray as xr
 from matplotlib.container import ErrorbarContainer
 from running import command
 
-from mirror_ppl import compare, fit
 from mirror_ppl.arviz import az
+from mirror_ppl.commands import compare, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import OptionError, PosteriorError
 from mirror_ppl.evaluation.comparison import compare_fits, label_models, read_fit

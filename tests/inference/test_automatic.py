@@ -18,7 +18,9 @@ from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
-QUICK = AutomaticOptions(AmortizedOptions(256, 100.0), ImportanceOptions(256, 100.0), enough=50)
+QUICK = AutomaticOptions(
+    AmortizedOptions(256, ImportanceOptions(256, 100.0)), ImportanceOptions(256, 100.0), enough=50
+)
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from running import command
 from scipy import stats
 from test_views import ragged
 
-from mirror_ppl import calibrate as calibrate_command
-from mirror_ppl import fit, simulate, train
+from mirror_ppl.commands import calibrate as calibrate_command
+from mirror_ppl.commands import fit, simulate, train
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
 from mirror_ppl.inference import importance
@@ -70,7 +70,7 @@ def options_of(guide):
 
 QUICK = {
     "importance": ImportanceOptions(256, 100.0),
-    "amortized": AmortizedOptions(256, 100.0),
+    "amortized": AmortizedOptions(256, ImportanceOptions(256, 100.0)),
 }
 """Settings of the engines that are calibrated here."""
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from running import command
 
-from mirror_ppl import fit
 from mirror_ppl.arviz import az
+from mirror_ppl.commands import fit
 from mirror_ppl.data import load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import CheckpointError, PosteriorError

@@ -93,7 +93,7 @@ def test_one_person_can_be_planned_for(path, draws):
     person = Person(human(), {name: value[:, 1:2] for name, value in back.items()})
     assert person.number == 4
     own = torch.stack([draws[name][[0, 3, 5, 8], 1, 0] for name in SIGHTS], -1)
-    seen = torch.stack([person.eyes[name][person.eye] for name in SIGHTS], -1)
+    seen = torch.stack([person.percepts[name][person.percept] for name in SIGHTS], -1)
     assert torch.equal(seen, own)
 
 

@@ -7,9 +7,10 @@ import torch
 from running import command
 from scipy import stats
 
-from mirror_ppl import fit
+from mirror_ppl.commands import fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import InputError
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
 from mirror_ppl.inference.amortized_guide import (
     AmortizedGuide,
@@ -55,7 +56,7 @@ def test_refined_draws_have_the_exact_posterior_and_more_of_them_count(toy, reco
     for person, builder in enumerate(person_builders(toy, recordings, guide_screening())):
         for refine, counts in effective.items():
             torch.manual_seed(person)
-            options = AmortizedOptions(512, stages=1, refine=refine)
+            options = AmortizedOptions(512, ImportanceOptions(stages=0), refine)
             found = sample_amortized(toy, network, builder, options)
             counts.append(found.effective)
             assert found.pareto_k < 0.7

@@ -7,12 +7,18 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from example_course import gone_through
+from example_course import gone_through, perceived
 from paths import EXAMPLES
 from test_views import ragged
 
-from mirror_ppl.communication import Communicator, ExpectedUtility, Person, RoundSoFar, Standing
-from mirror_ppl.communication.worlds import SelfModelWorld
+from mirror_ppl.communication import (
+    Communicator,
+    ExpectedUtility,
+    Person,
+    PlanningContext,
+    RoundSoFar,
+)
+from mirror_ppl.communication.rollouts import SelfModelWorld
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
@@ -36,7 +42,6 @@ from mirror_ppl.likelihood.tables import (
 )
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import first_success, noticed_sites, policy_implants
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
@@ -471,11 +476,11 @@ def test_who_acts_as_if_they_saw_has_noticed(self_model, recordings):
     for site in ("residual_in", "residual_out"):
         draws[site] = draws[site] * 0
     someone = Person(human, draws)
-    assert someone.eye_count == 1
+    assert someone.percept_count == 1
     for time in (0, 9):
         past = past_of(recordings, time)
         there = someone.in_round(past)
-        when = there.eyes[NOTICED[0]][there.eye]
+        when = there.percepts[NOTICED[0]][there.percept]
         log_weights = geometric(0.3).log()
         if time:
             each = by_hand(human, {n: v[0] for n, v in draws.items()}, recordings, 0, 0)
@@ -484,8 +489,8 @@ def test_who_acts_as_if_they_saw_has_noticed(self_model, recordings):
         found = torch.bincount(when, minlength=STEPS + 1) / 300
         error = 5 * (expected * (1 - expected) / 300).sqrt() + 1e-3
         assert ((found - expected).abs() < error).all()
-        assert there.in_round(past).eyes.keys() == there.eyes.keys()
-    assert someone.eye_count == 1  # untouched
+        assert there.in_round(past).percepts.keys() == there.percepts.keys()
+    assert someone.percept_count == 1  # untouched
     bare = HumanModel(self_model)
     unchanged = Person(bare, drawn(bare, 2))
     assert unchanged.in_round(past_of(recordings, 3)) is unchanged
@@ -505,7 +510,7 @@ def test_rare_attention_is_found_out(self_model, recordings):
     for number in range(10):
         past = past_of(recordings.select_rounds([number]), 12)
         there = someone.in_round(past)
-        away = (there.eyes["away"][there.eye] == 1).double().mean()
+        away = (there.percepts["away"][there.percept] == 1).double().mean()
         values = torch.tensor([0.0, 1.0])
         alike = {n: value[:1] for n, value in draws.items()}
         log_chances = Person(human, alike)._log_chances({"away": values}, past)[0]
@@ -523,8 +528,8 @@ def test_a_communicator_plans_for_somebody_who_attends(per_item, recordings):
     for time in (0, 5):
         past = past_of(recordings, time)
         assert communicator.plan(past).message == communicator.plan(past).message
-        standing = Standing.of(someone, past)
-        assert standing.person.eye_count > someone.eye_count
+        context = PlanningContext.of(someone, past)
+        assert context.person.percept_count > someone.percept_count
 
 
 # --- what a user may get wrong

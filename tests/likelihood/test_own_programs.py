@@ -14,7 +14,7 @@ from pyro.infer.autoguide import AutoNormal
 from test_one_program import recordings
 
 from benchmarks.one_program import exact_mean, toy
-from mirror_ppl.communication.minds import Person
+from mirror_ppl.communication.person import Person
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference import batches
 from mirror_ppl.inference.engines import InferenceOptions, infer

@@ -6,12 +6,11 @@ from itertools import permutations
 import pyro
 import pytest
 import torch
-from example_course import beliefs_of
+from example_course import beliefs_of, perceived
 from example_person import beliefs_before
 from pyro import poutine
 
 from mirror_ppl.communication import Person, RoundSoFar
-from mirror_ppl.communication.minds import Looks
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
@@ -24,7 +23,6 @@ from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.bomb_defusal import BombDefusalHuman
-from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
@@ -268,7 +266,7 @@ def test_who_is_in_a_round_has_not_found_what_they_wait_for(defuser):
         now = {name: value[0, step] for name, value in observation.items()}
         rounds = rounds.then(quiet, WAIT, now)
     person = Person(defuser, draws).in_round(rounds)
-    found = person.eyes["found_0"][person.eye]
+    found = person.percepts["found_0"][person.percept]
     assert len(found) == 40 and found.unique().numel() > 1
 
 
@@ -281,7 +279,7 @@ def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(defuser):
     now = {name: value[0, :1] for name, value in observation.items()}
     eyes = {f"found_{stage}": torch.tensor([0, 1]) for stage in range(3)}
     eyes |= {"guess": torch.tensor([1, 1]), "reads_type": torch.tensor([0, 0])}
-    person.eyes, person.eye, person.eye_count = eyes, torch.arange(2), 2
+    person.percepts, person.percept, person.percept_count = eyes, torch.arange(2), 2
     rounds = RoundSoFar.begin(WORLD, {name: value[0, 0] for name, value in observation.items()})
     beliefs, own = beliefs_before(person, rounds)
     quiet = {"visual": torch.zeros(2, 6).bool(), "verbal": torch.zeros(2, 1).bool()}
@@ -289,8 +287,8 @@ def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(defuser):
     for step in range(3):
         last = 5 if step == 0 else WAIT
         now = {name: value[0, step : step + 1] for name, value in observation.items()}
-        looks = Looks(own, torch.arange(2), torch.full((2,), last), own * 0, now, quiet)
-        beliefs, own = beliefs.after(looks)
+        step_of = person.transition(torch.arange(2), torch.full((2,), last), now, quiet)
+        beliefs, own = beliefs.at(own).after(step_of).distinct()
         numbers.append((len(beliefs.mean), own.tolist()))
     # One found it at once, the other after a step: as that says other things, they never agree.
     assert [number for number, _ in numbers] == [2, 2, 2]
@@ -303,8 +301,8 @@ def test_beliefs_that_stay_are_the_same_whenever_they_were_formed(defuser):
         # Later the second course is in another future, in which all is as in the first.
         two = {name: value.repeat(2, *(1,) * (value.dim() - 1)) for name, value in now.items()}
         rows, heard = (torch.arange(2), quiet) if step else (own * 0, both)
-        looks = Looks(own, torch.arange(2), torch.full((2,), last), rows, two, heard)
-        beliefs, own = beliefs.after(looks)
+        step_of = person.transition(torch.arange(2), torch.full((2,), last), two, heard, rows)
+        beliefs, own = beliefs.at(own).after(step_of).distinct()
         assert len(beliefs.mean) == 1
         assert own.tolist() == [0, 0]
 

@@ -2,13 +2,12 @@
 
 import pytest
 import torch
-from example_course import beliefs_of, gone_through
+from example_course import beliefs_of, gone_through, perceived
 from test_bomb_defusal_human import WORLD, course, implants
 
 from mirror_ppl.domains.bomb_panel import RULES
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.bomb_defusal import RULE, BombDefusalHuman
-from mirror_ppl.models.course import perceived
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.self_model import SelfModel

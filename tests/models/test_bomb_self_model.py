@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mirror_ppl.commands.train import Options, main
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.evaluation.self_model import fixed_views, self_model_quality
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import PAPER, SIZES
 from mirror_ppl.models.weights import load_self_model
-from mirror_ppl.train import Options, main
 from mirror_ppl.training.experience import experience
 from mirror_ppl.training.self_model import (
     SelfModelOptions,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pyro
 import pytest
 import torch
-from example_course import beliefs_of
+from example_course import beliefs_of, perceived
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
 from mirror_ppl.data import asset_path, load_demonstrations
@@ -23,7 +23,6 @@ from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models import HumanModel, View
-from mirror_ppl.models.course import perceived
 from mirror_ppl.models.implants import (
     RESIDUAL_HIDDEN,
     assumption_sites,

@@ -6,7 +6,7 @@ import pytest
 import torch
 from running import command
 
-from mirror_ppl import assist, fit, simulate
+from mirror_ppl.commands import assist, fit, simulate
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combinations import perceived_sites

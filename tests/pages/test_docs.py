@@ -16,8 +16,8 @@ from paths import ROOT
 from pyro import poutine
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
-from mirror_ppl import assist, console, evaluate
-from mirror_ppl.__main__ import COMMANDS
+from mirror_ppl import console
+from mirror_ppl.commands import COMMANDS, assist, evaluate
 from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
@@ -42,6 +42,13 @@ from mirror_ppl.training.self_model import SelfModelOptions
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 EXAMPLE = "docs/examples/late_reactions.py:LatePerson"
+
+
+def imported(module):
+    """What `python -m module` runs, to call it here."""
+    if module == "mirror_ppl":
+        return importlib.import_module("mirror_ppl.__main__")
+    return importlib.import_module(module.replace("mirror_ppl.", "mirror_ppl.commands."))
 
 
 def name_of(path):
@@ -90,7 +97,7 @@ def make_targets():
 
 
 def run_command(line, *further):
-    module = importlib.import_module(shlex.split(line)[2])
+    module = imported(shlex.split(line)[2])
     args = [*shlex.split(line)[3:], *further]
     return console.run(module.Options, module.main, prog=module.PROGRAM, description="", args=args)
 
@@ -110,7 +117,7 @@ def test_every_command_is_real(where, line):
         assert set(words[1:]) <= make_targets()
         return
     assert words[:2] == ["python", "-m"], f"{where} shows {line}"
-    module = importlib.import_module(words[2])
+    module = imported(words[2])
     assert words[2].removeprefix("mirror_ppl.") in COMMANDS
     options = vars(tyro.cli(module.Options, args=words[3:]))
     # Whom to assist is told by the posterior, and whom to fit by recordings, unless it is said.
@@ -128,7 +135,7 @@ def test_every_command_is_real(where, line):
 def test_commands_in_the_text_are_real():
     for path in PAGES:
         for module in re.findall(r"python -m ([\w.]+)", path.read_text()):
-            importlib.import_module(module if module != "mirror_ppl" else "mirror_ppl.__main__")
+            imported(module)
         assert set(re.findall(r"`make ([a-z]+)", path.read_text())) <= make_targets()
 
 
@@ -182,9 +189,9 @@ def test_tables_of_settings_are_the_defaults(name, heading, options):
 
 def test_options_and_communicators_of_assist_are_told_as_they_are():
     text, options = page("docs/communicator.md"), assist.Options()
-    shown = {row[0].strip("`-"): row[1] for row in table_of(text, "Option")}
+    shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
     assert shown.pop("communicator") == "all of them" and options.communicator == ()
-    for name in ("horizon", "branch", "patience", "sure"):
+    for name in ("horizon", "enumerate_above", "patience", "min_standard_errors"):
         assert shown.pop(name) == "the domain's" and getattr(options, name) is None
     assert shown == {name: str(getattr(options, name)) for name in shown}
     first = " ".join(row[0] for row in table_of(text, "Communicator"))

@@ -12,8 +12,8 @@ from refused import refused
 from running import command
 
 import mirror_ppl
-from mirror_ppl import fit as fit_command
 from mirror_ppl.arviz import az
+from mirror_ppl.commands import fit as fit_command
 from mirror_ppl.communication import RoundSoFar
 from mirror_ppl.data import save_demonstrations
 from mirror_ppl.errors import DemonstrationsError, InputError, UnknownNameError

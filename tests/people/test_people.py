@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
+from mirror_ppl.commands.simulate import DESCRIPTION, PROGRAM, Options, main
 from mirror_ppl.console import run
 from mirror_ppl.data import load_demonstrations
 from mirror_ppl.domains import get_domain
@@ -25,7 +26,6 @@ from mirror_ppl.people.populations import (
     reaches,
 )
 from mirror_ppl.people.recordings import draw_starts, record
-from mirror_ppl.simulate import DESCRIPTION, PROGRAM, Options, main
 
 DOMAIN = Driving()
 TASK = dict(zip(FEATURES, (0.0, -7.0, -2.0, -2.0, 0.0, 0.0, -1.0), strict=True))

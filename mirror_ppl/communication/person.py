@@ -1,18 +1,17 @@
-"""What the person may believe: posterior draws of a human model, carried through a round.
+"""What the person may believe: posterior draws of a human model, tracked through a round.
 
-Beliefs depend on perceptual implants alone, and draws of these repeat; so a belief is worked out
-once for each distinct *eye*, the values of the discrete sites, and once for each distinct thing
-that such an eye may have seen. U stands for distinct eyes, n for beliefs that are tracked.
+Beliefs depend on perceptual implants alone, and draws of these repeat; so beliefs are tracked once
+for each distinct *percept*, the values of the discrete sites (:class:`BeliefState`). U stands for
+distinct percepts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import pyro
 import torch
@@ -22,16 +21,14 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains.base import Observation, Visibility, map_state
+from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import AttentionValues, Proposal
 from mirror_ppl.likelihood.densities import choices, log_weighted_latents
-from mirror_ppl.models.course import perceived
+from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
-from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.prior import checked_draws
-from mirror_ppl.models.view import View
-from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
+from mirror_ppl.row_hashing import distinct_rows
 
 COUNTED = 3
 """Up to how many items of a message have to be cheaper than others that tell the same."""
@@ -47,9 +44,9 @@ class Person:
         draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or what becomes one.
 
     Attributes:
-        eyes: values ``[U]`` of the discrete sites, each combination that occurs in the draws once;
+        percepts: values ``[U]`` of the discrete sites, each combination in the draws once;
             in a round those of attention, too.
-        eye: which of them each draw has, ``[S]``.
+        percept: which of them each draw has, ``[S]``.
 
     Raises:
         HumanModelError: there are no draws, or they are not those of the model's sites.
@@ -73,10 +70,10 @@ class Person:
             if name in self.draws and site["fn"].has_enumerate_support
         }
         self.device = next(iter(self.draws.values())).device
-        self.eyes, self.eye = self._distinct_eyes(self._discrete, self.number)
-        self.eye_count = int(self.eye.max()) + 1
+        self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
+        self.percept_count = int(self.percept.max()) + 1
 
-    def _distinct_eyes(
+    def _distinct_percepts(
         self, values: Mapping[str, Tensor], number: int
     ) -> tuple[dict[str, Tensor], Tensor]:
         """Each combination of values ``[number]`` once, and which of them each is."""
@@ -117,8 +114,10 @@ class Person:
             chosen = torch.multinomial(log_chances.softmax(-1), 1).squeeze(-1)
         own = {name: value[chosen] for name, value in values.values.items()}
         person = copy(self)
-        person.eyes, person.eye = self._distinct_eyes({**self._discrete, **own}, self.number)
-        person.eye_count = int(person.eye.max()) + 1
+        person.percepts, person.percept = self._distinct_percepts(
+            {**self._discrete, **own}, self.number
+        )
+        person.percept_count = int(person.percept.max()) + 1
         return person
 
     @cached_property
@@ -136,21 +135,25 @@ class Person:
         number = len(next(iter(attention.values())))
         total = torch.zeros(self.number, number, device=self.device)
         everybody = copy(self)
-        everybody.eyes = {
-            **{name: value.repeat_interleave(number) for name, value in self.eyes.items()},
-            **{name: value.repeat(self.eye_count) for name, value in attention.items()},
+        everybody.percepts = {
+            **{name: value.repeat_interleave(number) for name, value in self.percepts.items()},
+            **{name: value.repeat(self.percept_count) for name, value in attention.items()},
         }
-        everybody.eye_count = self.eye_count * number
-        eye = self.eye[:, None] * number + torch.arange(number, device=self.device)  # [S, G]
-        for time, (beliefs, own) in enumerate(through(everybody, past)):
-            mean = beliefs.mean[None]
+        everybody.percept_count = self.percept_count * number
+        percept = self.percept[:, None] * number + torch.arange(
+            number, device=self.device
+        )  # [S, G]
+        before = BeliefState.initial(self.human, everybody.percept_count)
+        steps = transitions(everybody, past)
+        for time, state in enumerate(before.through(steps) if steps else ()):
+            mean = state.mean[None]
             acted = past.actions[time].expand(1, mean.shape[1])
             with self._conditioned():
                 _, found = choices(
                     self.human, self.implants, mean, self.human.action_values(mean), acted
                 )
             found = found.expand(self.number, *found.shape[-2:])[:, 0]
-            total = total + found.gather(-1, own[eye])
+            total = total + found.gather(-1, state.belief[percept])
         return total
 
     def _conditioned(self) -> ExitStack:
@@ -161,24 +164,21 @@ class Person:
         stack.enter_context(pyro.plate("person", 1, dim=-2))
         return stack
 
-    def see(self, eye: Tensor, observation: Observation, told: Visibility) -> View:
-        """What eyes ``[n]`` see of rounds ``[n, T, ...]``."""
-        implants = {name: value[eye] for name, value in self.eyes.items()}
-        view = perceived(self.human, implants, observation, told)
-        return view.map(lambda part: part.expand(len(eye), *part.shape[1:]))
-
-    def perceive(
+    def transition(
         self,
-        eye: Tensor,
-        knowledge: Any,
+        percept: Tensor,
+        action: Tensor,
         observation: Observation,
         told: Visibility,
-        step: int,
-    ) -> tuple[View, Any]:
-        """One step of eyes ``[n]`` with knowledge ``[n]``; see `HumanModel.perceive`."""
-        implants = {name: value[eye] for name, value in self.eyes.items()}
-        view, knowledge = self.human.perceive(implants, knowledge, observation, told, step)
-        return view.map(lambda part: part.expand(len(eye), *part.shape[1:])), knowledge
+        row: Tensor | None = None,
+    ) -> Transition:
+        """What leads percepts ``[n]`` to their next step; see :class:`Transition`."""
+        implants = {name: value[percept] for name, value in self.percepts.items()}
+        return Transition(implants, action, observation, told, row)
+
+    def last_action(self, past: RoundSoFar, time: int) -> int:
+        """What was done before a step of a round; the number of actions if nothing was."""
+        return int(past.actions[time - 1]) if time else len(self.human.domain.actions)
 
     def act(self, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities ``[S, M, A]`` of actions at M beliefs of each draw.
@@ -192,153 +192,62 @@ class Person:
         return result.expand(self.number, *result.shape[1:])[:, 0]
 
 
-@dataclass(frozen=True)
-class Looks:
-    """What g looks at the world are: whose, at what, after what.
-
-    Attributes:
-        parent: the belief before, ``[g]``, an index into those of the step before.
-        eye: ``[g]``.
-        action: what was done since, ``[g]``; the number of actions at the start of a round.
-        row: which of the observations is looked at, ``[g]``.
-        observation: the observations, ``[rows, ...]``.
-        told: what is communicated, ``[g, K]`` by modality.
-    """
-
-    parent: Tensor
-    eye: Tensor
-    action: Tensor
-    row: Tensor
-    observation: Observation
-    told: Visibility
+def transitions(person: Person, past: RoundSoFar) -> list[Transition]:
+    """What leads every percept through a round so far, up to before its present step."""
+    every = torch.arange(person.percept_count, device=person.device)
+    return [
+        person.transition(
+            every,
+            torch.full_like(every, person.last_action(past, time)),
+            {name: value[time, None] for name, value in past.observation.items()},
+            {name: mask[time, None] for name, mask in past.told.items()},
+        )
+        for time in range(past.time)
+    ]
 
 
 @dataclass(frozen=True)
-class Beliefs:
-    """What may be believed at one step, each belief once.
-
-    Attributes:
-        person: whose they are.
-        mean: the beliefs ``[n, Z]``.
-        scale: of their densities ``[n, Z]``; ``None`` before the first step, or if they have none.
-        knowledge: the domain's, ``[n]``.
-        step: the number of the next step.
-    """
-
-    person: Person
-    mean: Tensor
-    scale: Tensor | None
-    knowledge: Any
-    step: int
-
-    @classmethod
-    def at_first(cls, person: Person) -> tuple[Beliefs, Tensor]:
-        """Before the first step: one belief, and that it is everybody's, ``[U]``."""
-        human = person.human
-        zero = next(human.parameters()).new_zeros(1, human.belief_size)
-        nothing = human.domain.nothing_known(1, device=zero.device)
-        own = torch.zeros(person.eye_count, dtype=torch.long, device=zero.device)
-        return cls(person, zero, None, nothing, 0), own
-
-    def after(self, looks: Looks) -> tuple[Beliefs, Tensor]:
-        """Beliefs of the next step, and which of them each look leads to ``[g]``.
-
-        Looks that show the same after the same lead to one belief.
-        """
-        human = self.person.human
-        seen = {name: value[looks.row] for name, value in looks.observation.items()}
-        before = _rows(self.knowledge, looks.parent)
-        view, knowledge = self.person.perceive(looks.eye, before, seen, looks.told, self.step)
-        told_by, which = distinct_rows(torch.stack([looks.row, view.numbers()], -1))
-        rows = looks.row[told_by]
-        evidence = human.evidence(
-            view.map(lambda part: part[told_by]),
-            {name: value[rows] for name, value in looks.observation.items()},
-        )
-        known = _whole_numbers(knowledge)
-        first, index = distinct_rows(
-            torch.cat([torch.stack([looks.parent, looks.action, which], -1), *known], -1)
-        )
-        state = human.infer(
-            self.mean[looks.parent[first]],
-            evidence[which[first]],
-            looks.action[first],
-            None if view.still is None else view.still[first],
-        )
-        mean, scale = state if isinstance(state, Gaussian) else (state, None)
-        knowledge = _rows(knowledge, first)
-        if view.still is not None:
-            # Beliefs that stay as they are, are the same ones however long ago they were formed.
-            same, which = distinct_rows(
-                torch.cat([as_whole_numbers(mean), *_whole_numbers(knowledge)], -1)
-            )
-            mean, scale = mean[same], None if scale is None else scale[same]
-            knowledge, index = _rows(knowledge, same), which[index]
-        return Beliefs(self.person, mean, scale, knowledge, self.step + 1), index
-
-
-def through(person: Person, past: RoundSoFar) -> Iterator[tuple[Beliefs, Tensor]]:
-    """Beliefs at each step of a round so far, and which of them each eye has ``[U]``."""
-    beliefs, own = Beliefs.at_first(person)
-    eyes = torch.arange(person.eye_count, device=own.device)
-    none = len(person.human.domain.actions)
-    for time in range(past.time):
-        action = past.actions[time - 1] if time else none
-        looks = Looks(
-            parent=own,
-            eye=eyes,
-            action=torch.full_like(eyes, int(action)),
-            row=torch.zeros_like(eyes),
-            observation={name: value[time, None] for name, value in past.observation.items()},
-            told={name: mask[time].expand(len(eyes), -1) for name, mask in past.told.items()},
-        )
-        beliefs, own = beliefs.after(looks)
-        yield beliefs, own
-
-
-@dataclass(frozen=True)
-class Standing:
+class PlanningContext:
     """A person in the middle of a round, about to look at the present step.
 
     Attributes:
         person: posterior draws of the human model.
         past: the round so far.
-        before: what may be believed before that look.
-        own: which of these beliefs each eye has, ``[U]``.
+        before: what may be believed before that look, each belief once.
+        own: which of these beliefs each percept has, ``[U]``.
     """
 
     person: Person
     past: RoundSoFar
-    before: Beliefs
+    before: BeliefState
     own: Tensor
 
     @classmethod
-    def of(cls, person: Person, past: RoundSoFar) -> Standing:
+    def of(cls, person: Person, past: RoundSoFar) -> PlanningContext:
         """The person at this point of a round."""
         person = person.in_round(past)
-        *_, (before, own) = Beliefs.at_first(person), *through(person, past)
-        return cls(person, past, before, own)
+        state = BeliefState.initial(person.human, person.percept_count)
+        if past.time:
+            state = state.through(transitions(person, past))[-1]
+        return cls(person, past, *state.distinct())
 
     @property
     def last_action(self) -> int:
         """What was done last; the number of actions at the start of a round."""
-        past = self.past
-        return int(past.actions[-1]) if past.time else len(self.person.human.domain.actions)
+        return self.person.last_action(self.past, self.past.time)
 
-    def told(self, messages: Tensor) -> tuple[Beliefs, Tensor]:
-        """Beliefs after messages ``[M, N]`` for now, and which of them each eye has ``[M, U]``."""
-        eyes, number = self.person.eye_count, len(messages)
-        eye = torch.arange(eyes, device=messages.device).repeat(number)
-        looks = Looks(
-            parent=self.own[eye],
-            eye=eye,
-            action=torch.full_like(eye, self.last_action),
-            row=torch.zeros_like(eye),
-            observation={name: value[None] for name, value in self.past.now.items()},
-            told=Channels(self.person.human.domain).split(messages.repeat_interleave(eyes, 0)),
+    def told(self, messages: Tensor) -> tuple[BeliefState, Tensor]:
+        """Beliefs after messages ``[M, N]`` for now, and which each percept has ``[M, U]``."""
+        percepts, number = self.person.percept_count, len(messages)
+        percept = torch.arange(percepts, device=messages.device).repeat(number)
+        transition = self.person.transition(
+            percept,
+            torch.full_like(percept, self.last_action),
+            {name: value[None] for name, value in self.past.now.items()},
+            Channels(self.person.human.domain).split(messages.repeat_interleave(percepts, 0)),
         )
-        beliefs, index = self.before.after(looks)
-        return beliefs, index.view(number, eyes)
+        state, index = self.before.at(self.own[percept]).after(transition).distinct()
+        return state, index.view(number, percepts)
 
     @torch.no_grad()
     def telling(self, allowed: Tensor) -> Tensor:
@@ -368,13 +277,3 @@ class Standing:
         same = (index[:, None] == index).all(-1)
         dearer = alone[places][:, None] >= third[places] - 1e-6  # of rounding
         return (same & dearer).any(1)
-
-
-def _whole_numbers(knowledge: Any) -> list[Tensor]:
-    """A domain's knowledge ``[n]`` as whole numbers, equal where it is equal."""
-    return [as_whole_numbers(getattr(knowledge, part.name)) for part in fields(knowledge)]
-
-
-def _rows(knowledge: Any, rows: Tensor) -> Any:
-    """Some rows of a domain's knowledge."""
-    return map_state(lambda part: part[rows], knowledge)

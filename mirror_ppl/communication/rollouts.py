@@ -1,4 +1,4 @@
-"""Futures of the world under courses of actions, whoever takes them.
+"""RolloutTree of the world under courses of actions, whoever takes them.
 
 What a person is told changes what they do and nothing else, so the world is rolled out once for
 all candidate messages: one future for each sequence of actions that somebody might take. A *path*
@@ -28,7 +28,7 @@ NAMES = 2**62
 """How many paths can have names."""
 
 
-class Roll(Protocol):
+class Dynamics(Protocol):
     """How states ``[W, n]``, any dataclass of tensors, go on."""
 
     def observe(self, state: Any) -> Observation:
@@ -69,11 +69,11 @@ class _Paths:
     left: Tensor | None = None
 
 
-class Futures:
+class RolloutTree:
     """What there will be to observe and to gain.
 
     Args:
-        roll: how states go on.
+        dynamics: how states go on.
         state: now, ``[W, 1]``.
         now: what there is to observe now, ``[W, 1, ...]``.
         actions: how many actions there are, A.
@@ -83,13 +83,15 @@ class Futures:
         ValueError: there are more paths than can have names.
     """
 
-    def __init__(self, roll: Roll, state: Any, now: Observation, actions: int, horizon: int):
+    def __init__(
+        self, dynamics: Dynamics, state: Any, now: Observation, actions: int, horizon: int
+    ):
         if actions**horizon > NAMES:
             raise ValueError(
                 f"of {actions} actions at most {int(62 / math.log2(actions))} steps can be looked "
                 f"ahead, not {horizon}"
             )
-        self.roll, self.actions = roll, actions
+        self.dynamics, self.actions = dynamics, actions
         root = torch.zeros(1, dtype=torch.long, device=now["ego"].device)
         self._steps = [_Paths(state, root, now)]
 
@@ -127,10 +129,10 @@ class Futures:
     def _valued(self, known: Tensor | None, state: Any) -> Tensor:
         """Values of all states ``[W, n]``, of which the first are known."""
         if known is None:
-            return self.roll.value(state)
+            return self.dynamics.value(state)
         first = known.shape[1]
         new = map_state(lambda part: part[:, first:], state)
-        return torch.cat([known, self.roll.value(new)], 1)
+        return torch.cat([known, self.dynamics.value(new)], 1)
 
     def follow(self, step: int, path: Tensor, action: Tensor) -> Tensor:
         """Which paths of one action more these are, ``[E]``; those that are new are worked out.
@@ -148,7 +150,7 @@ class Futures:
         if len(new):
             state = map_state(lambda part: part[:, new], here.following)
             name = here.name[new // self.actions] * self.actions + new % self.actions
-            found = _Paths(state, name, self.roll.observe(state))
+            found = _Paths(state, name, self.dynamics.observe(state))
             known = 0
             if step + 1 < len(self._steps):
                 there = self._steps[step + 1]
@@ -175,7 +177,7 @@ class Futures:
         before = map_state(lambda part: part[:, path.repeat_interleave(self.actions)], here.state)
         action = torch.arange(self.actions, device=path.device).repeat(number)
         draws = here.observation["ego"].shape[0]
-        reward, following = self.roll.step(before, action.expand(draws, -1), step)
+        reward, following = self.dynamics.step(before, action.expand(draws, -1), step)
         unknown = torch.full((number * self.actions,), -1, device=path.device)
         if here.child is None:
             here.reward, here.following, here.child = reward, following, unknown
@@ -197,8 +199,8 @@ class World(Protocol):
 
     draws: int
 
-    def futures(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> Futures:
-        """Futures of H steps from a round so far, in W draws."""
+    def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
+        """RolloutTree of H steps from a round so far, in W draws."""
         ...
 
 
@@ -215,23 +217,23 @@ class SimulatorWorld:
         require_methods(domain, ["transition", "state_behind"], "domain", "a domain")
         self.domain = domain
 
-    def futures(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> Futures:
+    def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
         """See :class:`World`; the generator is not used."""
         now = {name: value[None, None] for name, value in past.now.items()}
         state = self.domain.state_behind(now)
-        return Futures(self, state, now, len(self.domain.actions), horizon)
+        return RolloutTree(self, state, now, len(self.domain.actions), horizon)
 
     def observe(self, state: Any) -> Observation:
-        """See :class:`Roll`."""
+        """See :class:`Dynamics`."""
         return self.domain.observe(state)
 
     def step(self, state: Any, action: Tensor, step: int) -> tuple[Tensor, Any]:
-        """See :class:`Roll`."""
+        """See :class:`Dynamics`."""
         following = self.domain.transition(state, action)
         return total_reward(self.domain.rewards(state, action, following)), following
 
     def value(self, state: Any) -> Tensor:
-        """The exact value of the best action, see :class:`Roll`; without discount."""
+        """The exact value of the best action, see :class:`Dynamics`; without discount."""
         return self.domain.reference_values(state, 1.0).amax(-1)
 
 
@@ -252,7 +254,7 @@ class SelfModelWorld:
         self.domain = self_model.domain
         self.draws = whole_number(draws, "draws", 1)
 
-    def futures(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> Futures:
+    def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
         """See :class:`World`."""
         model = self.self_model
         device = past.actions.device
@@ -266,8 +268,8 @@ class SelfModelWorld:
             name: value[None, None].expand(self.draws, 1, *value.shape)
             for name, value in past.now.items()
         }
-        roll = _LearnedRoll(model, noise[1:])
-        return Futures(roll, state, now, len(model.domain.actions), horizon)
+        dynamics = _LearnedDynamics(model, noise[1:])
+        return RolloutTree(dynamics, state, now, len(model.domain.actions), horizon)
 
 
 @dataclass(frozen=True)
@@ -278,7 +280,7 @@ class _Latent:
 
 
 @dataclass(frozen=True)
-class _LearnedRoll:
+class _LearnedDynamics:
     """How a self-model's states go on; the noise ``[H, W, 1, Z]`` is the same on all paths."""
 
     self_model: SelfModel

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 import torch
-from example_course import gone_through
+from example_course import gone_through, perceived
 from example_person import (
     CHANNELS,
     DOMAIN,
@@ -24,9 +24,10 @@ from example_person import (
 )
 
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
-from mirror_ppl.communication.minds import Looks, Standing
+from mirror_ppl.communication.person import PlanningContext
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.belief_tracking import BeliefState
 from mirror_ppl.models.implants import assumption_sites
 
 ACTIONS = len(DOMAIN.actions)
@@ -61,7 +62,7 @@ def test_all_sites_without_draws_are_named():
         Person(human(), draws)
 
 
-def test_draws_with_the_same_perception_share_an_eye():
+def test_draws_with_the_same_perception_share_an_percept():
     values = {
         "sight_front_own": [1, 2, 1, 1, 2, 1, 1],
         "assumes_clear": [0, 0, 0, 1, 0, 0, 0],
@@ -69,15 +70,15 @@ def test_draws_with_the_same_perception_share_an_eye():
     }
     someone = person(7, **values, lapse=[0.1] * 5 + [0.2] * 2)
     assert someone.number == 7
-    assert someone.eye_count == 4
+    assert someone.percept_count == 4
     groups = [[0, 2, 5], [1, 4], [3], [6]]
     for group in groups:
-        assert len(set(someone.eye[group].tolist())) == 1
-    assert len(set(someone.eye.tolist())) == 4
+        assert len(set(someone.percept[group].tolist())) == 1
+    assert len(set(someone.percept.tolist())) == 4
     for name, value in values.items():
-        assert someone.eyes[name][someone.eye].tolist() == value
-    # Sites that are not discrete say nothing of eyes.
-    assert "lapse" not in someone.eyes
+        assert someone.percepts[name][someone.percept].tolist() == value
+    # Sites that are not discrete say nothing of percepts.
+    assert "lapse" not in someone.percepts
 
 
 def test_everybody_sees_for_themselves():
@@ -89,10 +90,11 @@ def test_everybody_sees_for_themselves():
         assumes_clear=[0, 1, 1],
         assumes_closing=[1, 1, 0],
     )
-    number = someone.eye_count
     observation = {name: value.expand(3, 1, *value.shape) for name, value in past.now.items()}
     nothing = CHANNELS.split(torch.zeros(3, 1, len(CHANNELS), dtype=torch.bool))
-    view = someone.see(someone.eye, observation, nothing)
+    view = perceived(
+        human(), {n: v[someone.percept] for n, v in someone.percepts.items()}, observation, nothing
+    )
     behind, ahead = [False, False, True, False], [True, False, False, False]
     assert view.visible["visual"][:, 0].tolist() == [behind, ahead, ahead]
     others = [False, True, True, True]
@@ -104,11 +106,12 @@ def test_everybody_sees_for_themselves():
     assert view.visible["verbal"].shape == (3, 1, 4)
     assert not view.visible["verbal"].any()
     # A look at one step is the same, and tells what they have learned.
-    knowledge = DOMAIN.nothing_known(number)
+    rows = torch.arange(3)
     first = {name: value[:, 0] for name, value in observation.items()}
     told = {name: mask[:, 0] for name, mask in nothing.items()}
-    look, after = someone.perceive(someone.eye, knowledge, first, told, 0)
-    assert torch.equal(look.numbers(), view.numbers()[:, 0])
+    transition = someone.transition(someone.percept, told["visual"][:, 0], first, told, rows)
+    look, (after,) = BeliefState.initial(human(), 3).perceive([transition])
+    assert torch.equal(look.numbers(), view.numbers())
     assert after.unsure.tolist() == [behind, ahead, ahead]
 
 
@@ -132,16 +135,16 @@ def test_each_draw_acts_by_its_own_implants(generator):
 
 
 class Tracks:
-    """Random courses of action and messages of all eyes, from one round so far.
+    """Random courses of action and messages of all percepts, from one round so far.
 
-    Each is looked at by :class:`Looks` step by step; ``expected`` goes through its whole round.
+    Each is tracked step by step; ``expected`` goes through its whole round.
     With ``alike``, all do and hear the same.
     """
 
     def __init__(self, someone, past, horizon, number, generator, alike=False):
         self.person, self.past = someone, past
-        self.futures = SimulatorWorld(DOMAIN).futures(past, horizon, generator)
-        self.eye = torch.arange(number) % someone.eye_count
+        self.rollouts = SimulatorWorld(DOMAIN).rollouts(past, horizon, generator)
+        self.percept = torch.arange(number) % someone.percept_count
         # Few messages, so that some tracks hear and do the same.
         kinds = torch.rand(3, horizon, len(CHANNELS), generator=generator) < 0.15
         kinds[0] = False
@@ -152,27 +155,21 @@ class Tracks:
         self.path = torch.zeros(number, horizon, dtype=torch.long)
         for step in range(1, horizon):
             before, done = self.path[:, step - 1], self.actions[:, step - 1]
-            self.path[:, step] = self.futures.follow(step - 1, before, done)
+            self.path[:, step] = self.rollouts.follow(step - 1, before, done)
 
-    def looks(self, step, parent):
+    def transition(self, step):
         if step > 0:
             action = self.actions[:, step - 1]
         else:
             last = self.past.actions[-1] if self.past.time else ACTIONS
-            action = torch.full_like(self.eye, int(last))
-        observation = {name: value[0] for name, value in self.futures.observation(step).items()}
-        return Looks(
-            parent=parent,
-            eye=self.eye,
-            action=action,
-            row=self.path[:, step],
-            observation=observation,
-            told=CHANNELS.split(self.told[:, step]),
-        )
+            action = torch.full_like(self.percept, int(last))
+        observation = {name: value[0] for name, value in self.rollouts.observation(step).items()}
+        told = CHANNELS.split(self.told[:, step])
+        return self.person.transition(self.percept, action, observation, told, self.path[:, step])
 
     def expected(self, step):
         """Beliefs ``[g, Z]`` at the end of whole rounds up to this step."""
-        number, past = len(self.eye), self.past
+        number, past = len(self.percept), self.past
 
         def whole(before, *after):
             before = before[: past.time].expand(number, *before[: past.time].shape)
@@ -184,12 +181,12 @@ class Tracks:
         }
         told = whole(CHANNELS.join(past.told), *self.told[:, : step + 1].unbind(1))
         done = whole(past.actions, *self.actions[:, : step + 1].unbind(1))
-        eyes = {name: value[self.eye] for name, value in self.person.eyes.items()}
+        percepts = {name: value[self.percept] for name, value in self.person.percepts.items()}
         heard = CHANNELS.split(told)
-        return gone_through(self.person.human, eyes, observation, heard, done)[:, -1]
+        return gone_through(self.person.human, percepts, observation, heard, done)[:, -1]
 
     def upto(self, step):
-        return enumerate(self.futures.observation(each) for each in range(step + 1))
+        return enumerate(self.rollouts.observation(each) for each in range(step + 1))
 
 
 def person_of(kind, number, generator):
@@ -209,14 +206,14 @@ def test_beliefs_are_those_of_whole_rounds(generator, kind, time):
     past, _ = random_round(time, generator)
     tracks = Tracks(someone, past, 5, 120, generator)
     beliefs, own = beliefs_before(someone, past)
-    parent = own[tracks.eye]
+    parent = own[tracks.percept]
     for step in range(5):
-        beliefs, parent = beliefs.after(tracks.looks(step, parent))
+        beliefs, parent = beliefs.at(parent).after(tracks.transition(step)).distinct()
         expected = tracks.expected(step)
-        torch.testing.assert_close(beliefs.mean[parent], expected, rtol=0, atol=1e-5)
-    # Messages, eyes and actions matter: of tracks that differ in one of them alone, some differ.
+        torch.testing.assert_close(beliefs.believed[parent], expected, rtol=0, atol=1e-5)
+    # Messages, percepts and actions matter: of tracks that differ in one alone, some differ.
     apart = (expected[:, None] - expected).abs().amax(-1)
-    parts = (tracks.told.flatten(1), tracks.eye[:, None], tracks.path[:, -1:])
+    parts = (tracks.told.flatten(1), tracks.percept[:, None], tracks.path[:, -1:])
     different = torch.stack([(part[:, None] != part).any(-1) for part in parts])
     for part in different:
         assert apart[part & (different.sum(0) == 1)].max() > 0.01
@@ -239,14 +236,14 @@ def test_beliefs_of_whoever_takes_things_for_granted_are_those_of_whole_rounds(
             **{name: value.repeat_interleave(4) for name, value in sights.items()},
             **dict(zip(ASSUMED, torch.tensor(made * 3).unbind(-1), strict=True)),
         )
-        tracks = Tracks(someone, past, 6, someone.eye_count, generator, alike=True)
+        tracks = Tracks(someone, past, 6, someone.percept_count, generator, alike=True)
         beliefs, own = beliefs_before(someone, past)
-        parent = own[tracks.eye]
+        parent = own[tracks.percept]
         for step in range(6):
-            beliefs, parent = beliefs.after(tracks.looks(step, parent))
-            mine, expected = beliefs.mean[parent], tracks.expected(step)
+            beliefs, parent = beliefs.at(parent).after(tracks.transition(step)).distinct()
+            mine, expected = beliefs.believed[parent], tracks.expected(step)
             torch.testing.assert_close(mine, expected, rtol=0, atol=1e-5)
-            mine = mine[someone.eye].unflatten(0, (3, 4))
+            mine = mine[someone.percept].unflatten(0, (3, 4))
             apart = (mine[:, :, None] - mine[:, None]).abs().amax(-1)
             for index, (one, other) in enumerate(((0, 1), (2, 3), (0, 2), (1, 3))):
                 matters[:, index] |= apart[:, one, other] > 0.01
@@ -261,10 +258,10 @@ def test_a_car_that_is_imagined_elsewhere_is_believed_elsewhere(generator, kind)
     tracks.told = torch.stack([plan(shown, None, None), plan(None, shown, None)])
     tracks.actions[:], tracks.path[:] = 0, 0
     beliefs, own = beliefs_before(tracks.person, past)
-    parent = own[tracks.eye]
+    parent = own[tracks.percept]
     for step in range(3):
-        beliefs, parent = beliefs.after(tracks.looks(step, parent))
-        mine, expected = beliefs.mean[parent], tracks.expected(step)
+        beliefs, parent = beliefs.at(parent).after(tracks.transition(step)).distinct()
+        mine, expected = beliefs.believed[parent], tracks.expected(step)
         torch.testing.assert_close(mine, expected, rtol=0, atol=1e-5)
     # What is visible and taken for granted at the last step is the same.
     assert (mine[0] - mine[1]).abs().max() > 0.01
@@ -278,12 +275,16 @@ def test_each_belief_is_worked_out_once(generator, kind, time):
     past, _ = random_round(time, generator)
     tracks = Tracks(someone, past, 6, 200, generator)
     beliefs, own = beliefs_before(someone, past)
-    parent = own[tracks.eye]
+    parent = own[tracks.percept]
     for step in range(6):
-        beliefs, parent = beliefs.after(tracks.looks(step, parent))
-        torch.testing.assert_close(beliefs.mean[parent], tracks.expected(step), rtol=0, atol=1e-5)
-        assert len(beliefs.mean) < 200
-        assert parent.unique().tolist() == list(range(len(beliefs.mean)))
+        beliefs, parent = beliefs.at(parent).after(tracks.transition(step)).distinct()
+        torch.testing.assert_close(
+            beliefs.believed[parent], tracks.expected(step), rtol=0, atol=1e-5
+        )
+        assert len(beliefs.belief) < 200
+        assert parent.unique().tolist() == list(range(len(beliefs.belief)))
+        assert beliefs.belief.unique().tolist() == list(range(len(beliefs.mean)))
+        assert len(beliefs.mean.unique(dim=0)) == len(beliefs.mean)
         assert (beliefs.scale is None) == (kind is Averaging)
 
 
@@ -292,11 +293,11 @@ def test_the_last_action_and_everything_told_so_far_is_in_a_belief(someone, gene
     past, _ = random_round(3, generator)
 
     def next_belief(past):
-        tracks = Tracks(someone, past, 1, someone.eye_count, torch.Generator().manual_seed(0))
+        tracks = Tracks(someone, past, 1, someone.percept_count, torch.Generator().manual_seed(0))
         beliefs, own = beliefs_before(someone, past)
-        beliefs, index = beliefs.after(tracks.looks(0, own[tracks.eye]))
-        torch.testing.assert_close(beliefs.mean[index], tracks.expected(0), rtol=0, atol=1e-5)
-        return beliefs.mean[index]
+        beliefs = beliefs.at(own[tracks.percept]).after(tracks.transition(0))
+        torch.testing.assert_close(beliefs.believed, tracks.expected(0), rtol=0, atol=1e-5)
+        return beliefs.believed
 
     base = next_belief(past)
     for step in range(3):
@@ -314,45 +315,43 @@ def test_the_last_action_and_everything_told_so_far_is_in_a_belief(someone, gene
 
 
 def look_around(someone, past, messages):
-    """Beliefs after each eye's look with each message ``[M, N]``; which one, ``[M, U]``."""
+    """Beliefs after each percept's look with each message ``[M, N]``; which one, ``[M, U]``."""
     beliefs, own = beliefs_before(someone, past)
-    eye = torch.arange(someone.eye_count).repeat(len(messages))
+    percept = torch.arange(someone.percept_count).repeat(len(messages))
     last = int(past.actions[-1]) if past.time else ACTIONS
-    looks = Looks(
-        parent=own[eye],
-        eye=eye,
-        action=torch.full_like(eye, last),
-        row=torch.zeros_like(eye),
-        observation={name: value[None] for name, value in past.now.items()},
-        told=CHANNELS.split(messages.repeat_interleave(someone.eye_count, 0)),
+    transition = someone.transition(
+        percept,
+        torch.full_like(percept, last),
+        {name: value[None] for name, value in past.now.items()},
+        CHANNELS.split(messages.repeat_interleave(someone.percept_count, 0)),
     )
-    beliefs, index = beliefs.after(looks)
+    beliefs, index = beliefs.at(own[percept]).after(transition).distinct()
     return beliefs, index.view(len(messages), -1)
 
 
-def test_eyes_that_see_the_same_share_a_belief():
+def test_percepts_that_see_the_same_share_a_belief():
     # Thresholds are 0, 1, 2, 3, 4, 6 and 12 cells; the only car is 4 cells ahead.
     past = begun(0, [4, 30, -30, -30], [-1, 1, -1, -1])
     someone = person(5, front_own=[0, 2, 3, 4, 5])
-    assert someone.eye_count == 5
+    assert someone.percept_count == 5
     beliefs, which = look_around(someone, past, flags()[None])
-    which = which[0, someone.eye]
+    which = which[0, someone.percept]
     assert len(beliefs.mean) == 2
     assert (which[:3] == which[0]).all() and (which[3:] == which[3]).all()
     assert which[0] != which[3]
 
 
-def test_words_that_make_all_eyes_see_the_same_make_their_beliefs_the_same():
+def test_words_that_make_all_percepts_see_the_same_make_their_beliefs_the_same():
     past = begun(0, [4, 30, -30, -30], [-1, 1, -1, -1])
     someone = person(2, front_own=[0, FULL_SIGHT])
     shown = flags(visual=["front-left"])
     beliefs, which = look_around(someone, past, torch.stack([flags(), shown]))
-    silence, told = beliefs.mean[which]
+    silence, told = beliefs.believed[which]
     assert not torch.allclose(silence[0], silence[1])
     torch.testing.assert_close(told[0], told[1], rtol=0, atol=0)
 
 
-def test_what_eyes_saw_before_keeps_their_beliefs_apart():
+def test_what_percepts_saw_before_keeps_their_beliefs_apart():
     """At first one sees the car and the other does not; then it is far from both."""
     past = begun(0, [4, 30, -30, -30], [1, 1, -1, -1])
     later = begun(0, [11, 30, -30, -30], [1, 1, -1, -1]).now
@@ -361,7 +360,7 @@ def test_what_eyes_saw_before_keeps_their_beliefs_apart():
         someone = person(2, front_own=[3, 4], assumes_clear=clear, assumes_closing=closing)
         beliefs, which = look_around(someone, past, flags()[None])
         assert len(set(which[0].tolist())) == 2
-        assert not torch.allclose(*beliefs.mean[which[0]])
+        assert not torch.allclose(*beliefs.believed[which[0]])
     # Two who both saw nothing share their beliefs from the beginning on.
     beliefs, own = beliefs_before(person(2, front_own=[2, 3]), past)
     assert len(beliefs.mean) == 1
@@ -375,7 +374,7 @@ def test_somebody_who_takes_something_for_granted_believes_otherwise(assumption)
     someone = person(2, front_own=4, **{assumption: [0, 1]})
     beliefs, which = look_around(someone, past, flags()[None])
     assert len(set(which[0].tolist())) == 2
-    assert (beliefs.mean[which[0, 0]] - beliefs.mean[which[0, 1]]).abs().max() > 0.01
+    assert (beliefs.believed[which[0, 0]] - beliefs.believed[which[0, 1]]).abs().max() > 0.01
     spoken = flags(verbal=["front-left", "front-right", "rear-left", "rear-right"])
     _, which = look_around(someone, past, spoken[None])
     assert len(set(which[0].tolist())) == 1
@@ -389,11 +388,11 @@ def test_a_model_that_remembers_more_stands_in_a_round_with_its_memory(generator
     past, _ = random_round(time, generator)
     someone = person_of(Averaging, 4, generator)
     tracks = Tracks(someone, past, 4, 40, generator)
-    standing = Standing.of(someone, past)
-    beliefs, parent = standing.before, standing.own[tracks.eye]
+    context = PlanningContext.of(someone, past)
+    beliefs, parent = context.before, context.own[tracks.percept]
     for step in range(4):
-        beliefs, parent = beliefs.after(tracks.looks(step, parent))
-    mine = beliefs.mean[parent]
+        beliefs, parent = beliefs.at(parent).after(tracks.transition(step)).distinct()
+    mine = beliefs.believed[parent]
     torch.testing.assert_close(mine, tracks.expected(3), rtol=0, atol=1e-5)
     last, average, number = someone.human.parts(mine)
     assert (number == time + 4).all()
@@ -408,7 +407,8 @@ def test_a_memory_that_is_not_used_leaves_decisions_as_they_are(generator):
     draws = varied_draws(6, generator)
     usual, same = (
         Communicator(
-            Person(model(self_model()), draws), ExpectedUtility(SimulatorWorld(DOMAIN), 4, branch=0)
+            Person(model(self_model()), draws),
+            ExpectedUtility(SimulatorWorld(DOMAIN), 4, enumerate_above=0),
         ).plan(past)
         for model in (HumanModel, Unused)
     )
@@ -426,16 +426,16 @@ def test_items_tell_what_somebody_does_not_know_yet():
     someone = person(2, front_own=[two, 0], front_other=[two, 0])
     past = begun(0, [2, 9, -9, -30], [-1, 1, 1, -1])
     allowed = CHANNELS.join(DOMAIN.communicable(past.now))
-    assert torch.equal(Standing.of(someone, past).telling(allowed), allowed)
+    assert torch.equal(PlanningContext.of(someone, past).telling(allowed), allowed)
     told = CHANNELS.split(flags(verbal=["rear-left"]))
     past = past.then(told, 0, begun(0, [1, 10, -8, -30], [-1, 1, 1, -1]).now)
     # Whoever heard of a car knows where it is; of the others they may learn more.
     left = allowed & ~flags(visual=["rear-left"], verbal=["rear-left"])
-    assert torch.equal(Standing.of(someone, past).telling(allowed), left)
+    assert torch.equal(PlanningContext.of(someone, past).telling(allowed), left)
     # The first knows the car in front, having seen it twice; the second does not.
     sighted = person(1, front_own=two, front_other=two)
     left &= ~flags(["front-left"], ["front-left"])
-    assert torch.equal(Standing.of(sighted, past).telling(allowed), left)
+    assert torch.equal(PlanningContext.of(sighted, past).telling(allowed), left)
     # Of a model that remembers more it is the same.
     sighted = person(1, Averaging(self_model()), front_own=two, front_other=two)
-    assert torch.equal(Standing.of(sighted, past).telling(allowed), left)
+    assert torch.equal(PlanningContext.of(sighted, past).telling(allowed), left)

@@ -1,0 +1,31 @@
+"""The commands. Each parses its options, calls the public face, and prints what comes out."""
+
+import signal
+from importlib import import_module
+from typing import NoReturn
+
+from mirror_ppl.console import guarded, run
+
+COMMANDS = {
+    "fit": "infer what people see and how they decide from their recorded rounds",
+    "assist": "pair communicators with people, and see who helps how much",
+    "calibrate": "see whether posteriors are as sure as they have a right to be",
+    "compare": "compare human models by how well they predict what people do",
+    "evaluate": "compare MIRROR with its ablations and baselines, as the paper does",
+    "train": "train a domain's self-model",
+    "simulate": "record rounds of simulated people",
+}
+
+
+def call(name: str) -> NoReturn:
+    """Be the command of that name, from the command line to the exit status of the process."""
+
+    def command() -> int:
+        # Imported here, so that an interruption meanwhile ends in a line, too.
+        module = import_module(f"mirror_ppl.commands.{name}")
+        return run(module.Options, module.main, prog=module.PROGRAM, description=module.DESCRIPTION)
+
+    status = guarded(command)
+    # All is done and written. Python's own end takes a moment, in which nothing is to interrupt.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    raise SystemExit(status)

@@ -1,0 +1,384 @@
+"""`python -m mirror_ppl.assist`: pair communicators with people, and compare net returns."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mirror_ppl.console import console_for_tables
+from mirror_ppl.errors import (
+    OptionError,
+    PosteriorError,
+    UnknownNameError,
+)
+from mirror_ppl.limits import check_numbers
+from mirror_ppl.progress import Progress
+
+if TYPE_CHECKING:
+    from mirror_ppl.evaluation.assistance import Played
+    from mirror_ppl.evaluation.assistance_cells import Pairing
+    from mirror_ppl.inference.results.posterior_file import PosteriorFile
+
+FAR_BELOW = -10
+"""Shares of the way from silence to the oracle below which no number is printed."""
+KL, LEARNED = "mirror-kl", "mirror-self-model"
+PROGRAM = "python -m mirror_ppl.assist"
+DESCRIPTION = """Let communicators send messages to the simulated people of a posterior in their
+rounds, and print for each the people's returns, the cost of messages and what they were about. All
+play the same rounds with the same random numbers. With --json or --log, a run that is stopped goes
+on where it was when the same command is given again."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Whom to help, how, and where the results go."""
+
+    posterior: Path = Path("runs/demo/posterior.nc")
+    """A posterior of simulated people, from python -m mirror_ppl.fit (or make demo)."""
+    domain: str | None = None
+    """The world that the posterior has to be of; that of the posterior unless given."""
+    setting: str | None = None
+    """The setting that the posterior has to be of; that of the posterior unless given."""
+    communicator: tuple[str, ...] = ()
+    """One or several of mirror, mirror-self-model, mirror-kl, none, all, random, nearest, oracle;
+    all of them unless given (but for mirror-self-model where the robot was taught wrong rules).
+    What each is stands in docs/communicator.md."""
+    rounds: int = 20
+    """Rounds of each person."""
+    people: int | None = None
+    """How many of the people, from the first on; all unless given."""
+    draws: int = 64
+    """Posterior draws that are planned with."""
+    horizon: int | None = None
+    """Steps that planners look ahead; 10 in driving, 16 in search_rescue and 12 in bomb_defusal
+    unless given."""
+    discount: float = 1.0
+    """Worth of a reward one step later, from above 0 to 1."""
+    min_standard_errors: float | None = None
+    """How many standard errors of its gain a message has to gain to be sent; 0 is enough for the
+    best on average. 2 in driving, 1 in search_rescue and 0 in bomb_defusal unless given."""
+    patience: int | None = None
+    """Steps over which a message is compared with saying it later; 1 compares with silence only."""
+    enumerate_above: float | None = None
+    """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
+    course a draw; 0.1 in driving and 0.4 in the other domains unless given."""
+    kl_weight: float = 1.0
+    """Units of reward that mirror-kl gives for a nat."""
+    kl_measure: str = "kl"
+    """What mirror-kl measures: kl, or squared (the distance of means of the released code)."""
+    json: Path | None = None
+    """Write the results as data; the folder is made if it is not there."""
+    log: Path | None = None
+    """Write every decision with its audit, one JSON object a line, over what is there."""
+    human_model: str | None = None
+    """The human model that the posterior is of, if it is another: one-radius and so on, or one of
+    your own, path/to/file.py:Class, whose code is run."""
+    self_model: Path | None = None
+    """Weights of the robot's self-model; those that ship unless given."""
+    population: str | None = None
+    """Who the people are, where the posterior does not say: paper or diverse."""
+    people_seed: int | None = None
+    """The seed that the people were simulated with, where the posterior does not say."""
+    seed: int = 0
+    """Seed of the rounds and of everything random."""
+    jobs: int = 2
+    """Processes that share the work."""
+    scheduler: str | None = None
+    """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "rounds", "people", "draws", "horizon", "patience", jobs=1)
+        check_numbers(self, "seed", "people_seed")
+        if not 0 < self.discount <= 1:
+            raise OptionError(f"--discount must be above 0 and at most 1, not {self.discount}")
+        if self.enumerate_above is not None and not 0 <= self.enumerate_above <= 1:
+            raise OptionError(f"--enumerate-above must be from 0 to 1, not {self.enumerate_above}")
+        if self.min_standard_errors is not None and not self.min_standard_errors >= 0:
+            raise OptionError(
+                f"--min-standard-errors must be at least 0, not {self.min_standard_errors}"
+            )
+        if not 0 < self.kl_weight < math.inf:
+            raise OptionError(f"--kl-weight must be a positive number, not {self.kl_weight}")
+        if self.kl_measure not in ("kl", "squared"):
+            raise OptionError(f'--kl-measure must be kl or squared, not "{self.kl_measure}"')
+
+
+def main(options: Options) -> None:
+    """Pair, write the results, and print what was found.
+
+    Raises:
+        MirrorError: what was asked for cannot be done; nothing is written then.
+    """
+    from mirror_ppl.evaluation.assistance import COMMUNICATORS
+    from mirror_ppl.evaluation.assistance_cells import play_all, turns
+    from mirror_ppl.evaluation.assistance_summary import summarize_assistance
+    from mirror_ppl.files import lock_of, output_folder, write_together
+    from mirror_ppl.jobs import Runner
+
+    chosen = options.communicator or COMMUNICATORS
+    for name in chosen:
+        if name not in COMMUNICATORS:
+            raise UnknownNameError.of("communicator", name, COMMUNICATORS)
+    chosen = tuple(name for name in COMMUNICATORS if name in chosen)
+    outputs = _outputs(options)
+    kept = options.json or options.log
+    posterior, source = _people(options)
+    number = len(posterior.people) if options.people is None else options.people
+    if number > len(posterior.people):
+        raise PosteriorError(
+            f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
+        )
+    pairing = _pairing(options, posterior, source)
+    pairing.check()
+    chosen = _possible(options, chosen, pairing)
+    parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
+    cells = turns(chosen, number)
+    with ExitStack() as stack:
+        for path in outputs:
+            own = [parts.name] if parts is not None and path == kept else []
+            results = output_folder(path.parent, [path.name], lock_of(path), own)
+            stack.enter_context(results)
+        progress = stack.enter_context(Progress("assist", len(cells)))
+        runner = Runner(parts, jobs=options.jobs, scheduler=options.scheduler, progress=progress)
+        everything = play_all(pairing, cells, runner)
+        played = {name: everything[name] for name in chosen}
+        summary = summarize_assistance(played, options.seed)
+        write_together(_contents(options, posterior, played, summary))
+        runner.clean()
+    _show(summary, posterior.attributes, number, options.rounds)
+    for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
+        if path is not None:
+            print(f"{path}: {what}")
+
+
+def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, Any]) -> Pairing:
+    """Who is paired in which rounds."""
+    from mirror_ppl.evaluation.assistance import PlannerOptions
+    from mirror_ppl.evaluation.assistance_cells import Pairing
+
+    planner = PlannerOptions.of(
+        posterior.attributes["domain"],
+        horizon=options.horizon,
+        discount=options.discount,
+        enumerate_above=options.enumerate_above,
+        patience=options.patience,
+        min_standard_errors=options.min_standard_errors,
+        kl_weight=options.kl_weight,
+        kl_measure=options.kl_measure,
+    )
+    return Pairing(
+        posterior=options.posterior,
+        human_model=options.human_model,
+        self_model=options.self_model,
+        draws=options.draws,
+        setting=posterior.attributes["setting"],
+        population=source["population"],
+        people_seed=int(source["seed"]),
+        people=len(posterior.people),
+        rounds=options.rounds,
+        planner=planner,
+        seed=options.seed,
+        keep_log=options.log is not None,
+    )
+
+
+def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tuple[str, ...]:
+    """Communicators without those that cannot plan for these people, unless they are asked for."""
+    from mirror_ppl.communication.objectives import beliefs_have_density, require_density
+
+    if KL in chosen and not beliefs_have_density(pairing.human):
+        if KL in options.communicator:
+            require_density(pairing.human)
+        chosen = tuple(name for name in chosen if name != KL)
+        name = type(pairing.human).__name__
+        print(f"{KL} is left out: beliefs of {name} have no density", file=sys.stderr)
+    if not options.communicator and pairing.domain.as_believed is not pairing.domain:
+        chosen = tuple(name for name in chosen if name != LEARNED)
+        print(
+            f"{LEARNED} is left out: the robot was taught wrong in {pairing.domain.name}",
+            file=sys.stderr,
+        )
+    return chosen
+
+
+def _contents(
+    options: Options,
+    posterior: PosteriorFile,
+    played: Mapping[str, Sequence[Played]],
+    summary: dict[str, dict[str, Any]],
+) -> dict[Path, str]:
+    """What is written: a summary as data, and every decision."""
+    from mirror_ppl.evaluation.assistance_summary import compare
+    from mirror_ppl.files import json_text, plain
+
+    contents = {}
+    if options.json is not None:
+        results: dict[str, Any] = {
+            "command": PROGRAM,
+            "options": {
+                name: value
+                for name, value in asdict(options).items()
+                if name not in ("json", "log", "jobs", "scheduler")
+            },
+            "posterior": dict(posterior.attributes),
+            "communicators": summary,
+        }
+        if "mirror" in played:
+            results["mirror_above"] = {
+                name: compare(played, "mirror", name, options.seed)
+                for name in played
+                if name != "mirror"
+            }
+        contents[options.json] = json_text(results)
+    if options.log is not None:
+        lines = [
+            json.dumps(plain({"communicator": name, "person": posterior.people[person]} | entry))
+            + "\n"
+            for name, people in played.items()
+            for person, one in enumerate(people)
+            for entry in one.log
+        ]
+        contents[options.log] = "".join(lines)
+    return contents
+
+
+def _outputs(options: Options) -> list[Path]:
+    from mirror_ppl.files import require_files_of_their_own
+    from mirror_ppl.models.variants import VARIANTS
+
+    source = None if options.human_model in VARIANTS else options.human_model
+    inputs = {
+        "--posterior": [options.posterior],
+        "--self-model": [options.self_model],
+        "--human-model": [None if source is None else Path(source.rpartition(":")[0])],
+    }
+    return require_files_of_their_own({"--json": options.json, "--log": options.log}, inputs)
+
+
+def _people(options: Options):
+    """The posterior, and what its people were simulated with."""
+    from mirror_ppl.domains import get_domain, require_known
+    from mirror_ppl.inference.results.posterior_file import load_posterior
+    from mirror_ppl.people import PEOPLE
+
+    if options.domain is not None:
+        get_domain(options.domain)
+    posterior = load_posterior(options.posterior, options.domain)
+    domain = posterior.attributes["domain"]
+    settings = get_domain(domain).settings
+    if options.setting is not None:
+        require_known(options.setting, "setting", settings, domain)
+    own = posterior.attributes.get("setting", "unknown")
+    if options.setting not in (None, own):
+        raise PosteriorError(
+            f"{options.posterior}: is of people in the setting {own}, not {options.setting}"
+        )
+    require_known(own, "setting", settings, domain)
+    source: dict[str, Any] = {
+        "population": posterior.attributes.get("recorded_population", options.population),
+        "seed": posterior.attributes.get("recorded_seed", options.people_seed),
+    }
+    for option, name, given in (
+        ("--population", "population", options.population),
+        ("--people-seed", "seed", options.people_seed),
+    ):
+        if given is not None and str(given) != str(source[name]):
+            raise PosteriorError(
+                f"{options.posterior}: is of people with {name} {source[name]}, not {given} "
+                f"({option})"
+            )
+    if None in source.values():
+        raise PosteriorError(
+            f"{options.posterior}: does not say which simulated people it is of; give --population "
+            "and --people-seed (people who were recorded are assisted from Python, see "
+            "docs/communicator.md)"
+        )
+    if not str(source["seed"]).isdecimal():
+        raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")
+    require_known(source["population"], "population", PEOPLE[domain].populations)
+    return posterior, source
+
+
+def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, rounds: int) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from mirror_ppl.domains import get_domain
+
+    def table(title: str, caption: str, columns: list[str]) -> Table:
+        made = Table(
+            title=title,
+            caption=caption,
+            title_justify="left",
+            caption_justify="left",
+            box=SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+        )
+        made.add_column("communicator")
+        for column in columns:
+            made.add_column(column, justify="right", no_wrap=True)
+        return made
+
+    first = next(iter(summary.values()))
+    domain = get_domain(attributes["domain"])
+    notions = [name.split("_")[-1] for name in first["relevant"]]
+    about = [f"about {name.replace('_', ' ')}" for name in first["relevant"]]
+    worth = table(
+        f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
+        "rewards a round; ±: standard error; [90% interval], paired; -: needs none and oracle",
+        ["task", "cost", "net", "above none", "way to oracle"],
+    )
+    said = table(
+        "What is communicated",
+        f"{domain.mishap[1]} a round; {', '.join(first['items'])}: items a step; "
+        f"{', '.join(notions)}: share of items {', '.join(about)}; ms a decision",
+        [domain.mishap[1], *first["items"], *notions, "ms"],
+    )
+    for name, entry in summary.items():
+        error = "" if entry["net_se"] is None else f" ±{entry['net_se']:.2f}"
+        worth.add_row(
+            name,
+            f"{entry['task']:.2f}",
+            f"{entry['cost']:.2f}",
+            f"{entry['net']:.2f}{error}",
+            _interval(entry.get("over_none"), 1, "+.2f"),
+            _way(entry.get("way_to_oracle")),
+        )
+        said.add_row(
+            name,
+            f"{entry['mishaps']:.2f}",
+            *(f"{value:.2f}" for value in entry["items"].values()),
+            *(
+                "-" if share["all"] is None else f"{100 * share['all']:.0f}%"
+                for share in entry["relevant"].values()
+            ),
+            f"{entry['milliseconds']:.1f}",
+        )
+    console = console_for_tables(100)
+    console.print(worth)
+    console.print(said)
+    if rounds == 1:
+        print("Of one round of each person there are no errors and intervals; --rounds gives more")
+
+
+def _way(value: dict[str, float | None] | None) -> str:
+    """How far the way to the oracle; a number that is far below says nothing more."""
+    if value is not None and (value["mean"] or 0) < FAR_BELOW:
+        return f"below {FAR_BELOW:.0%}"
+    return _interval(value, 100, ".0f", "%")
+
+
+def _interval(
+    value: dict[str, float | None] | None, scale: float, form: str, unit: str = ""
+) -> str:
+    if value is None:
+        return "-"
+    known = (value[name] for name in ("mean", "low", "high"))
+    mean, *ends = (format(scale * number, form) for number in known if number is not None)
+    return f"{mean}{unit} [{', '.join(ends)}]" if ends else f"{mean}{unit}"

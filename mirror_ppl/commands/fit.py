@@ -1,0 +1,176 @@
+"""`python -m mirror_ppl.fit`: infer what people see and how they decide."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING
+
+from mirror_ppl.errors import OptionError
+from mirror_ppl.inference.names import told_engine
+from mirror_ppl.limits import check_numbers, require_memory, share
+from mirror_ppl.progress import Stages
+
+if TYPE_CHECKING:
+    from mirror_ppl.data import Demonstrations
+
+PROGRAM = "python -m mirror_ppl.fit"
+CHECKPOINT = "fit.checkpoint"
+CHECKPOINTS = re.compile(r"fit\.checkpoint(\.\d+)?")
+COPIES = 4
+"""Of log-probabilities of actions, while they are worked out and drawn from."""
+DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
+uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
+recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
+InferenceData), summary.json, pictures of what they see, and open.png. A fit that is stopped goes on
+from its checkpoint when the same command is given again."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to fit, and where the results go."""
+
+    demos: Path | None = None
+    """Recordings in the format of docs/demonstrations.md."""
+    domain: str | None = None
+    """The world of the shipped recordings: driving (unless given), search_rescue or bomb_defusal.
+    """
+    setting: str | None = None
+    """The setting of the shipped recordings: clear or fog in driving, clear or smoke in
+    search_rescue, labelled or unlabelled in bomb_defusal. Default: the one in which people see
+    less."""
+    population: str | None = None
+    """The people of the shipped recordings: paper (unless given; sight limited by the setting
+    alone, in bomb_defusal as quick at every terminal) or diverse (each their own sight)."""
+    out: Path = Path("runs/fit")
+    """Folder for the results; made if it is not there."""
+    train_rounds: int | None = None
+    """How many rounds of each person to learn from, from the first on; 0 for none. Default: 20 of
+    recordings with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
+    human_model: str | None = None
+    """Another human model: one-radius, per-item, perceptual-only, policy-only or no-implants, or
+    one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
+    self_model: Path | None = None
+    """Weights of the robot's self-model; those that ship unless given."""
+    guide: str = "auto"
+    """How to infer: auto (amortized for whoever it serves well, if a network of this human model is
+    there, else importance; the output says who was inferred by which), importance (what people see
+    summed out exactly, how they decide by importance sampling), amortized (the same, proposed at
+    once by a trained network), svi (variational) or nuts (Hamiltonian Monte Carlo, slow)."""
+    guide_file: Path | None = None
+    """Network of the guides auto and amortized (see `python -m mirror_ppl.train --what guide`)."""
+    pooling: str = "none"
+    """Whether people tell of each other: none, or partial (the population that they are from is
+    inferred with them, and posterior.nc holds it)."""
+    prior_from: Path | None = None
+    """A posterior.nc of --pooling partial, whose population is the prior of these people."""
+    allow_contradictions: str = "0%"
+    """Percentage of steps whose action may contradict the next observation, such as 2%: for
+    recordings of noisy rigs. The summary counts them."""
+    explore: int = 8
+    """Rounds that the model plays in each scenario, to say which would tell more of what people
+    see; 0 leaves it out."""
+    steps: int = 300
+    """Gradient steps of svi."""
+    refine: int = 0
+    """Of auto and amortized: gradient steps on each person's rounds that refine what the network
+    proposes; none unless given."""
+    draws: int = 200
+    """Posterior draws."""
+    seed: int = 0
+    """Seed of everything random: the same seed gives the same summary."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda or cuda:0."""
+
+    def __post_init__(self) -> None:
+        if self.guide_file is not None and self.guide not in ("auto", "amortized"):
+            raise OptionError("--guide-file is for --guide auto and amortized")
+        if self.prior_from is not None and self.pooling != "none":
+            raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
+        if self.refine and self.guide not in ("auto", "amortized"):
+            raise OptionError("--refine is for --guide auto and amortized")
+        check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed")
+        share(self.allow_contradictions, "--allow-contradictions")
+
+
+def main(options: Options) -> None:
+    """Fit, write the results, and print what was found.
+
+    Raises:
+        MirrorError: what was asked for cannot be done; nothing is written then.
+    """
+    began = monotonic()
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.evaluation.fit_report import show_fit
+    from mirror_ppl.face import RESULTS, infer
+    from mirror_ppl.files import output_folder
+    from mirror_ppl.inference.svi import SVIOptions
+
+    recordings = _recordings(options)
+    engine = told_engine(options.guide)
+    allowed = share(options.allow_contradictions, "--allow-contradictions")
+    _require_memory(recordings, options)
+    with output_folder(options.out, (*RESULTS, CHECKPOINT)) as folder, Stages() as stages:
+        fit = infer(
+            recordings,
+            human=options.human_model,
+            engine=engine,
+            pooling=options.pooling,
+            seed=options.seed,
+            draws=options.draws,
+            train_rounds=options.train_rounds,
+            settings=SVIOptions(steps=options.steps) if engine == "svi" else None,
+            refine=options.refine,
+            explore=options.explore,
+            allow_contradictions=allowed,
+            prior_from=options.prior_from,
+            guide_file=options.guide_file,
+            self_model=options.self_model,
+            device=options.device,
+            report=stages.report,
+            checkpoint=folder / CHECKPOINT,
+        )
+        seconds = round(monotonic() - began, 1)
+        pictures = fit.save(folder, seconds=seconds)
+        for file in folder.glob(f"{CHECKPOINT}*"):
+            if CHECKPOINTS.fullmatch(file.name) and file.is_file():
+                file.unlink()
+    show_fit(fit.summary | {"seconds": seconds}, get_domain(recordings.domain).reach_unit)
+    print(f"{folder / 'posterior.nc'}: posterior and predictions, as ArviZ InferenceData")
+    print(f"{folder / 'summary.json'}: the numbers above")
+    for name, shows in pictures.items():
+        print(f"{folder / name}: {shows}")
+
+
+def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
+    """Refuse what will not fit, before any work is done."""
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.inference.results.fitting import split_rounds
+    from mirror_ppl.inference.results.posterior_predictive import PEOPLE_AT_ONCE
+
+    parts = [part for part in split_rounds(demonstrations, options.train_rounds) if part]
+    actions = len(get_domain(demonstrations.domain).actions)
+    steps = sum(part.actions[0].numel() for part in parts)
+    people = demonstrations.num_people
+    # Probabilities of actions are kept of held-out rounds; of some people there are copies.
+    values = options.draws * steps * actions * (people + COPIES * min(people, PEOPLE_AT_ONCE))
+    require_memory(4 * values, "so many draws of predictions")
+
+
+def _recordings(options: Options) -> Demonstrations:
+    from mirror_ppl.face import load_recordings
+
+    given = {name: getattr(options, name) for name in ("domain", "setting", "population")}
+    if options.demos is not None:
+        recorded = load_recordings(options.demos)
+        for name in ("domain", "setting"):
+            if given[name] not in (None, own := getattr(recorded, name)):
+                raise OptionError(
+                    f"--{name} is {given[name]}, but --demos is of {own}; leave one out"
+                )
+        if options.population is not None:
+            raise OptionError("--population is of the shipped recordings; leave it or --demos out")
+        return recorded
+    return load_recordings(**given)

@@ -1,0 +1,113 @@
+"""`python -m mirror_ppl.simulate`: record rounds of simulated people."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from mirror_ppl.console import usable_device
+from mirror_ppl.errors import OptionError
+from mirror_ppl.limits import check_numbers, require_memory
+from mirror_ppl.progress import Progress
+
+PROGRAM = "python -m mirror_ppl.simulate"
+COPIES = 4
+"""Of recordings in memory: while they are made, checked and packed into a file."""
+DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
+for python -m mirror_ppl.fit. How the people are made is told in docs/people.md."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to record."""
+
+    out: Path
+    """The netCDF file to write; one that is there is replaced, missing folders are created."""
+    domain: str = "driving"
+    """The world: driving (two lanes, four cars that never yield), search_rescue (a burning house,
+    a victim, two corridors) or bomb_defusal (three stages, six terminals)."""
+    setting: str | None = None
+    """Its setting: of driving clear (the whole road in sight) or fog (2 cells ahead, nothing
+    behind), of search_rescue clear (the whole house in sight) or smoke (1.5 cells around), of
+    bomb_defusal labelled (the type can be read) or unlabelled. Default: the one in which people see
+    less."""
+    population: str = "paper"
+    """Who: paper (sight limited by the setting alone; in bomb_defusal as quick at every terminal)
+    or diverse (each their own sight)."""
+    people: int = 10
+    """How many people, at least 1."""
+    rounds: int = 40
+    """How many rounds each of them plays, at least 1."""
+    told: float = 0.0
+    """Chance that an item that can be communicated is told, at each step, whoever it helps: rounds
+    that tell what people make of messages."""
+    seed: int = 0
+    """The same seed gives the same people in every setting, and the same command the same file."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda or cuda:0."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "people", "rounds", "seed")
+        if not 0 <= self.told <= 1:
+            raise OptionError(f"--told must be from 0 to 1, not {self.told}")
+
+
+def main(options: Options) -> None:
+    """Simulate, write, and tell what was written.
+
+    Raises:
+        UnknownNameError: there is no such domain, setting, population or device.
+        OutputError: the file cannot be written.
+    """
+    from mirror_ppl.data import save_demonstrations
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.files import lock_of, output_folder
+    from mirror_ppl.people import simulate
+
+    domain = get_domain(options.domain)
+    setting = domain.settings[-1] if options.setting is None else options.setting
+    device = usable_device(options.device)
+    require_memory(_bytes(options), "rounds of so many people")
+    folder = output_folder(options.out.parent, [options.out.name], lock_of(options.out))
+    with folder, Progress("simulate", domain.horizon) as progress:
+        demonstrations = simulate(
+            options.domain,
+            setting,
+            options.population,
+            options.people,
+            options.rounds,
+            options.seed,
+            device,
+            progress,
+            options.told,
+        )
+        provenance = {**demonstrations.provenance, "command": _command(options)}
+        path = save_demonstrations(options.out, replace(demonstrations, provenance=provenance))
+
+    assert demonstrations.rewards is not None and demonstrations.action_entropy is not None
+    reward = demonstrations.rewards.nansum(-1).mean().item()
+    entropy = demonstrations.action_entropy.nanmean().item()
+    print(f"{path}: {options.domain}, {setting}, population {options.population}")
+    print(f"  people {options.people}, rounds of each {options.rounds}, seed {options.seed}")
+    print(f"  mean reward of a round {reward:.3f}")
+    print(f"  mean entropy of an action {entropy:.4f} nats")
+
+
+def _bytes(options: Options) -> int:
+    """About how much memory the recordings take, and copies that are made of them."""
+    from mirror_ppl.domains import get_domain
+
+    domain = get_domain(options.domain)
+    values = sum(len(m.items) * (len(m.features) + 1) for m in domain.modalities)
+    times = options.people * options.rounds * (domain.horizon + 1)
+    return COPIES * 4 * times * (values + len(domain.ego_features) + 3)
+
+
+def _command(options: Options) -> str:
+    """The command that makes the same recordings again, wherever it is to write them."""
+    from mirror_ppl.domains import get_domain
+
+    values = {part.name: getattr(options, part.name) for part in fields(options)}
+    if options.setting is None:
+        values["setting"] = get_domain(options.domain).settings[-1]
+    unsaid = {"out"} if options.told else {"out", "told"}
+    parts = [f"--{name} {value}" for name, value in values.items() if name not in unsaid]
+    return " ".join([PROGRAM, *parts])

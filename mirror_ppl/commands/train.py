@@ -1,0 +1,223 @@
+"""`python -m mirror_ppl.train`: train a self-model or a guide."""
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from mirror_ppl.console import usable_device
+from mirror_ppl.errors import OptionError
+from mirror_ppl.limits import check_numbers
+from mirror_ppl.progress import Progress, Stages
+
+LEAST_PEOPLE = 10
+PROGRAM = "python -m mirror_ppl.train"
+DESCRIPTION = """Train the robot's self-model from nothing, or a guide that infers people at once,
+measure it, and write its weights with a card that tells both. A self-model is measured against the
+exact planner; it takes about ten minutes. A guide learns from people who are drawn from the human
+model's prior; it takes about half an hour. A run that is stopped goes on when the same command is
+given again."""
+SELF_MODEL, GUIDE = "self-model", "guide"
+OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "sizes", "device")
+OF_GUIDE = ("people", "elbo_steps", "human_model", "self_model")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to train, and where to."""
+
+    what: str = SELF_MODEL
+    """What to train: self-model or guide."""
+    out: Path | None = None
+    """The weights file to write; its card can be read with `python -m mirror_ppl.train --card`.
+    Default: runs/driving_self_model.safetensors or runs/driving_guide.safetensors, by the name of
+    the domain."""
+    domain: str = "driving"
+    """The world to learn: driving (two lanes, four cars that never yield), search_rescue (a
+    burning house, a victim, two corridors) or bomb_defusal (three stages, six terminals)."""
+    phases: int | None = None
+    """Of a self-model: phases of acting and learning; 2 to try it out. Default: what makes a good
+    one, of driving 40, of search_rescue 400 and of bomb_defusal 200."""
+    steps: int | None = None
+    """Of a self-model: gradient steps of a phase. Default: of driving 300,
+    of search_rescue 40, of bomb_defusal 30."""
+    learning_rate: float | None = None
+    """Of a self-model: learning rate at the start; it falls to a hundredth. Default: of driving
+    0.001, of the others 0.002."""
+    speech: str = "words"
+    """Of a self-model: what makes numbers of utterances, words or gpt2 (the supplement's; needs the
+    extra "speech" and its weights)."""
+    sizes: str = "shipped"
+    """Of a self-model: sizes of the networks, shipped or paper (the supplement's, which differ in
+    bomb_defusal: a Q-network of 3 x 2048)."""
+    people: int = 1000
+    """Of a guide: people to learn from, simulated in the true domain."""
+    elbo_steps: int = 0
+    """Of a guide: gradient steps of the ELBO among those of inference compilation."""
+    human_model: str | None = None
+    """Of a guide: another human model: one-radius, per-item, perceptual-only and so on, or
+    one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
+    self_model: Path | None = None
+    """Of a guide: weights of the robot's self-model; those that ship unless given."""
+    seed: int = 0
+    """Seed of everything random."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda or cuda:0."""
+    card: Path | None = None
+    """Do not train: print the card of this weights file."""
+
+    def __post_init__(self) -> None:
+        if self.what not in (SELF_MODEL, GUIDE):
+            raise OptionError(f"--what must be {SELF_MODEL} or {GUIDE}, not {self.what}")
+        check_numbers(self, "phases", "steps", "elbo_steps", "seed", people=LEAST_PEOPLE)
+        other, of_other = (SELF_MODEL, OF_SELF_MODEL) if self.what == GUIDE else (GUIDE, OF_GUIDE)
+        defaults = {field.name: field.default for field in fields(self)}
+        for name in of_other:
+            if getattr(self, name) != defaults[name]:
+                raise OptionError(f"--{name.replace('_', '-')} is for --what {other}")
+        rate = self.learning_rate
+        if rate is not None and not 0 < rate <= 1:
+            raise OptionError(f"--learning-rate must be above 0 and at most 1, not {rate}")
+
+
+def main(options: Options) -> None:
+    """Train, measure, write, and print what was reached.
+
+    Raises:
+        UnknownNameError: there is no such domain or device.
+        AssetError: a file that was named cannot be read.
+        HumanModelError: the human model breaks its contract.
+        OutputError: the file cannot be written.
+        CheckpointError: a checkpoint of a run with other options is in the way.
+    """
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.files import lock_of, output_folder, require_files_of_their_own
+
+    if options.card is not None:
+        _show(_card(options.card))
+        return
+    get_domain(options.domain)
+    name = options.what.replace("-", "_")
+    out = options.out or Path("runs") / f"{options.domain}_{name}.safetensors"
+    inputs = {"--self-model": [options.self_model]}
+    require_files_of_their_own({"--out": out}, inputs)
+    checkpoint = out.with_suffix(".checkpoint")
+    with output_folder(out.parent, [out.name, checkpoint.name], lock_of(out)):
+        card = (_guide if options.what == GUIDE else _self_model)(options, out, checkpoint)
+        checkpoint.unlink(missing_ok=True)
+    _show(card)
+    print(f"weights and card: {out}")
+
+
+def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
+    import torch
+
+    from mirror_ppl.domains import get_domain, require_known
+    from mirror_ppl.evaluation.self_model import self_model_quality
+    from mirror_ppl.models.sizes import PAPER, SIZES
+    from mirror_ppl.models.speech import EMBEDDINGS
+    from mirror_ppl.models.weights import save_self_model
+    from mirror_ppl.training.self_model import SelfModelOptions, train_self_model
+
+    default, *_ = EMBEDDINGS
+    if require_known(options.speech, "speech", tuple(EMBEDDINGS)) != default and not any(
+        modality.utterances for modality in get_domain(options.domain).modalities
+    ):
+        raise OptionError(f"--speech: nothing is put into words in {options.domain}")
+    sizes = {"shipped": SIZES, "paper": PAPER}[
+        require_known(options.sizes, "sizes", ("shipped", "paper"))
+    ][options.domain]
+    settings = SelfModelOptions.of(
+        options.domain,
+        phases=options.phases,
+        steps=options.steps,
+        learning_rate=options.learning_rate,
+    )
+    generator = torch.Generator(usable_device(options.device)).manual_seed(options.seed)
+    with Progress("train", settings.phases) as progress:
+        self_model = train_self_model(
+            get_domain(options.domain).as_believed,
+            settings,
+            generator,
+            progress.update,
+            checkpoint,
+            options.speech,
+            sizes,
+        )
+    # It was taught the world as it is believed to be, and lives in the world as it is.
+    self_model.domain = get_domain(options.domain)
+    with Stages() as stages:
+        quality = self_model_quality(
+            self_model,
+            discount=settings.discount,
+            progress=lambda done, total: stages.report("measure", done, total, "views"),
+        )
+    card = _described(options, settings, quality, "measured on 4000 rounds")
+    save_self_model(self_model, out, card)
+    return card
+
+
+def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
+    from mirror_ppl.likelihood.contract import check_contract
+    from mirror_ppl.models.loading import load_human_model
+    from mirror_ppl.models.weights import load_self_model, shipped_weights
+    from mirror_ppl.training.guide import GuideOptions, train_guide
+    from mirror_ppl.training.guide_file import save_guide
+
+    weights = options.self_model or shipped_weights(options.domain)
+    self_model, _ = load_self_model(weights, options.domain)
+    human = load_human_model(options.human_model, self_model)
+    check_contract(human)
+    settings = GuideOptions(people=options.people, elbo_steps=options.elbo_steps)
+    with Stages() as stages:
+        guide, quality = train_guide(human, settings, options.seed, stages.report, checkpoint)
+    card = _described(options, settings, quality, "nats a person, of people held out")
+    save_guide(guide, human, out, card)
+    if quality["learned"] <= 0:
+        print("This guide knows no more than the prior; give it more --people")
+    return card
+
+
+def _described(options: Options, settings: Any, quality: dict[str, float], measured: str) -> dict:
+    import torch
+
+    from mirror_ppl.version import __version__
+
+    return {
+        "command": _command(options),
+        "versions": {"mirror_ppl": __version__, "torch": torch.__version__.split("+")[0]},
+        "settings": asdict(settings),
+        "measured": measured,
+        "quality": {name: round(value, 4) for name, value in quality.items()},
+    }
+
+
+def _card(path: Path) -> dict[str, Any]:
+    """The card of a weights file."""
+    from mirror_ppl.models import weights
+    from mirror_ppl.training import guide_file
+
+    return weights.read_card(path, {weights.FORMAT: "self-model", guide_file.FORMAT: "guide"})
+
+
+def _command(options: Options) -> str:
+    """The command that does it again; without what does not matter to what is trained."""
+    left_out = {"out", "card", *(OF_SELF_MODEL if options.what == GUIDE else OF_GUIDE)}
+    values = {
+        part.name: getattr(options, part.name)
+        for part in fields(options)
+        if part.name not in left_out
+    }
+    given = {name: value for name, value in values.items() if value is not None}
+    return " ".join([PROGRAM, *(f"--{name.replace('_', '-')} {given[name]}" for name in given)])
+
+
+def _show(card: dict) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=card["command"], title_justify="left")
+    table.add_column(card.get("measured", "measured on 4000 rounds"))
+    table.add_column("value", justify="right")
+    for name, value in card["quality"].items():
+        table.add_row(name.replace("_", " "), f"{value:.3f}")
+    Console().print(table)

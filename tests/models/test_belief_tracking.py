@@ -1,0 +1,142 @@
+"""Tracked beliefs, against the recursion of the human model for each person by itself."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from example_course import go_through
+from test_bomb_defusal_human import WAIT, course
+
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.likelihood.attention import attention_sites
+from mirror_ppl.likelihood.combinations import discrete_sites
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.belief_tracking import BeliefState, Memory, Transition
+from mirror_ppl.models.bomb_defusal import BombDefusalHuman
+from mirror_ppl.models.human import at_step, messages_at
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+PEOPLE, STEPS = 60, 8
+
+
+def drivers(generator):
+    """Drivers in fog: a model, a round ``[1, T, ...]``, and actions ``[1, T]``."""
+    recordings = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    human = HumanModel(load_self_model(shipped_weights("driving"))[0])
+    observation = {name: value[0, :1, :STEPS] for name, value in recordings.observation().items()}
+    return human, observation, recordings.actions[0, :1, :STEPS]
+
+
+def defusers(generator):
+    """People who wait for most of a round, in which many beliefs stay as they are."""
+    human = BombDefusalHuman(load_self_model(shipped_weights("bomb_defusal"))[0])
+    done = [WAIT, WAIT, 1, WAIT, WAIT, WAIT, 2, WAIT]
+    observation, _ = course(done)
+    observation = {name: value[:, :STEPS] for name, value in observation.items()}
+    return human, observation, torch.tensor([done])
+
+
+@pytest.fixture(params=[drivers, defusers])
+def case(request, generator):
+    """A model, implants of people with different messages, and the transitions of a round."""
+    human, observation, actions = request.param(generator)
+    supports = discrete_sites(human) | attention_sites(human)
+    implants = {
+        name: own[torch.randint(min(len(own), 6), (PEOPLE,), generator=generator)]
+        for name, own in supports.items()
+    }
+    # Of half of the people there are doubles.
+    implants = {name: value[torch.arange(PEOPLE) % 45] for name, value in implants.items()}
+    told = {
+        m.name: (torch.rand(3, STEPS, len(m.items), generator=generator) < 0.1)[
+            torch.arange(PEOPLE) % 3
+        ]
+        for m in human.domain.modalities
+    }
+    before = torch.cat([torch.tensor([len(human.domain.actions)]), actions[0, :-1]])
+    transitions = [
+        Transition(
+            implants,
+            before[step].expand(PEOPLE),
+            at_step(observation, step),
+            messages_at(told, step),
+        )
+        for step in range(STEPS)
+    ]
+    expected = [belief for _, belief in go_through(human, implants, observation, told, actions)]
+    return human, observation, transitions, expected
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+@torch.no_grad()
+def test_beliefs_are_those_of_each_person_alone(case, remembers):
+    human, observation, transitions, expected = case
+    memory = Memory.of_round(human, observation) if remembers else None
+    states = BeliefState.initial(human, PEOPLE, memory).through(transitions)
+    for state, own in zip(states, expected, strict=True):
+        torch.testing.assert_close(state.believed, own.expand(PEOPLE, -1), rtol=0, atol=1e-5)
+    # They differ between people, and some are shared.
+    assert 1 < len(states[-1].belief.unique()) < PEOPLE
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+@torch.no_grad()
+def test_steps_one_by_one_come_to_the_same(case, remembers):
+    human, observation, transitions, _ = case
+    memory = Memory.of_round(human, observation) if remembers else None
+    state = BeliefState.initial(human, PEOPLE, memory)
+    for transition, expected in zip(transitions, state.through(transitions), strict=True):
+        state = state.after(transition)
+        torch.testing.assert_close(state.believed, expected.believed, rtol=0, atol=1e-5)
+        assert len(state.belief.unique()) == len(expected.belief.unique())
+        assert torch.equal(state.key()[:, 1:], expected.key()[:, 1:])
+        assert state.step == expected.step
+
+
+@torch.no_grad()
+def test_observations_of_their_own_are_as_one_that_is_shared(case):
+    human, _, transitions, expected = case
+    rows = torch.randperm(PEOPLE)
+    apart = [
+        replace(
+            one,
+            row=rows,
+            observation={
+                name: value.expand(PEOPLE, *value.shape[1:])
+                for name, value in one.observation.items()
+            },
+        )
+        for one in transitions
+    ]
+    for state, own in zip(BeliefState.initial(human, PEOPLE).through(apart), expected, strict=True):
+        torch.testing.assert_close(state.believed, own.expand(PEOPLE, -1), rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_belief_is_inferred_once(case, monkeypatch):
+    """With a memory, nothing is inferred where the same came about before."""
+    human, observation, transitions, _ = case
+    inferred = []
+    infer = type(human).infer
+
+    def counted(self, belief, *rest):
+        inferred.append(len(belief))
+        return infer(self, belief, *rest)
+
+    monkeypatch.setattr(type(human), "infer", counted)
+    start = BeliefState.initial(human, PEOPLE, Memory.of_round(human, observation))
+    states = start.through(transitions)
+    assert len(states[-1].memory.causes) == sum(inferred)
+    assert len(states[-1].memory.causes.unique(dim=0)) == sum(inferred)
+    assert len(states[-1].mean.unique(dim=0)) == len(states[-1].mean) <= 1 + sum(inferred)
+    first, index = states[-1].distinct()
+    assert torch.equal(first.key()[index], states[-1].key())
+    assert len(first.key().unique(dim=0)) == len(first.belief)
+
+
+def test_before_the_first_step_there_is_one_belief(case):
+    human, *_ = case
+    state, own = BeliefState.initial(human, 5).distinct()
+    assert own.tolist() == [0] * 5 and state.mean.shape == (1, human.belief_size)
+    assert not state.believed.any()
+    assert state.step == 0
