@@ -25,7 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.inference.adaptive_importance import ImportanceOptions, adapt
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, adapt, near_to
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
@@ -103,6 +103,7 @@ def sample_amortized(
     builder: ViewTableBuilder,
     options: AmortizedOptions | None = None,
     sites: Mapping[str, Any] | None = None,
+    near: Weighted | None = None,
 ) -> Weighted:
     """Weighted draws of one person: the guide's, and the ways that evidence is about.
 
@@ -114,13 +115,18 @@ def sample_amortized(
         builder: the person's rounds so far.
         options: settings.
         sites: see :class:`Sampler`.
+        near: draws from much the same posterior, which are proposed from in the network's place.
     """
     options = options or AmortizedOptions()
     evidence = evidence_of(builder)
     sampler = Sampler(human, evidence.table, evidence.combinations, sites)
     sampler.add_prior_draws(evidence.ways, evidence.joint)
     sampler.prune(options.adaptation.prune_margin)
-    if options.refine and sampler.sites:
+    if near is not None:
+        if near.proposed_residual:
+            sampler.learn_residual(near)
+        density = near_to(sampler, near, options.adaptation)
+    elif options.refine and sampler.sites:
         compiled = ViewTables(human, sampler.table)
         density = refined(guide, compiled, evidence.log_evidence, evidence.steps, options.refine)
     else:

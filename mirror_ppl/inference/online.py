@@ -67,6 +67,7 @@ class OnlinePosterior:
         self._rounds: list[Round] = []
         self.pareto_k = float("nan")
         self.seconds = 0.0, 0.0
+        self._last: Weighted | None = None
         self._screening = Screening() if network is None else guide_screening()
         self._sightings = ViewTableBuilder(human, self._screening)
         self._sites = scalar_sites(human)
@@ -122,7 +123,7 @@ class OnlinePosterior:
         began = monotonic()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed * 1_000_003 + self.rounds)
-            found = self._weighted()
+            found = self._last = self._weighted()
             drawn = found.sample(number, self._sightings.grid)
         self.pareto_k = found.pareto_k
         self.seconds = self.seconds[0], monotonic() - began
@@ -132,11 +133,13 @@ class OnlinePosterior:
         human, options = self.human, ImportanceOptions()
         if self.network is None:
             first = coarse(options) if looks_twice(human) else options
-            found = sample_importance(human, self._sightings.table(), first)
+            found = sample_importance(human, self._sightings.table(), first, self._last)
         else:
             # What the first asking has checked need not be checked again.
             sites = None if math.isnan(self.pareto_k) else self._sites
-            found = sample_amortized(human, self.network, self._sightings, AT_ONCE, sites)
+            found = sample_amortized(
+                human, self.network, self._sightings, AT_ONCE, sites, self._last
+            )
         if looks_twice(human):
             _, found = second_look(
                 human, self._rounds, self._screening, options, self._sightings, found

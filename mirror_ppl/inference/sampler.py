@@ -60,6 +60,7 @@ class Weighted:
             draw, ``[S, G]``, up to what all of them share.
         log_weights: normalized and Pareto-smoothed, ``[S]``.
         pareto_k: of the weights.
+        proposed_residual: whether the residual was proposed by what the rounds say of it.
     """
 
     policy: Draws
@@ -67,6 +68,7 @@ class Weighted:
     log_joint: Tensor
     log_weights: Tensor
     pareto_k: float
+    proposed_residual: bool = False
 
     @property
     def effective(self) -> float:
@@ -236,7 +238,7 @@ class Sampler:
         return self._residual is not None
 
     def learn_residual(self, found: Weighted) -> None:
-        """From now on propose the residual, too, by these weights of all draws so far.
+        """From now on propose the residual, too, by these weighted draws of the person.
 
         A share of :data:`DEFENSIVE_SHARE` of what is proposed has a residual from the prior all
         the same.
@@ -253,9 +255,8 @@ class Sampler:
             self.combinations.log_prior if self.combinations.fixed else None,
         )
         self._residual = ResidualProposal.of(self.human, self.table, counts)
-        self._log_residual = self._residual_densities(
-            found.policy, self._residual.gaussian(found.policy)
-        )
+        own = self._policy()
+        self._log_residual = self._residual_densities(own, self._residual.gaussian(own))
 
     def learn_discrete(self, found: Weighted) -> None:
         """From now on propose discrete sites of the policy, too, by what is known so far.
@@ -317,12 +318,15 @@ class Sampler:
         groups[0] = groups[0] + _log_abs_det(self.sites, place)
         self._log_prior = torch.cat([self._log_prior, torch.stack(groups)], 1)
 
-    def weighted(self) -> Weighted:
-        """All draws, with their weights."""
-        joint = torch.cat(self._joints)
-        policy = {
+    def _policy(self) -> Draws:
+        """All draws so far ``[S, 1, 1, ...]``."""
+        return {
             name: torch.cat([one[name] for one in self._policies]) for name in self._policies[0]
         }
+
+    def weighted(self) -> Weighted:
+        """All draws, with their weights."""
+        joint, policy = torch.cat(self._joints), self._policy()
         of_scalars, of_discrete = self._log_prior
         prior = either = torch.zeros_like(of_scalars)
         if self._residual is not None:
@@ -347,7 +351,9 @@ class Sampler:
         target = joint.logsumexp(-1) + of_scalars + of_discrete + prior
         target = target + torch.cat(self._corrections)
         log_weights, pareto_k = _smoothed(target - mixture)
-        return Weighted(policy, self.combinations, joint, log_weights, pareto_k)
+        return Weighted(
+            policy, self.combinations, joint, log_weights, pareto_k, self.proposes_residual
+        )
 
     def _joint(self, policy: Draws, number: int) -> Tensor:
         combinations = self.combinations

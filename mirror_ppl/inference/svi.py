@@ -85,8 +85,11 @@ class ImplantPosterior:
 
 
 class PriorScaledNormal(AutoNormal):
-    """A mean-field guide that starts as wide as the prior: weights of which the data say nothing
-    are right from the first step, and the others have only to move.
+    """A mean-field guide whose vectors start as wide as their prior.
+
+    Weights of which the data say nothing are right from the first step. Sites of one number start
+    narrow: a site that is known to .01 would have gradients thousands of times as large under a
+    wide guide, and Adam, which remembers them, would take steps that are far too small.
     """
 
     def _setup_prototype(self, *args: Any, **kwargs: Any) -> None:
@@ -94,6 +97,8 @@ class PriorScaledNormal(AutoNormal):
         assert self.prototype_trace is not None
         for name, site in self.prototype_trace.iter_stochastic_nodes():
             prior = site["fn"]
+            if not prior.event_dim:
+                continue
             draws = torch.stack([prior.sample() for _ in range(WIDTH_DRAWS)])
             width = biject_to(prior.support).inv(draws).std(0)
             width = width.mean(tuple(range(width.dim() - prior.event_dim)))
