@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -45,7 +45,11 @@ Value = Callable[[Tensor], Valued]
 
 
 class Objective(Protocol):
-    """What a communicator wants."""
+    """What a communicator wants.
+
+    One that values the message of the present step alone has an attribute ``one_step`` that is
+    true, so that no plans of several steps are compared.
+    """
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
         """What candidates are worth at this point of a round.
@@ -256,6 +260,8 @@ class Divergence:
         measure: ``kl``, or ``squared``, the squared distance of the means that the authors'
             released code has in its place.
     """
+
+    one_step: ClassVar[bool] = True
 
     weight: float = 1.0
     measure: str = "kl"

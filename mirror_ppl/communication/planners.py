@@ -101,8 +101,6 @@ PLANNERS: Mapping[str, Callable[[Person, PlannerOptions], Objective]] = {
 ``mirror`` looks for reward in the domain's simulator, ``mirror-self-model`` in what the robot has
 learned of the world; ``mirror-kl`` brings the person's belief near to the robot's.
 """
-MYOPIC = ("mirror-kl",)
-"""Those whose objective looks at one step."""
 
 
 def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
@@ -113,8 +111,8 @@ def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) ->
     """
     if name not in PLANNERS:
         raise UnknownNameError.of("planner", name, PLANNERS)
-    search = Automatic(options.patience, items=options.items)
-    if name in MYOPIC:
-        search = replace(search, steps=1)
     objective = PLANNERS[name](person, options)
+    search = Automatic(options.patience, items=options.items)
+    if getattr(objective, "one_step", False):
+        search = replace(search, steps=1)
     return Communicator(person, objective, search, options.min_standard_errors, seed)
