@@ -36,7 +36,13 @@ from mirror_ppl.version import __version__
 
 ENGINES: Mapping[str, Engine] = {
     engine.name: engine
-    for engine in (automatic.ENGINE, importance.ENGINE, amortized.ENGINE, svi.ENGINE, nuts.ENGINE)
+    for engine in (
+        automatic.ENGINE,
+        importance.ENGINE,
+        amortized.ENGINE,
+        svi.ENGINE,
+        nuts.ENGINE,
+    )
 }
 """The registry; a new engine is a file of its own and its name here."""
 
