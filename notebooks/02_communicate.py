@@ -38,20 +38,9 @@ import torch
 # Whether Jupyter's widgets are installed does not matter here.
 warnings.filterwarnings("ignore", message="IProgress not found")
 
-from mirror_ppl.communication import (
-    Automatic,
-    Communicator,
-    ExpectedUtility,
-    Person,
-    RoundSoFar,
-    SimulatorWorld,
-)
-from mirror_ppl.data import asset_path, load_demonstrations
+import mirror_ppl
+from mirror_ppl.communication import RoundSoFar
 from mirror_ppl.domains import get_domain
-from mirror_ppl.inference.engines import InferenceOptions
-from mirror_ppl.inference.results.fitting import fit_people
-from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 # The networks are small: one thread is as fast as several.
 torch.set_num_threads(1)
@@ -64,30 +53,24 @@ quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
 # One of the ten people in the recordings that ship. The communicator plans with 64 draws from
 # their posterior. So it has not one opinion of what they see, but 64, and messages have to be
 # worth sending on average over these.
-#
-# A posterior that was saved is read with `load_posterior(path).draws(human, 64)`, from
-# `mirror_ppl.inference.results.posterior_file`.
 
 # %%
 domain = get_domain("driving")
-self_model, card = load_self_model(shipped_weights("driving"))
-human = HumanModel(self_model)
-recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people(["person-01"])
-options = InferenceOptions(draws=16 if quick else 64)
-fit = fit_people(human, recordings, options, seed=0, train_rounds=10 if quick else None)
-person = Person(human, fit.posterior.draws)
-
-pd.DataFrame(fit.summary["people"][0]["implants"]).T.round(2)
+recordings = mirror_ppl.load_recordings(setting="fog").select_people(["person-01"])
+settings = {"draws": 16, "train_rounds": 10} if quick else {"draws": 64}
+fit = mirror_ppl.infer(recordings, explore=0, **settings)
+fit.person().implants.round(2)
 
 # %% [markdown]
 # ## The communicator
 #
-# It has two parts: whom it speaks to, and what messages are for. Here they are for reward, looked
-# for in the domain's own simulator. Where there is no simulator, `SelfModelWorld(self_model)` takes
-# its place: what the robot has learned of the world.
+# It plans messages for one person of a fit. The planner `mirror`, the default, looks for reward in
+# the domain's own simulator. `planner="mirror-self-model"` looks for it in what the robot has
+# learned of the world, and `planner="mirror-kl"` brings the person's belief close to the robot's.
 
 # %%
-communicator = Communicator(person, ExpectedUtility(SimulatorWorld(domain)))
+communicator = mirror_ppl.Communicator(fit)
+person = communicator.person
 
 # %% [markdown]
 # ## In your own simulator, or on your robot
@@ -317,8 +300,8 @@ plot_action(decision)
 #
 # Two settings change when it speaks.
 #
-# - **Patience.** `Automatic(3)`, the default, compares each good message with the same message one
-#   or two steps later. What can wait waits: it may turn out not to be needed. `Automatic(1)` asks
+# - **Patience.** `patience=3`, the default, compares each good message with the same message one or
+#   two steps later. What can wait waits: it may turn out not to be needed. `patience=1` asks
 #   only whether a message is better than silence for good.
 # - **How sure.** With `min_standard_errors=2`, the default, a message has to gain more than two
 #   standard errors of its gain, and so has each of its items, compared with leaving it out. With 0
@@ -329,12 +312,11 @@ plot_action(decision)
 # the same past, in which the shipped settings spoke.
 
 # %%
-utility = ExpectedUtility(SimulatorWorld(domain))
 others = {
     "as shipped": communicator,
-    "no patience": Communicator(person, utility, Automatic(1)),
-    "0 s.e.": Communicator(person, utility, min_standard_errors=0.0),
-    "20 s.e.": Communicator(person, utility, min_standard_errors=20.0),
+    "no patience": mirror_ppl.Communicator(fit, patience=1),
+    "0 s.e.": mirror_ppl.Communicator(fit, min_standard_errors=0.0),
+    "20 s.e.": mirror_ppl.Communicator(fit, min_standard_errors=20.0),
 }
 pd.DataFrame(
     [
