@@ -48,7 +48,8 @@ def run_tasks(
     from joblib import Parallel, delayed
 
     if here and jobs == 1:
-        yield from map(_guarded, tasks)
+        for task in tasks:  # not by map(), which a StopIteration of a task would end
+            yield _guarded(task)
         return
     with warnings.catch_warnings():
         # Processes that have used much memory are replaced by new ones; nothing is lost.

@@ -66,6 +66,8 @@ class View:
         masks = {**self.visible, **{f"{name}, taken": mask for name, mask in self.taken.items()}}
         if self.still is not None:
             masks["still"] = self.still[..., None]
+        if not masks:  # of a model that looks at nothing
+            return torch.zeros((), dtype=torch.long)
         sizes = [mask.shape[-1] for mask in masks.values()]
         sizes += [self.imagined[name].shape[-2:].numel() for name in self.taken]
         device = next(iter(masks.values())).device
