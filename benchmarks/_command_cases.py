@@ -108,7 +108,9 @@ def _become(command: str, arguments: list[str], folder: Path, place: Path) -> No
     # Of a process that is a copy, joblib makes none of its own.
     warnings.filterwarnings("ignore", "Loky-backed parallel loops")
     try:
-        module = importlib.import_module(f"mirror_ppl.{command or '__main__'}")
+        module = importlib.import_module(
+            f"mirror_ppl.commands.{command}" if command else "mirror_ppl.__main__"
+        )
         if command:
             told = {"prog": module.PROGRAM, "description": module.DESCRIPTION, "args": arguments}
             status = run(module.Options, module.main, **told)

@@ -110,7 +110,10 @@ def line(random: Random) -> tuple[str, list[str]]:
     if not command:
         return command, [str(one) for one in random.choice(OF_PROGRAM, int(random.integers(3)))]
     small = SMALL[command][int(random.integers(len(SMALL[command])))]
-    arguments, options = list(small), importlib.import_module(f"mirror_ppl.{command}").Options
+    arguments, options = (
+        list(small),
+        importlib.import_module(f"mirror_ppl.commands.{command}").Options,
+    )
     parts = {field.name: field for field in dataclasses.fields(options)}
     kinds = typing.get_type_hints(options)
     for name in random.choice(

@@ -69,5 +69,5 @@ def _likely(job: Job) -> Draws | None:
     if has_own_program(job.human) or not looks_twice(job.human):
         return None
     settings = coarse(ImportanceOptions())
-    first = replace(job, draws=LIKELY_DRAWS, settings=settings, checkpoint=None, start=None)
+    first = replace(job, draws=LIKELY_DRAWS, settings=settings, checkpoint=None)
     return dict(infer_by_importance(first).draws)

@@ -120,7 +120,9 @@ def values_of(one, other):
 def test_odd_options_are_refused_in_a_line(monkeypatch, capsys, tmp_path):
     """As far as options alone tell: nothing is computed."""
     monkeypatch.chdir(tmp_path)
-    modules = {name: importlib.import_module(f"mirror_ppl.{name}") for name in COMMANDS if name}
+    modules = {
+        name: importlib.import_module(f"mirror_ppl.commands.{name}") for name in COMMANDS if name
+    }
     for module in modules.values():
         monkeypatch.setattr(module, "main", lambda options: 0)
 

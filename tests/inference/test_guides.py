@@ -486,7 +486,9 @@ def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, c
         "from mirror_ppl.models.toy import ToyHuman\n\n\nclass Toy(ToyHuman):\n    pass\n"
     )
     monkeypatch.setattr(
-        guide_training, "GuideOptions", lambda people: replace(TRAINING, people=people, steps=50)
+        guide_training,
+        "GuideOptions",
+        lambda people, elbo_steps: replace(TRAINING, people=people, steps=50),
     )
     path, human = tmp_path / "guide.safetensors", ("--human-model", f"{tmp_path / 'toy.py'}:Toy")
     assert command(train, "--what", "guide", "--people", 40, *human, "--out", path) == 0
