@@ -27,7 +27,7 @@ from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel
 
 SITE = "residual_out"
-NEWTON_STEPS, CURVATURES = 3, 1
+NEWTON_STEPS, CURVATURES = 4, 2
 """Steps to the best weights; at so many of them is it worked out how curved the likelihood is."""
 DRAWS = 128
 """What is worked out at once; bounds memory."""
