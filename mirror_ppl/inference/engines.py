@@ -25,6 +25,7 @@ from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.likelihood.combinations import require_unread
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.view_table_builder import Screening
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel, has_own_program, require_standard_program
@@ -137,6 +138,7 @@ def infer(
         DemonstrationsError: the rounds cannot be in the domain's world.
     """
     check_rounds(human, demonstrations)
+    check_contract(human)
     require_kind(options, InferenceOptions, "options")
     if options.allow_contradictions < 1:
         check_world(demonstrations, options.allow_contradictions)

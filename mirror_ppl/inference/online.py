@@ -34,7 +34,8 @@ class OnlinePosterior:
         human: the model of people.
         network: a trained guide (see :func:`mirror_ppl.training.guide_file.load_guide`); without,
             draws are those of ``importance``, which takes longer at each asking.
-        seed: of everything random. The same rounds in the same order give the same draws.
+        seed: of everything random. The same rounds in the same order, with draws asked for after
+            the same of them, give the same draws.
         allow_contradictions: share of the steps that are added at once, from 0 to 1, that may
             contradict the next observation.
 
@@ -68,6 +69,7 @@ class OnlinePosterior:
         self.pareto_k = float("nan")
         self.seconds = 0.0, 0.0
         self._last: Weighted | None = None
+        self._near: Weighted | None = None
         self._screening = Screening() if network is None else guide_screening()
         self._sightings = ViewTableBuilder(human, self._screening)
         self._sites = scalar_sites(human)
@@ -102,6 +104,7 @@ class OnlinePosterior:
             raise InputError(f"the rounds are of {person!r}, those before of {self.person!r}")
         self.person = person
         began = monotonic()
+        self._near = self._last  # the same until more rounds come in, so that draws are, too
         if int(demonstrations.round_counts[0]):
             for one_round in rounds_of(demonstrations, 0):
                 self._sightings.add(*one_round)
@@ -133,12 +136,12 @@ class OnlinePosterior:
         human, options = self.human, ImportanceOptions()
         if self.network is None:
             first = coarse(options) if looks_twice(human) else options
-            found = sample_importance(human, self._sightings.table(), first, self._last)
+            found = sample_importance(human, self._sightings.table(), first, self._near)
         else:
             # What the first asking has checked need not be checked again.
             sites = None if math.isnan(self.pareto_k) else self._sites
             found = sample_amortized(
-                human, self.network, self._sightings, AT_ONCE, sites, self._last
+                human, self.network, self._sightings, AT_ONCE, sites, self._near
             )
         if looks_twice(human):
             _, found = second_look(

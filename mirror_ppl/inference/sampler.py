@@ -275,9 +275,8 @@ class Sampler:
 
     def _residual_densities(self, policy: Draws, gaussian: MultivariateNormal) -> Tensor:
         """Log densities ``[2, S]`` of residuals, by the prior and as proposed."""
-        own = {SITE: policy[SITE]}
-        _, prior = complete(self.human, self.table, own, len(policy[SITE]))
-        return torch.stack([prior, gaussian.log_prob(policy[SITE].flatten(1))])
+        _, prior = _completed(self.human, self.table, policy, len(policy[SITE]), (SITE,))
+        return torch.stack([prior[SITE], gaussian.log_prob(policy[SITE].flatten(1))])
 
     def propose(self, proposal: Proposal, number: int) -> None:
         """Draw some more."""

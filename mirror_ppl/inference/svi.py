@@ -25,12 +25,14 @@ from torch.distributions import biject_to
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.checks import real_number, whole_number
-from mirror_ppl.errors import InputError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference.batches import in_batches
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.marginal_elbo import elbo_of
+from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.likelihood.densities import PLATES
+from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import combination_scores
 from mirror_ppl.likelihood.view_table import NO_VIEW
@@ -216,14 +218,21 @@ def _prune(compiled: ViewTables, guide: Callable[[], Draws], margin: float) -> N
     Each is scored under the guide's draw that suits it best.
     """
     human, table, best = compiled.human, compiled.table, None
+    grid = combination_values(human, table)
     for _ in range(PRUNING_DRAWS):
+        drawn = guide()
+        one = {name: value[None] for name, value in drawn.items()}
+        try:
+            prior = log_priors(human, grid, one, table.people)
+        except HumanModelError:
+            return  # other sites depend on these, so that none has a prior of its own
         with (
             poutine.block(),
-            poutine.condition(data=guide()),
+            poutine.condition(data=drawn),
             pyro.plate("person", table.people, dim=-PLATES),
         ):
             likelihoods = log_likelihoods(human, human.prior(), table)
-        score = combination_scores(table, likelihoods)
+        score = combination_scores(table, likelihoods) + prior[0]
         best = score if best is None else torch.maximum(best, score)
     assert best is not None
     compiled.restrict(best >= best.amax(-1, keepdim=True) - margin)

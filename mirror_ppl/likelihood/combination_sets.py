@@ -73,12 +73,14 @@ class EquivalentCombinations:
         # In the order of combinations, however views are numbered.
         first, place = first.sort()
         which = place.argsort()[which]
-        prior = own.double().exp()
+        # Relative to the largest: many observations of a person may make all of them tiny.
+        largest = own.max()
+        prior = (own.double() - largest).exp()
         order = which.argsort(stable=True)
         total = prior.new_zeros(len(first)).index_add(0, which, prior)
         return cls(
             combinations[first],
-            total.log().to(own),
+            total.log().to(own) + largest,
             True,
             combinations[order],
             prior[order].cumsum(0),

@@ -16,6 +16,7 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
 from mirror_ppl.errors import HumanModelError, MirrorError
+from mirror_ppl.likelihood.densities import sample_nodes
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
@@ -79,6 +80,7 @@ def check_contract(human: HumanModel) -> None:
             }
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
             knowledge: Any = domain.nothing_known(people, device=device)
+            before = set(trace.trace.nodes)
             for step, now in enumerate(observed):
                 method = "perceive"
                 readable = Readable(discrete | latents)
@@ -93,6 +95,11 @@ def check_contract(human: HumanModel) -> None:
                     raise HumanModelError(
                         f"believe returned shape {tuple(belief.shape)}, expected "
                         f"({people}, {human.belief_size}) for {people} beliefs"
+                    )
+                for name in sample_nodes(trace.trace).keys() - before:
+                    raise HumanModelError(
+                        f'sees, perceive, evidence or believe has the site "{name}", which engines '
+                        "would leave out; put it into prior, round_latents or act"
                     )
                 method = "act"
                 _check_act(human, implants, belief)

@@ -223,7 +223,8 @@ class ViewTableBuilder:
         alive = self.alive
         score = self.score[:, alive] + found
         self.score[:, alive] = score
-        best = score.amax(0)
+        # With their prior: what it says, by a factor or an observed site too, may decide.
+        best = (score + self.log_prior[:, alive]).amax(0)
         self.alive = alive[best >= best.max() - screening.margin]
 
     def table(self) -> ViewTable:

@@ -67,6 +67,8 @@ class Memory:
     def of_round(cls, human: HumanModel, observation: Observation) -> Memory:
         """Of the beginning of a round with observations ``[1, T, ...]``."""
         symbols = human.domain.symbols(observation)
+        if type(human).evidence is not HumanModel.evidence:
+            symbols = observation  # it may read whatever there is
         rows = torch.cat([as_whole_numbers(value[0]).flatten(1) for value in symbols.values()], 1)
         observed = rows @ random_keys(rows.shape[1], rows.device, 1)
         return cls(observed, rows.new_zeros(0, 3), rows.new_zeros(0))

@@ -2,13 +2,15 @@
 
 Sampled values are followed through the run by Pyro's provenance tensors, as in
 :func:`pyro.infer.inspect.get_dependencies`: a site depends on those of whose values its log density
-is computed. This errs on the safe side. Zero times a value counts as a dependence; a shape, a dtype
-or a device that is taken from a value (``new_full``, ``expand_as``, ``to``) does not.
+is computed. Zero times a value counts as a dependence; a shape, a dtype or a device that is taken
+from a value (``new_full``, ``expand_as``, ``to``) does not. Provenance is lost where a value is
+assigned to part of a tensor or leaves torch. So densities are also compared under different values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -85,11 +87,77 @@ def _run(human: HumanModel) -> Dependencies:
                 human.round_latents(implants)
             with poutine.trace() as act:
                 human.choose(implants, belief, values, action.to(like.device))
-        return Dependencies(
-            _parents(prior.trace),
-            _parents(latents.trace),
-            frozenset().union(*_parents(act.trace).values()),
-        )
+        found = _parents(prior.trace)
+        actions = frozenset().union(*_parents(act.trace).values())
+    return Dependencies(
+        found | _hidden_parents(human, found),
+        _parents(latents.trace),
+        actions | _hidden_causes(human, latent_sites(prior.trace)),
+    )
+
+
+@contextmanager
+def _as_drawn(seed: int, given: Mapping[str, Tensor]) -> Iterator[None]:
+    """The program runs for one person, with other draws for another seed."""
+    with (
+        torch.random.fork_rng(devices=[]),
+        pyro.validation_enabled(False),
+        poutine.block(),
+        poutine.condition(data=dict(given)),
+        pyro.plate("person", 1, dim=-2),
+    ):
+        torch.manual_seed(seed)
+        yield
+
+
+def _hidden_parents(human: HumanModel, found: Mapping[str, Sites]) -> dict[str, Sites]:
+    """Parents of sites of ``prior`` that provenance loses, as where parts of a tensor are assigned.
+
+    A density that differs between two draws of everything else depends on some of it, and is said
+    to depend on all.
+    """
+    nodes = []
+    for seed in range(2):
+        with _as_drawn(seed, {}), poutine.trace() as trace:
+            human.prior()
+        nodes.append(sample_nodes(trace.trace))
+    latent, hidden = frozenset(latent_sites(trace.trace)), {}
+    for name in found.keys() & nodes[0].keys() & nodes[1].keys():
+        value = nodes[0][name]["value"]
+        one, other = (each[name]["fn"].log_prob(value) for each in nodes)
+        if not found[name] and not torch.equal(one, other):
+            hidden[name] = latent - {name}
+    return hidden
+
+
+def _hidden_causes(human: HumanModel, sites: Mapping[str, Any]) -> Sites:
+    """Discrete sites of ``prior`` that change what ``act`` says, also where provenance loses them.
+
+    Each is tried at its first and its last value, with all others the same.
+    """
+    like = next(human.parameters())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        belief = torch.randn(1, 1, human.belief_size).to(like)
+    values, action = human.action_values(belief), torch.zeros(1, 1, dtype=torch.long)
+
+    def said(given: Mapping[str, Tensor]) -> list[Tensor]:
+        with _as_drawn(0, given):
+            implants = human.prior()
+            with pyro.plate("round", 1, dim=-1), poutine.trace() as act:
+                human.choose(implants, belief, values, action.to(like.device))
+        nodes = sample_nodes(act.trace).values()
+        return [torch.as_tensor(node["fn"].log_prob(node["value"])) for node in nodes]
+
+    usual = {name: detach_provenance(node["value"]) for name, node in sites.items()}
+    found = set()
+    for name, node in sites.items():
+        if node["fn"].has_enumerate_support and not node["fn"].event_dim:
+            support = node["fn"].enumerate_support(expand=False).flatten()
+            ends = [said({**usual, name: end.view(1, 1)}) for end in support[[0, -1]]]
+            if not all(map(torch.equal, *ends)):
+                found.add(name)
+    return frozenset(found)
 
 
 def _parents(trace: poutine.Trace) -> dict[str, Sites]:

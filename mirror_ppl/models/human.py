@@ -73,9 +73,11 @@ class HumanModel(nn.Module):
         """Make sure that a class that changes what spans are about declares them.
 
         Raises:
-            HumanModelError: they are not.
+            HumanModelError: they are not, or it overrides what is not to be overridden.
         """
         super().__init_subclass__(**options)
+        for name in {"infer", "belief_after"} & vars(cls).keys():
+            raise HumanModelError(f"{cls.__name__} overrides {name}(); override believe() instead")
         order = cls.__mro__
         declaring = next(one for one in order if "spans" in vars(one))
         since = set().union(*(vars(one) for one in order[: order.index(declaring)]))
@@ -368,7 +370,9 @@ class HumanModel(nn.Module):
 def has_own_program(human: HumanModel) -> bool:
     """Whether a human model overrides the program itself, and not only what it calls."""
     kind = type(human)
-    return kind.model is not HumanModel.model or kind.choose is not HumanModel.choose
+    of_instance = {"model", "choose"} & vars(human).keys()
+    overrides = kind.model is not HumanModel.model or kind.choose is not HumanModel.choose
+    return overrides or bool(of_instance)
 
 
 def require_standard_program(human: HumanModel, what: str) -> None:

@@ -39,6 +39,7 @@ from mirror_ppl.inference.population.sampler import (
     PeoplesDraws,
     sample_population,
 )
+from mirror_ppl.likelihood.densities import log_prob
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
@@ -184,8 +185,7 @@ class Pooling:
         nodes = sample_sites(self.human, people, number, draws)
         total = torch.zeros(number, people, device=self.centre.device)
         for name in (*self.supports, *self.sites):
-            value = nodes[name]["value"]
-            total = total + nodes[name]["fn"].log_prob(value).expand(number, people, 1)[..., 0]
+            total = total + log_prob(nodes[name]).expand(number, people, 1)[..., 0]
         # In unconstrained space.
         place = unconstrained(self.sites, draws)
         stretch = place.new_zeros(len(place))

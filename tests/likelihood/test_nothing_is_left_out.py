@@ -1,0 +1,123 @@
+"""What a user writes counts in every engine, or is refused with the reason."""
+
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.svi import SVIOptions
+from mirror_ppl.likelihood.compiled import compile
+from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.dependencies import dependencies
+from mirror_ppl.models.human import has_own_program
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.people import simulate
+
+
+@pytest.fixture(scope="module")
+def self_model():
+    return load_self_model(shipped_weights("driving"))[0]
+
+
+class Blind(HumanModel):
+    """Known to see nothing ahead, whatever they did."""
+
+    def prior(self):
+        implants = super().prior()
+        pyro.factor("blind", -500.0 * (implants["sight_front_own"] != 0))
+        return implants
+
+
+class Gaze(HumanModel):
+    """Watched by an eye tracker whose log density is in the thousands."""
+
+    def prior(self):
+        implants = super().prior()
+        reading = dist.Normal(implants["sight_front_own"].float(), 0.01)
+        pyro.sample("gaze", reading, obs=torch.tensor(0.5))
+        return implants
+
+
+@pytest.mark.parametrize(
+    ("engine", "settings"), [("importance", None), ("svi", SVIOptions(steps=30, prune_every=10))]
+)
+@pytest.mark.parametrize(("kind", "bins"), [(Blind, {0}), (Gaze, {0, 1})])
+def test_what_the_prior_says_of_sight_outweighs_rounds(kind, bins, engine, settings, self_model):
+    rounds = simulate("driving", "fog", "paper", 1, 8, 100)
+    options = InferenceOptions(engine, 50, settings)
+    drawn = infer(kind(self_model), rounds, options, 0).draws["sight_front_own"]
+    assert set(drawn.flatten().tolist()) <= bins
+
+
+class Assigns(HumanModel):
+    """Reads sight in ``act`` and a lapse in ``prior``, by assignment to parts of tensors."""
+
+    def prior(self):
+        implants = super().prior()
+        chances = torch.full((*implants["lapse"].shape, 2), 0.5)
+        chances[..., 1] = implants["lapse"]
+        return implants | {"dozes": pyro.sample("dozes", dist.Categorical(chances))}
+
+    def act(self, implants, belief, values):
+        logits = super().act(implants, belief, values).clone()
+        logits[..., 0] = logits[..., 0] + implants["sight_front_own"]
+        return torch.log_softmax(logits, -1)
+
+
+def test_dependencies_are_found_where_provenance_is_lost(self_model):
+    found = dependencies(Assigns(self_model))
+    assert "sight_front_own" in found.actions
+    assert "lapse" in found.prior["dozes"]
+
+
+class Whispers(HumanModel):
+    def perceive(self, implants, knowledge, observation, told, step):
+        pyro.factor(f"whisper_{step}", torch.tensor(-1.0))
+        return super().perceive(implants, knowledge, observation, told, step)
+
+
+def test_sites_in_perceive_are_refused(self_model):
+    with pytest.raises(HumanModelError, match=r'site "whisper_0", which engines would leave out'):
+        check_contract(Whispers(self_model))
+
+
+@pytest.mark.parametrize("name", ["infer", "belief_after"])
+def test_what_is_made_of_believe_is_not_overridden(name):
+    with pytest.raises(HumanModelError, match=r"override believe\(\) instead"):
+        type("Mine", (HumanModel,), {name: lambda self, *given: None})
+
+
+def test_a_program_of_one_object_is_a_program_of_its_own(self_model):
+    human = HumanModel(self_model)
+    assert not has_own_program(human)
+    object.__setattr__(human, "model", lambda rounds, world=False: None)
+    assert has_own_program(human)
+
+
+class ReadsSpeed(HumanModel):
+    """Its evidence has what the encoder's symbols lack: the number of the step."""
+
+    def evidence(self, view, observation):
+        found = super().evidence(view, observation)
+        return found + 0.3 * observation["ego"].sum(-1, keepdim=True)
+
+
+def test_evidence_of_a_user_may_read_the_whole_observation(self_model):
+    rounds = simulate("driving", "fog", "paper", 1, 1, 100)
+    human = ReadsSpeed(self_model)
+    tables = compile(human, rounds)
+    torch.manual_seed(0)
+    draws = {name: value[:, None] for name, value in _one(human).items()}
+    with pyro.poutine.block(), pyro.poutine.trace() as trace:
+        pyro.poutine.condition(human.model, data={k: v[0] for k, v in draws.items()})(rounds)
+    program = trace.trace.log_prob_sum()
+    torch.testing.assert_close(tables.log_joint(draws)[0, 0], program, rtol=0, atol=1e-3)
+
+
+def _one(human):
+    from mirror_ppl.models.prior import draw_prior
+
+    return {name: value[0] for name, value in draw_prior(human, 1, 1, 0).items()}
