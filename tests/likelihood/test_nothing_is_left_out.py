@@ -5,12 +5,14 @@ import pyro.distributions as dist
 import pytest
 import torch
 
+from mirror_ppl import load_recordings
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel
+from mirror_ppl.models.bomb_defusal_variants import BombDefusalNoImplants
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import has_own_program
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -42,11 +44,12 @@ class Gaze(HumanModel):
 
 
 @pytest.mark.parametrize(
-    ("engine", "settings"), [("importance", None), ("svi", SVIOptions(steps=30, prune_every=10))]
+    ("engine", "settings"),
+    [("importance", None), ("svi", SVIOptions(steps=30, prune_every=10, prune_margin=2))],
 )
 @pytest.mark.parametrize(("kind", "bins"), [(Blind, {0}), (Gaze, {0, 1})])
 def test_what_the_prior_says_of_sight_outweighs_rounds(kind, bins, engine, settings, self_model):
-    rounds = simulate("driving", "fog", "paper", 1, 8, 100)
+    rounds = load_recordings().select_people(["person-01"]).select_rounds(range(20))
     options = InferenceOptions(engine, 50, settings)
     drawn = infer(kind(self_model), rounds, options, 0).draws["sight_front_own"]
     assert set(drawn.flatten().tolist()) <= bins
@@ -97,17 +100,17 @@ def test_a_program_of_one_object_is_a_program_of_its_own(self_model):
     assert has_own_program(human)
 
 
-class ReadsSpeed(HumanModel):
-    """Its evidence has what the encoder's symbols lack: the number of the step."""
+class ReadsClock(BombDefusalNoImplants):
+    """Its evidence has what the encoder's symbols lack: since when the stage is under way."""
 
     def evidence(self, view, observation):
         found = super().evidence(view, observation)
-        return found + 0.3 * observation["ego"].sum(-1, keepdim=True)
+        return found + 0.3 * observation["ego"][..., 1:2]
 
 
-def test_evidence_of_a_user_may_read_the_whole_observation(self_model):
-    rounds = simulate("driving", "fog", "paper", 1, 1, 100)
-    human = ReadsSpeed(self_model)
+def test_evidence_of_a_user_may_read_the_whole_observation():
+    rounds = simulate("bomb_defusal", "labelled", "paper", 1, 1, 100)
+    human = ReadsClock(load_self_model(shipped_weights("bomb_defusal"))[0])
     tables = compile(human, rounds)
     torch.manual_seed(0)
     draws = {name: value[:, None] for name, value in _one(human).items()}
