@@ -43,14 +43,20 @@ class Gaze(HumanModel):
         return implants
 
 
+PRUNED = SVIOptions(steps=30, prune_every=10, prune_margin=2)
+
+
 @pytest.mark.parametrize(
-    ("engine", "settings"),
-    [("importance", None), ("svi", SVIOptions(steps=30, prune_every=10, prune_margin=2))],
+    ("number", "options"),
+    [
+        (20, InferenceOptions("importance", 50)),
+        (20, InferenceOptions("svi", 50, PRUNED)),
+        (4, InferenceOptions("svi", 50, PRUNED, screening=None)),
+    ],
 )
 @pytest.mark.parametrize(("kind", "bins"), [(Blind, {0}), (Gaze, {0, 1})])
-def test_what_the_prior_says_of_sight_outweighs_rounds(kind, bins, engine, settings, self_model):
-    rounds = load_recordings().select_people(["person-01"]).select_rounds(range(20))
-    options = InferenceOptions(engine, 50, settings)
+def test_what_the_prior_says_of_sight_outweighs_rounds(kind, bins, number, options, self_model):
+    rounds = load_recordings().select_people(["person-01"]).select_rounds(range(number))
     drawn = infer(kind(self_model), rounds, options, 0).draws["sight_front_own"]
     assert set(drawn.flatten().tolist()) <= bins
 
