@@ -20,7 +20,7 @@
 #
 # 1. whether different ways to compute them agree,
 # 2. how they grow round by round, while somebody drives,
-# 3. whether they are as sure as they have a right to be,
+# 3. whether they are calibrated,
 # 4. what they leave open, and which rounds would tell,
 # 5. what other people tell about a person before they have done anything,
 # 6. and whether another model of people would do better.
@@ -145,7 +145,7 @@ figure
 # %% [markdown]
 # The first rounds take longest: nearly everything is possible still, and has to be looked at.
 #
-# ## 3. As sure as they have a right to be?
+# ## 3. Are they calibrated?
 #
 # **Simulation-based calibration.** Draw people from the prior, let them drive, infer them. If
 # inference is right, the truth is as likely to be at any place among the posterior draws: its rank

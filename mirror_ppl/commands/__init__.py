@@ -8,11 +8,11 @@ from mirror_ppl.console import guarded, run
 
 COMMANDS = {
     "fit": "infer what people see and how they decide from their recorded rounds",
-    "assist": "pair communicators with people, and see who helps how much",
-    "calibrate": "see whether posteriors are as sure as they have a right to be",
+    "assist": "pair communicators with people, and measure how much each helps",
+    "calibrate": "test whether posteriors are calibrated, on simulated people",
     "compare": "compare human models by how well they predict what people do",
     "evaluate": "compare MIRROR with its ablations and baselines, as the paper does",
-    "train": "train a domain's self-model",
+    "train": "train a domain's self-model, or the network of the amortized guide",
     "simulate": "record rounds of simulated people",
 }
 

@@ -71,7 +71,7 @@ class OnlinePosterior:
         self._last: Weighted | None = None
         self._near: Weighted | None = None
         self._screening = Screening() if network is None else guide_screening()
-        self._sightings = ViewTableBuilder(human, self._screening)
+        self._builder = ViewTableBuilder(human, self._screening)
         self._sites = scalar_sites(human)
         with torch.random.fork_rng(devices=[]):
             self._order = tuple(sample_sites(human, 1))
@@ -107,7 +107,7 @@ class OnlinePosterior:
         self._near = self._last  # the same until more rounds come in, so that draws are, too
         if int(demonstrations.round_counts[0]):
             for one_round in rounds_of(demonstrations, 0):
-                self._sightings.add(*one_round)
+                self._builder.add(*one_round)
                 self._rounds.append(one_round)
         self.seconds = monotonic() - began, self.seconds[1]
 
@@ -127,7 +127,7 @@ class OnlinePosterior:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed * 1_000_003 + self.rounds)
             found = self._last = self._weighted()
-            drawn = found.sample(number, self._sightings.grid)
+            drawn = found.sample(number, self._builder.grid)
         self.pareto_k = found.pareto_k
         self.seconds = self.seconds[0], monotonic() - began
         return {name: drawn[name] for name in self._order}
@@ -136,15 +136,15 @@ class OnlinePosterior:
         human, options = self.human, ImportanceOptions()
         if self.network is None:
             first = coarse(options) if looks_twice(human) else options
-            found = sample_importance(human, self._sightings.table(), first, self._near)
+            found = sample_importance(human, self._builder.table(), first, self._near)
         else:
             # What the first asking has checked need not be checked again.
             sites = None if math.isnan(self.pareto_k) else self._sites
             found = sample_amortized(
-                human, self.network, self._sightings, AT_ONCE, sites, self._near
+                human, self.network, self._builder, AT_ONCE, sites, self._near
             )
         if looks_twice(human):
             _, found = second_look(
-                human, self._rounds, self._screening, options, self._sightings, found
+                human, self._rounds, self._screening, options, self._builder, found
             )
         return found

@@ -1,1 +1,1 @@
-"""Simulation-based calibration: are posteriors as sure as they may be?"""
+"""Simulation-based calibration: ranks of the truth among posterior draws, and coverage."""
