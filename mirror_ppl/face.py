@@ -28,6 +28,7 @@ from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.results.export import add_identifiability, netcdf_content
 from mirror_ppl.inference.results.identifiability import identify
 from mirror_ppl.inference.results.population_file import load_population
+from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
@@ -62,9 +63,15 @@ class Fit(fitting.Fit):
 
     def __repr__(self) -> str:
         told = self.summary
+        doubtful = [
+            person["id"]
+            for person in told["people"]
+            if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
+        ]
+        warning = f"; weights not to be relied on: {', '.join(doubtful)}" if doubtful else ""
         return (
             f"Fit({told['domain']}, {told['setting']}: {len(self.people)} people, "
-            f"{told['guide']}, {len(next(iter(self.posterior.draws.values())))} draws)"
+            f"{told['guide']}, {len(next(iter(self.posterior.draws.values())))} draws{warning})"
         )
 
     @property

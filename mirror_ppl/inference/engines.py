@@ -196,7 +196,10 @@ def _each(engine: Engine, job: Job) -> Inferred:
         require_standard_program(job.human, f"be inferred by the engine {engine.name}")
     if job.network is None and (engine.needs_network or job.refine):
         what = "refining" if job.refine else f"the engine {engine.name}"
-        raise InputError(f"{what} needs its network, not None; see load_guide")
+        raise InputError(
+            f"{what} needs its network, not None; see load_guide, and train --what guide for one "
+            "of this human model"
+        )
     found = engine.run(job)
     if not found.engines:
         found = replace(found, engines=(engine.name,) * job.rounds.num_people)

@@ -140,9 +140,7 @@ class OnlinePosterior:
         else:
             # What the first asking has checked need not be checked again.
             sites = None if math.isnan(self.pareto_k) else self._sites
-            found = sample_amortized(
-                human, self.network, self._builder, AT_ONCE, sites, self._near
-            )
+            found = sample_amortized(human, self.network, self._builder, AT_ONCE, sites, self._near)
         if looks_twice(human):
             _, found = second_look(
                 human, self._rounds, self._screening, options, self._builder, found

@@ -7,6 +7,7 @@ import torch
 
 from mirror_ppl import load_recordings
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.compiled import compile
@@ -59,6 +60,12 @@ def test_what_the_prior_says_of_sight_outweighs_rounds(kind, bins, number, optio
     rounds = load_recordings().select_people(["person-01"]).select_rounds(range(number))
     drawn = infer(kind(self_model), rounds, options, 0).draws["sight_front_own"]
     assert set(drawn.flatten().tolist()) <= bins
+
+
+def test_people_are_not_drawn_from_a_prior_that_is_more_than_it_samples(self_model):
+    options = CalibrationOptions(people=1, rounds=(1,))
+    with pytest.raises(HumanModelError, match='"blind" of Blind.prior is a factor, observed'):
+        calibrate(Blind(self_model), lambda rounds, seed: None, options, "fog", 0)
 
 
 class Assigns(HumanModel):

@@ -29,9 +29,11 @@ from torch import Tensor
 from mirror_ppl.checks import whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.calibration.ranks import Calibration, collect, join_rounds, judge
 from mirror_ppl.inference.engines import Inferred
 from mirror_ppl.jobs import DatasetFormat, Runner
+from mirror_ppl.likelihood.densities import correction, prior_nodes
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.simulation import play_rounds
@@ -139,8 +141,10 @@ def calibrate(
     Raises:
         UnknownNameError: there is no such setting.
         ValueError: ``infer`` or a summary returned something else than it should.
+        HumanModelError: the prior has a factor, an observed site, a scale or a mask.
     """
     require_known(setting, "setting", human.domain.settings, human.domain.name)
+    _require_plain_prior(human)
     trial = _Trial(human, options, setting, seed)
     batches = [
         Batch(first, min(options.batch, options.people - first))
@@ -159,6 +163,17 @@ def calibrate(
     }
     judged = [outcome.result for outcome in outcomes if outcome.result is not None]
     return collect(judged, trial.prior, trial.discrete, attributes)
+
+
+def _require_plain_prior(human: HumanModel) -> None:
+    """Refuse human models whose prior is more than what it samples: people are drawn from that."""
+    for name, node in prior_nodes(human, {}, 1, 1).items():
+        if correction(node) is not None:
+            raise HumanModelError(
+                f'"{name}" of {type(human).__name__}.prior is a factor, observed, scaled or '
+                "masked: people who are drawn from the prior do not follow it; calibrate a model "
+                "without it"
+            )
 
 
 def _judged(trial: _Trial, infer: Infer, batch: Batch) -> xr.Dataset:
