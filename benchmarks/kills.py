@@ -246,6 +246,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--commands", nargs="+", default=list(COMMANDS), choices=list(COMMANDS))
+    parser.add_argument("--signals", nargs="+", default=list(SIGNALS), choices=list(SIGNALS))
     parser.add_argument("--out", type=Path, default=Path("runs/kills"))
     options = parser.parse_args()
     random = np.random.default_rng(options.seed)
@@ -258,7 +259,8 @@ def main() -> int:
     tallies: dict[tuple[str, str], Tally] = {}
     for number in range(options.kills):
         name = options.commands[number % len(options.commands)]
-        kind = list(SIGNALS)[(number // len(options.commands) + number) % len(SIGNALS)]
+        turn = number // len(options.commands) + number
+        kind = options.signals[turn % len(options.signals)]
         whole, seconds = wholes[name]
         moments = FIRST + random.random(1 + (random.random() < SECOND)) * max(0.5, seconds - FIRST)
         tally = tallies.setdefault((name, kind), Tally())
