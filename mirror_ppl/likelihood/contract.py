@@ -130,6 +130,8 @@ def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
             f"act returned shape {tuple(found.shape)}, expected {expected} for (people, rounds, "
             "actions)"
         )
+    if bool(found.isnan().any()):
+        raise HumanModelError(f"{type(human).__name__}.act returns nan")
     total = found.exp().sum(-1)
     if not torch.allclose(total, torch.ones_like(total), atol=1e-3):
         raise HumanModelError("act has to return log-probabilities: they do not sum to 1")

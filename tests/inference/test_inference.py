@@ -25,8 +25,15 @@ from mirror_ppl.inference.svi import (
     draw_implants,
     fit_implants,
 )
+from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
-from mirror_ppl.likelihood.enumeration import draw_combinations, log_joint, log_prior, marginals
+from mirror_ppl.likelihood.enumeration import (
+    combination_values,
+    draw_combinations,
+    log_joint,
+    log_prior,
+    marginals,
+)
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted
@@ -437,7 +444,9 @@ def test_checkpoint_of_another_fit_is_refused(few, recordings, tmp_path):
 
 def test_pruning_gives_up_whoever_is_hopeless(few, table):
     policy = some_policy(few, 3)
+    one = {name: value[None] for name, value in policy.items()}
     score = combination_scores(table, log_likelihoods(few, policy, table))
+    score = score + log_priors(few, combination_values(few, table), one, 3)[0]
     behind = score.amax(-1, keepdim=True) - score
     margin = behind[behind > 0].median().item() + 1e-3
     compiled = ViewTables(few, table)
@@ -445,12 +454,13 @@ def test_pruning_gives_up_whoever_is_hopeless(few, table):
     pruned = compiled.table
     alive = (pruned.index != NO_VIEW).any(1)
     assert torch.equal(alive, behind <= margin)
-    assert alive[1].all()  # nothing is known of them
+    assert alive[1].sum() >= alive.sum(1).max()  # nothing is known of them but the prior
     assert 0 < (~alive).sum() < alive.sum()
     # Whoever was given up is never drawn.
     given = {name: value.expand(20, *value.shape) for name, value in policy.items()}
     combination = pruned.combination(compiled.sample_discrete(given))[..., 0]
-    assert alive[torch.arange(3).expand(combination.shape), combination].all()
+    some = torch.tensor([0, 2])  # the other one has no rounds, of which views could be given up
+    assert alive[some.expand(20, 2), combination[:, some]].all()
 
 
 def test_fit_tells_who_is_consistent_and_how_far_they_see(few, generator):
