@@ -41,7 +41,7 @@ CHANGES = ("none", "factor", "observed", "scale", "act")
 """What is changed of a toy: nothing, a factor, an observed site or a scale in ``prior``, or a
 factor in ``act``."""
 STEPS = 6
-"""Of the toy's rounds, the first ones of drivers': without compilation each step counts."""
+"""Steps of the toy's rounds: without compilation, each takes time."""
 MEASURED, ERROR = 1.0, 0.01
 """The answer to the questionnaire, and its standard deviation."""
 
@@ -91,7 +91,7 @@ def toy(change: str, self_model: SelfModel) -> ToyHuman:
 
 
 def own_program(change: str, self_model: SelfModel) -> ToyHuman:
-    """The same person, whose class overrides the program itself, so that nothing is compiled."""
+    """A toy whose class overrides the program itself, so that nothing is compiled."""
     kind = type(toy(change, self_model))
 
     class Own(kind):
@@ -184,7 +184,7 @@ def toys(options: Options, self_model: SelfModel) -> Iterator[dict]:
 
 
 def _standard_error(draws: Tensor) -> float:
-    """Of the mean of draws ``[S]``, by means of 20 batches of them: chains are correlated."""
+    """Standard error of the mean of draws ``[S]``, by 20 batch means: chains are correlated."""
     batches = draws[: len(draws) // 20 * 20].view(20, -1).mean(-1)
     return float(batches.std() / math.sqrt(20))
 

@@ -87,7 +87,8 @@ def sample_importance(
     sampler.draw(few)
     sampler.prune(options.prune_margin)
     if near is not None and sampler.sites:
-        sampler.propose(near_to(sampler, near, options), options.proposals)
+        place = unconstrained(sampler.sites, near.policy)
+        sampler.propose(near_to(sampler, place, near, options), options.proposals)
     elif options.proposals > few:
         sampler.draw(options.proposals - few)
     return adapt(sampler, options)
@@ -110,16 +111,17 @@ def adapt(sampler: Sampler, options: ImportanceOptions) -> Weighted:
         if not sampler.proposes_residual and (few or stage >= PLAIN_STAGES):
             sampler.learn_residual(found)
         sampler.learn_discrete(found)
-        sampler.propose(near_to(sampler, found, options), options.proposals)
+        sampler.propose(near_to(sampler, sampler.place, found, options), options.proposals)
     return sampler.weighted()
 
 
-def near_to(sampler: Sampler, found: Weighted, options: ImportanceOptions) -> Proposal:
-    """A proposal of the scalar sites with the moments of weighted draws."""
+def near_to(
+    sampler: Sampler, place: Tensor, found: Weighted, options: ImportanceOptions
+) -> Proposal:
+    """A proposal of the scalar sites with the moments of weighted draws at places ``[S, D]``."""
     if not sampler.sites:
         return NoScalars()
     found = found.tempered(LEARNED_FROM)
-    place = unconstrained(sampler.sites, found.policy)
 
     def fit(some: Tensor) -> MultivariateStudentT:
         return _heavy_tailed(some, found.log_weights, options.wider)

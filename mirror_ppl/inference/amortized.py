@@ -36,6 +36,7 @@ from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import unconstrained
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,8 @@ def sample_amortized(
     if near is not None:
         if near.proposed_residual:
             sampler.learn_residual(near)
-        density = near_to(sampler, near, options.adaptation)
+        place = unconstrained(sampler.sites, near.policy)
+        density = near_to(sampler, place, near, options.adaptation)
     elif options.refine and sampler.sites:
         compiled = ViewTables(human, sampler.table)
         density = refined(guide, compiled, evidence.log_evidence, evidence.steps, options.refine)

@@ -217,7 +217,7 @@ class Sampler:
         place = unconstrained(self.sites, policy, len(joint))
         # All of it is given: priors may depend on any of these sites.
         own = (*self.sites, *self.supports)
-        _, log_priors = _completed(self.human, self.table, policy, len(joint), own)
+        _, log_priors = complete(self.human, self.table, policy, len(joint), own)
         self._add(policy, joint, place, log_priors)
         self._stages.append(_Stage(len(joint)))
 
@@ -275,7 +275,7 @@ class Sampler:
 
     def _residual_densities(self, policy: Draws, gaussian: MultivariateNormal) -> Tensor:
         """Log densities ``[2, S]`` of residuals, by the prior and as proposed."""
-        _, prior = _completed(self.human, self.table, policy, len(policy[SITE]), (SITE,))
+        _, prior = complete(self.human, self.table, policy, len(policy[SITE]), (SITE,))
         return torch.stack([prior[SITE], gaussian.log_prob(policy[SITE].flatten(1))])
 
     def propose(self, proposal: Proposal, number: int) -> None:
@@ -289,7 +289,7 @@ class Sampler:
             chosen = torch.multinomial(log_chances.exp(), number, replacement=True)
             given[name] = self.supports[name][chosen].view(number, 1, 1)
         drawn = (*self.sites, *self.supports)
-        policy, log_priors = _completed(self.human, self.table, given, number, drawn)
+        policy, log_priors = complete(self.human, self.table, given, number, drawn)
         if self._residual is not None:
             gaussian = self._residual.gaussian(policy)
             own = policy[SITE]
@@ -363,26 +363,18 @@ class Sampler:
 
 @torch.no_grad()
 def complete(
-    human: HumanModel, table: ViewTable, given: Mapping[str, Tensor], number: int
-) -> tuple[Draws, Tensor]:
-    """Draws ``[S, 1, 1, ...]`` of every site that views do not depend on, some of them given.
-
-    Returns:
-        The draws, those that are not given from the prior; and the log prior density ``[S]`` of
-        those that are given.
-    """
-    policy, log_priors = _completed(human, table, given, number)
-    return policy, sum(log_priors.values(), torch.zeros(number, device=table.index.device))
-
-
-def _completed(
     human: HumanModel,
     table: ViewTable,
     given: Mapping[str, Tensor],
     number: int,
     asked: Sequence[str] | None = None,
 ) -> tuple[Draws, dict[str, Tensor]]:
-    """The same with the log prior density of each of some sites, the given ones unless asked."""
+    """Draws ``[S, 1, 1, ...]`` of every site that views do not depend on, some of them given.
+
+    Returns:
+        The draws, those that are not given from the prior; and the log prior density ``[S]`` of
+        each site that is asked about, of the given ones unless some are.
+    """
     nodes = sample_sites(human, 1, number, given)
     values = values_of(nodes)
     log_priors = {

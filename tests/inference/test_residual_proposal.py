@@ -149,7 +149,7 @@ def test_proposed_residuals_are_of_the_gaussian_and_some_of_the_prior(human, tab
     # Each kind is likelier where it came from.
     assert (proposed - prior)[20:].mean() > (proposed - prior)[:20].mean()
     last = sampler._policies[-1]["residual_out"]
-    _, density = complete(human, table, {"residual_out": last}, 200)
+    density = complete(human, table, {"residual_out": last}, 200)[1]["residual_out"]
     torch.testing.assert_close(prior, density)
 
 
