@@ -3,6 +3,7 @@
 import pyro
 import pytest
 import torch
+from pyro import poutine
 from scipy import stats
 from torch.distributions import Beta, Normal
 
@@ -17,6 +18,7 @@ from mirror_ppl.inference.population.pooling import (
 )
 from mirror_ppl.inference.population.sampler import ContinuousSites, DiscreteSite, HyperPriors
 from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior, sample_sites
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import RATES, ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -205,3 +207,22 @@ def test_people_who_are_alike_tell_of_each_other(toy, pooling):
     new = pooling.newcomers(found, 1, 0)
     assert right(new) > 3 / 7
     assert float(new["otherwise"].mean()) < 0.12  # of Beta(1, 4) it is 0.2
+
+
+class Scaled(ToyHuman):
+    """A toy whose prior counts a tenth."""
+
+    def prior(self):
+        with poutine.scale(scale=0.1):
+            return super().prior()
+
+
+def test_scales_of_the_prior_count():
+    self_model = load_self_model(shipped_weights("driving"))[0]
+    plain, scaled = Pooling(ToyHuman(self_model)), Pooling(Scaled(self_model))
+    draws = draw_prior(ToyHuman(self_model), 2, 5, 0)
+    # The map to unconstrained space, which both have, is no part of the prior.
+    nodes = sample_sites(plain.human, 2, 5, draws)
+    density = sum(node["fn"].log_prob(node["value"]) for node in nodes.values())[..., 0]
+    found = plain._log_prior(draws) - scaled._log_prior(draws)
+    torch.testing.assert_close(found, 0.9 * density.T, rtol=1e-4, atol=1e-4)
