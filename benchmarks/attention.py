@@ -18,6 +18,7 @@ from torch import Tensor
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.likelihood import view_table_builder as builder
 from mirror_ppl.likelihood.enumeration import log_joints
+from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.prior import Draws, draw_prior
@@ -50,7 +51,7 @@ def main() -> None:
         for person in range(options.people):
             near = _near({name: value[person] for name, value in people.items()}, human, generator)
             scores = [
-                _scores(human, list(rounds_of(recordings, person)), near, values, again)
+                _scores(human, rounds_of(recordings, person), near, values, again)
                 for again in range(options.repeats)
             ]
             found.append(torch.stack(scores))
@@ -75,13 +76,12 @@ def _near(truth: Draws, human: PerItem, generator: torch.Generator) -> Draws:
     return near
 
 
-def _scores(human: PerItem, rounds: list, near: Draws, values: int, again: int) -> Tensor:
+def _scores(human: PerItem, rounds: Rounds, near: Draws, values: int, again: int) -> Tensor:
     """Log-evidence ``[NEAR]``, with values of attention of their own."""
     seen = ViewTableBuilder(human, Screening(), likely=near, values=values)
     number = builder._number_of
     builder._number_of = lambda recorded: (number(recorded) + again * 7919) % 2**62
-    for one_round in rounds:
-        seen.add(*one_round)
+    seen.add(rounds)
     builder._number_of = number
     table = seen.table()
     policy = {name: value for name, value in near.items() if name not in table.sites}

@@ -82,8 +82,8 @@ def tested_people(
     found = []
     for person in range(people):
         builder = ViewTableBuilder(human, guide_screening())
-        for number, one_round in enumerate(rounds_of(recordings, person), 1):
-            builder.add(*one_round)
+        for number, one_round in enumerate(rounds_of(recordings, person).each(), 1):
+            builder.add(one_round)
             if number in TESTED_ROUNDS:
                 found.append((number, person, copy.deepcopy(builder, {id(human): human})))
     return found

@@ -28,6 +28,7 @@ from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.nuts import NUTSOptions
 from mirror_ppl.inference.svi import SVIOptions
@@ -171,7 +172,11 @@ def toys(options: Options, self_model: SelfModel) -> Iterator[dict]:
         exact = exact_mean(change, rounds, self_model)
         for name, (kind, engine) in engines.items():
             start = perf_counter()
-            found = infer(kind(change, self_model), rounds, engine, options.seed)
+            try:
+                found = infer(kind(change, self_model), rounds, engine, options.seed)
+            except HumanModelError as error:
+                yield {"case": f"toy: {change}", "engine": name, "refused": str(error)}
+                continue
             draws = found.draws["in_sight"].flatten().double()
             yield {
                 "case": f"toy: {change}",

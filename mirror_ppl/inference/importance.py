@@ -46,7 +46,7 @@ def infer_by_importance(
             first = coarse(job.settings) if looks_twice(human) else job.settings
             engine, found = first_pass(builder, first)
             if looks_twice(human):
-                rounds = list(rounds_of(job.rounds, person))
+                rounds = rounds_of(job.rounds, person)
                 builder, found = second_look(
                     human, rounds, job.screening, job.settings, builder, found
                 )

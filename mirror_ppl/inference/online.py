@@ -15,7 +15,8 @@ from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_i
 from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, require_network_of
 from mirror_ppl.inference.sampler import Weighted
-from mirror_ppl.inference.second_look import Round, coarse, looks_twice, second_look
+from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
+from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.limits import LIMITS
@@ -65,7 +66,7 @@ class OnlinePosterior:
         self.person: str | None = None
         self.seed = seed_number(seed)
         self.allow_contradictions = real_number(allow_contradictions, "allow_contradictions", 0, 1)
-        self._rounds: list[Round] = []
+        self._rounds: list[Rounds] = []
         self.pareto_k = float("nan")
         self.seconds = 0.0, 0.0
         self._last: Weighted | None = None
@@ -79,7 +80,7 @@ class OnlinePosterior:
     @property
     def rounds(self) -> int:
         """Number of rounds so far."""
-        return len(self._rounds)
+        return sum(map(len, self._rounds))
 
     def add(self, demonstrations: Demonstrations) -> None:
         """Learn from rounds that have come in.
@@ -106,9 +107,9 @@ class OnlinePosterior:
         began = monotonic()
         self._near = self._last  # the same until more rounds come in, so that draws are, too
         if int(demonstrations.round_counts[0]):
-            for one_round in rounds_of(demonstrations, 0):
-                self._builder.add(*one_round)
-                self._rounds.append(one_round)
+            rounds = rounds_of(demonstrations, 0)
+            self._builder.add(rounds)
+            self._rounds.append(rounds)
         self.seconds = monotonic() - began, self.seconds[1]
 
     def draws(self, number: int = 200) -> Draws:
@@ -143,6 +144,6 @@ class OnlinePosterior:
             found = sample_amortized(human, self.network, self._builder, AT_ONCE, sites, self._near)
         if looks_twice(human):
             _, found = second_look(
-                human, self._rounds, self._screening, options, self._builder, found
+                human, Rounds.joined(self._rounds), self._screening, options, self._builder, found
             )
         return found

@@ -7,22 +7,16 @@ first time. The first look tells roughly; the second chooses by that.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-from torch import Tensor
-
-from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.sampler import Weighted
+from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 
 LIKELY_DRAWS, COARSE_DRAWS = 64, 256
 """Draws of the person by which attention is chosen, and proposals of a stage of the first look."""
-
-Round = tuple[Observation, Visibility, Tensor, Tensor]
-"""What :meth:`ViewTableBuilder.add` takes."""
 
 
 def looks_twice(human: HumanModel) -> bool:
@@ -41,7 +35,7 @@ def coarse(options: ImportanceOptions) -> ImportanceOptions:
 
 def second_look(
     human: HumanModel,
-    rounds: Sequence[Round],
+    rounds: Rounds,
     screening: Screening | None,
     options: ImportanceOptions,
     builder: ViewTableBuilder,
@@ -62,6 +56,5 @@ def second_look(
     """
     likely = found.sample(LIKELY_DRAWS, builder.grid)
     again = ViewTableBuilder(human, screening, likely=likely)
-    for one_round in rounds:
-        again.add(*one_round)
+    again.add(rounds)
     return again, sample_importance(human, again.table(), options, found)

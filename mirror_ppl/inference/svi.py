@@ -198,7 +198,7 @@ def optimize(
         losses = _restore(*checkpoint, cast(AutoGuide, guide), optimizer, compiled)
     while len(losses) < options.steps:
         # What is wrong with a model shows at the first step; checking all of them costs a third.
-        with pyro.validation_enabled(not losses):
+        with pyro.validation_enabled(not losses), _one_scale(compiled):
             losses.append(cast(float, svi.step()))
         optimizer.step()
         report("fit", len(losses), options.steps, f"negative ELBO {losses[-1]:.1f}")
@@ -209,6 +209,21 @@ def optimize(
         if checkpoint is not None and len(losses) % options.checkpoint_every == 0:
             _save(*checkpoint, cast(AutoGuide, guide), optimizer, losses, compiled)
     return losses
+
+
+@contextmanager
+def _one_scale(compiled: Compiled) -> Iterator[None]:
+    """Say in a line which sites Pyro cannot sum out together."""
+    try:
+        yield
+    except ValueError as error:
+        if "common poutine.scale" not in str(error):
+            raise
+        raise HumanModelError(
+            f"{type(compiled.human).__name__}.model scales some of its discrete sites, or what "
+            "depends on them, and not others: the engine svi (Pyro's TraceEnum_ELBO) cannot sum "
+            "them out; the engine nuts can"
+        ) from error
 
 
 @torch.no_grad()

@@ -8,15 +8,13 @@ know, and the values that are read throughout the round. Histories that agree in
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.chain import Chain, Level
-from mirror_ppl.likelihood.round_views import RoundViews, moments_along, views_of_moments
+from mirror_ppl.likelihood.round_views import ManyViews, Rounds, moments_along, views_of_moments
 from mirror_ppl.models.belief_tracking import BeliefState, Memory
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.spans import check_spans
@@ -24,38 +22,29 @@ from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
 
 @torch.no_grad()
-def chained_views(  # noqa: PLR0913 - a round, and whose it is
-    human: HumanModel,
-    combinations: Mapping[str, Tensor],
-    number: int,
-    observation: Observation,
-    told: Visibility,
-    actions: Tensor,
-    real: Tensor,
-) -> RoundViews:
-    """The distinct views of one round, with a chain of one sight for each combination.
+def chained_views(
+    human: HumanModel, combinations: Mapping[str, Tensor], number: int, one: Rounds
+) -> tuple[ManyViews, Chain]:
+    """The distinct views of one round, and a chain of one sight for each combination.
 
     Args:
         human: the model of people; its attention is :attr:`HumanModel.chained`.
         combinations: values ``[M]`` of the discrete implants.
         number: M.
-        observation: ``[1, T, ...]``.
-        told: ``[1, T, K]``.
-        actions: ``[1, T]``.
-        real: which steps are no padding, ``[T]``.
+        one: the round, R is 1.
 
     Raises:
         HumanModelError: ``spans`` breaks its contract.
     """
-    so_far = {name: value[0, real] for name, value in observation.items()}
-    steps = int(real.sum())
+    so_far, actions = one.so_far(0)
+    steps = len(actions)
     supports = attention_sites(human)
     spans = human.spans(so_far)
     check_spans(spans, {site: len(support) for site, support in supports.items()}, steps)
     facts = {name: fact.view(1, 1) for name, fact in human.covariates(so_far).items()}
     device = actions.device
     combination = torch.arange(number, device=device)
-    state = BeliefState.initial(human, number, Memory.of_round(human, observation))
+    state = BeliefState.initial(human, number, Memory.of_rounds(human, one.observation))
     throughout: dict[str, Tensor] = {}
     levels, rows = [], []
     begins = [0, *(span.first for span in list(spans.values())[1:]), steps]
@@ -71,7 +60,7 @@ def chained_views(  # noqa: PLR0913 - a round, and whose it is
         implants = {name: own[combination] for name, own in combinations.items()} | values
         span_steps = range(begins[place], begins[place + 1])
         state, numbers = moments_along(
-            state.at(parent), implants, observation, told, actions, span_steps
+            state.at(parent), implants, one, torch.zeros_like(parent), span_steps
         )
         if span.last == steps and span.first == 0:
             throughout[site] = values[site]
@@ -91,5 +80,6 @@ def chained_views(  # noqa: PLR0913 - a round, and whose it is
         done += len(numbers)
         state, combination = state.at(first), combination[first]
         throughout = {name: own[first] for name, own in throughout.items()}
-    views, which = views_of_moments(state, torch.cat(rows))
-    return replace(views, chain=Chain(supports, tuple(levels), facts).of_views(which))
+    numbers = torch.cat(rows)
+    views, which = views_of_moments(state, numbers, torch.zeros_like(numbers[:, 0]), 1)
+    return views, Chain(supports, tuple(levels), facts).of_views(which)

@@ -136,8 +136,7 @@ class ViewTables(Compiled):
         if not self._builders:
             raise InputError("rounds are added to what was compiled with growing=True")
         for person, builder in enumerate(self._builders):
-            for one_round in rounds_of(rounds, person):
-                builder.add(*one_round)
+            builder.add(rounds_of(rounds, person))
         self.table = join_tables([builder.table() for builder in self._builders])
 
     @cached_property

@@ -1,8 +1,8 @@
-"""Distinct views of one round."""
+"""Distinct views of rounds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +15,65 @@ from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.belief_tracking import CHUNK, BeliefState, Memory, Transition
 from mirror_ppl.models.human import HumanModel, at_step, messages_at
 from mirror_ppl.row_hashing import distinct_rows
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """R recorded rounds of one person.
+
+    Attributes:
+        observation: ``[R, T, ...]``.
+        told: what was communicated, ``[R, T, K]``.
+        actions: ``[R, T]``; some action in padding.
+        real: which steps are no padding ``[R, T]``; it comes at the end.
+    """
+
+    observation: Observation
+    told: Visibility
+    actions: Tensor
+    real: Tensor
+
+    def __len__(self) -> int:
+        """The number of rounds R."""
+        return len(self.actions)
+
+    def at(self, first: int, last: int) -> Rounds:
+        """From the first one to that before the last."""
+        some = slice(first, last)
+        return Rounds(
+            {name: value[some] for name, value in self.observation.items()},
+            {name: mask[some] for name, mask in self.told.items()},
+            self.actions[some],
+            self.real[some],
+        )
+
+    def each(self) -> Iterator[Rounds]:
+        """One after the other."""
+        return (self.at(number, number + 1) for number in range(len(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rounds]) -> Rounds:
+        """All of them, which are of as many steps."""
+        return cls(
+            {
+                name: torch.cat([one.observation[name] for one in parts])
+                for name in parts[0].observation
+            },
+            {name: torch.cat([one.told[name] for one in parts]) for name in parts[0].told},
+            torch.cat([one.actions for one in parts]),
+            torch.cat([one.real for one in parts]),
+        )
+
+    @property
+    def steps(self) -> list[int]:
+        """How many steps of each are no padding."""
+        return self.real.sum(-1).tolist()
+
+    def so_far(self, number: int) -> tuple[Observation, Tensor]:
+        """What there was to observe in one round ``[t, ...]``, and what was done ``[t]``."""
+        real = self.real[number]
+        observation = {name: value[number, real] for name, value in self.observation.items()}
+        return observation, self.actions[number, real]
 
 
 @dataclass(frozen=True)
@@ -72,70 +131,154 @@ class RoundViews:
         return RoundViews(moments, self.belief[used], self.values[used], self.acted[used])
 
 
+@dataclass(frozen=True)
+class ManyViews:
+    """Distinct views of R rounds, one round after the other.
+
+    Attributes:
+        moments: of each step of the V views, which of the N moments it is, ``[V, T]``.
+        belief: ``[N, Z]``.
+        values: ``[N, A]``.
+        acted: ``[N]``.
+        views: the round that each view is of ``[V]``, in order.
+        rounds: the round that each moment is of ``[N]``, in order.
+        number: R.
+    """
+
+    moments: Tensor
+    belief: Tensor
+    values: Tensor
+    acted: Tensor
+    views: Tensor
+    rounds: Tensor
+    number: int
+
+    def split(self) -> list[tuple[slice, RoundViews]]:
+        """Of each round which of the views are its, and these by themselves."""
+        views, moments = (_begins(part, self.number) for part in (self.views, self.rounds))
+        found = []
+        for number in range(self.number):
+            own = slice(views[number], views[number + 1])
+            some = slice(moments[number], moments[number + 1])
+            named = self.moments[own]
+            named = torch.where(named == NO_VIEW, NO_VIEW, named - moments[number])
+            part = RoundViews(named, self.belief[some], self.values[some], self.acted[some])
+            if not len(part.acted):  # of padding alone; act() is asked about something all the same
+                part = replace(
+                    part,
+                    belief=self.belief.new_zeros(1, self.belief.shape[-1]),
+                    values=self.values.new_zeros(1, self.values.shape[-1]),
+                    acted=self.acted.new_zeros(1),
+                )
+            found.append((own, part))
+        return found
+
+
+def _begins(groups: Tensor, number: int) -> list[int]:
+    """Where each of so many groups begins ``[number + 1]``, of the group of each ``[n]``."""
+    edges = torch.arange(number + 1, device=groups.device)
+    return torch.searchsorted(groups, edges).tolist()
+
+
+def distinct_in_groups(rows: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
+    """As `distinct_rows` of rows ``[n, ...]`` in groups ``[n]``; one group after the other."""
+    first, which = distinct_rows(torch.cat([groups[:, None], rows], 1))
+    order = groups[first].argsort(stable=True)
+    place = torch.empty_like(order)
+    place[order] = torch.arange(len(order), device=order.device)
+    return first[order], place[which]
+
+
 @torch.no_grad()
-def round_views(
-    human: HumanModel,
-    implants: Mapping[str, Tensor],
-    number: int,
-    observation: Observation,
-    told: Visibility,
-    actions: Tensor,
-    steps: int,
-) -> tuple[RoundViews, Tensor]:
-    """Distinct views of one round, and which of them each combination has.
+def views_of_rounds(
+    human: HumanModel, implants: Mapping[str, Tensor], row: Tensor, rounds: Rounds
+) -> tuple[ManyViews, Tensor]:
+    """Distinct views of R rounds, and which of them somebody has who looks at one of these.
 
     Args:
         human: the model of people.
-        implants: combinations of values ``[M]`` of the discrete sites that perception reads.
-        number: M.
-        observation: ``[1, T, ...]``.
-        told: ``[1, T, K]``.
-        actions: ``[1, T]``.
-        steps: how many of the T steps are no padding.
+        implants: combinations of values ``[n]`` of the discrete sites that perception reads.
+        row: which of the rounds each is to look at ``[n]``.
+        rounds: of one person.
     """
-    state = BeliefState.initial(human, number, Memory.of_round(human, observation))
-    state, numbers = moments_along(state, implants, observation, told, actions, range(steps))
-    return views_of_moments(state, numbers)
+    state = BeliefState.initial(human, len(row), Memory.of_rounds(human, rounds.observation))
+    lengths = rounds.real.sum(-1)
+    numbers = torch.full((len(row), rounds.actions.shape[1]), NO_VIEW, device=row.device)
+    own, begin, under_way = row, 0, torch.arange(len(row), device=row.device)
+    for end in lengths.unique().tolist():  # those whose round is over look at nothing more
+        going = lengths[own] >= end
+        if not bool(going.all()):
+            state, own, under_way = state.at(going), own[going], under_way[going]
+            implants = {name: value[going] for name, value in implants.items()}
+        state, found = moments_along(state, implants, rounds, own, range(begin, end))
+        numbers[under_way, begin:end] = found[:, begin:end]
+        begin = end
+    return views_of_moments(state, numbers, row, len(rounds))
 
 
 def moments_along(
     state: BeliefState,
     implants: Mapping[str, Tensor],
-    observation: Observation,
-    told: Visibility,
-    actions: Tensor,
+    rounds: Rounds,
+    row: Tensor,
     steps: range,
 ) -> tuple[BeliefState, Tensor]:
-    """Track beliefs through some steps of a round; arguments as of :func:`round_views`.
+    """Track beliefs through some steps of rounds; arguments as of :func:`views_of_rounds`.
 
     Returns:
         The state after these steps, and the number of the moment at each, ``[n, T]``, ``NO_VIEW``
         outside of them: a belief of the state and what was done there.
     """
     number, action_count = len(state.belief), len(state.human.domain.actions)
-    moments = state.belief.new_full((number, actions.shape[1]), NO_VIEW)
-    transitions = []
+    moments = torch.full((number, rounds.actions.shape[1]), NO_VIEW, device=row.device)
+    several, transitions = len(rounds) > 1, []
     for step in steps:
-        before = actions[0, step - 1] if step else actions.new_tensor(action_count)
-        now, heard = at_step(observation, step), messages_at(told, step)
-        transitions.append(Transition(implants, before.expand(number), now, heard))
+        before = torch.full_like(row, action_count)
+        if step:
+            before = rounds.actions[row, step - 1]
+        heard = messages_at(rounds.told, step)
+        if several:
+            heard = {name: mask[row] for name, mask in heard.items()}
+        now = at_step(rounds.observation, step)
+        transitions.append(Transition(implants, before, now, heard, row if several else None))
     states = state.through(transitions) if steps else []
     for step, now in zip(steps, states, strict=True):
-        moments[:, step] = now.belief * action_count + actions[0, step]
+        moments[:, step] = now.belief * action_count + rounds.actions[row, step]
     return [state, *states][-1], moments
 
 
-def views_of_moments(state: BeliefState, numbers: Tensor) -> tuple[RoundViews, Tensor]:
-    """Distinct rows of the moments ``[n, T]`` of a round, and which of them each row is ``[n]``."""
+def views_of_moments(
+    state: BeliefState, numbers: Tensor, row: Tensor, number: int
+) -> tuple[ManyViews, Tensor]:
+    """Distinct views of rounds, and which of them each has.
+
+    Args:
+        state: of which moments are numbered, see :func:`moments_along`.
+        numbers: of moments ``[n, T]``.
+        row: which of the rounds it is ``[n]``.
+        number: of rounds R.
+    """
     human = state.human
-    first, which = distinct_rows(numbers)
-    moments = numbers[first]
+    first, which = distinct_in_groups(numbers, row)
+    moments, views = numbers[first], row[first]
     real = moments != NO_VIEW
-    used, place = moments[real].unique(return_inverse=True)
-    moments[real] = place
-    if not len(used):  # of padding alone; act() is asked about something all the same
-        used = used.new_zeros(1)
     action_count = len(human.domain.actions)
-    belief = state.mean[used // action_count]
-    values = torch.cat([human.action_values(some) for some in belief.split(CHUNK)])
-    return RoundViews(moments, belief, values, used % action_count), which
+    many = len(state.mean) * action_count
+    used, place = (views[:, None] * many + moments)[real].unique(return_inverse=True)
+    moments[real] = place
+    rounds, moment = used // many, used % many
+    some, belief = (moment // action_count).unique(return_inverse=True)
+    values = [human.action_values(part) for part in state.mean[some].split(CHUNK)]
+    found = torch.cat(values) if len(some) else state.mean.new_zeros(0, action_count)
+    return (
+        ManyViews(
+            moments,
+            state.mean[some][belief],
+            found[belief],
+            moment % action_count,
+            views,
+            rounds,
+            number,
+        ),
+        which,
+    )

@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.likelihood.attention import VALUES
 from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.round_views import Rounds, RoundViews
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
-from mirror_ppl.likelihood.view_table_builder import RoundViews, Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.measured import with_measurements
 
@@ -173,8 +173,7 @@ def person_builders(
             alone = with_measurements(human, demonstrations.select_people([person]))
         some = None if candidates is None else candidates[person]
         builder = ViewTableBuilder(alone, screening, some, own, values)
-        for one_round in rounds_of(demonstrations, person):
-            builder.add(*one_round)
+        builder.add(rounds_of(demonstrations, person))
         yield builder
         report(person + 1)
 
@@ -236,22 +235,22 @@ def join_tables(
     )
 
 
-def rounds_of(
-    demonstrations: Demonstrations, person: int
-) -> Iterator[tuple[Observation, Visibility, Tensor, Tensor]]:
+def rounds_of(demonstrations: Demonstrations, person: int) -> Rounds:
     """A person's rounds, as :meth:`ViewTableBuilder.add` takes them.
 
     Of somebody without rounds there is one of padding, so that there is something to look up.
     """
     steps = demonstrations.shape[2]
-    observation = demonstrations.observation()
-    for number in range(max(int(demonstrations.round_counts[person]), 1)):
-        yield (
-            {name: value[person, number, :steps][None] for name, value in observation.items()},
-            {name: value[person, number][None] for name, value in demonstrations.told.items()},
-            demonstrations.actions[person, number].clamp(min=0)[None],
-            demonstrations.mask[person, number],
-        )
+    rounds = max(int(demonstrations.round_counts[person]), 1)
+    return Rounds(
+        {
+            name: value[person, :rounds, :steps]
+            for name, value in demonstrations.observation().items()
+        },
+        {name: mask[person, :rounds] for name, mask in demonstrations.told.items()},
+        demonstrations.actions[person, :rounds].clamp(min=0),
+        demonstrations.mask[person, :rounds],
+    )
 
 
 def _pad(value: Tensor, length: int, fill: int = 0) -> Tensor:

@@ -1,6 +1,6 @@
-"""The views of one person's rounds, round after round.
+"""The views of one person's rounds.
 
-Every combination of the discrete implants is a candidate. Round by round, candidates are dropped
+Every combination of the discrete implants is a candidate. After some rounds, candidates are dropped
 that explain the person's actions hopelessly worse than the best one, however the person decides:
 the later rounds need not be seen through their eyes, and exact marginalization stays cheap.
 """
@@ -19,7 +19,6 @@ from pyro import poutine
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.likelihood.attention import KEPT, VALUES, AttentionValues, Proposal
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.chained_views import chained_views
@@ -35,13 +34,24 @@ from mirror_ppl.likelihood.densities import (
     log_weighted_latents,
     require_compilable,
 )
-from mirror_ppl.likelihood.round_views import RoundViews, round_views
+from mirror_ppl.likelihood.round_views import (
+    ManyViews,
+    Rounds,
+    RoundViews,
+    distinct_in_groups,
+    views_of_rounds,
+)
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable, along_views
 from mirror_ppl.models.belief_tracking import CHUNK
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
 
+SCREENED_ROWS, MOST_ROWS = 4096, 32768
+"""Combinations of discrete implants times rounds that are gone through at once: with screening,
+about as many as take as long as the calls themselves, since in later rounds fewer are left."""
+GROWTH = 3
+"""With screening, so many times the rounds before are gone through at once, at most."""
 PROPOSING_POLICIES = 64
 """Draws from the prior by which attention is proposed where nothing is screened."""
 TEMPERATURE = 4.0
@@ -139,84 +149,107 @@ class ViewTableBuilder:
             self._proposal = Proposal(human, anybody, likely, values)
 
     @torch.no_grad()
-    def add(
-        self, observation: Observation, told: Visibility, actions: Tensor, real: Tensor
-    ) -> None:
-        """Go through one round more.
+    def add(self, rounds: Rounds) -> None:
+        """Go through more rounds, as many at once as there is little to go through."""
+        first = 0
+        while first < len(rounds):
+            some = rounds.at(first, first + self._at_once())
+            if self.human.chained:
+                for one in some.each():
+                    self._add_chained(one)
+            else:
+                self._add_together(some)
+            first += len(some)
 
-        Args:
-            observation: ``[1, T, ...]``.
-            told: ``[1, T, K]``.
-            actions: ``[1, T]``.
-            real: which steps are no padding, ``[T]``.
-        """
-        if self.human.chained:
-            self._add_chained(observation, told, actions, real)
-            return
+    def _at_once(self) -> int:
+        """How many rounds are gone through before combinations are given up."""
+        if self._proposal is not None:  # by what the rounds before say
+            return 1
+        if self.screening is None:
+            return max(1, MOST_ROWS // len(self.alive))
+        # Few at first: the first ones tell most of what can be given up.
+        return max(1, min(GROWTH * len(self._rounds), SCREENED_ROWS // len(self.alive)))
+
+    def _add_together(self, rounds: Rounds) -> None:
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
-        attended, number, seed = None, len(alive), 0
+        attended, each, seed = None, 1, 0
         if self._proposal is not None:
-            recorded = {**observation, "actions": actions}
-            so_far = {name: value[0, real] for name, value in observation.items()}
-            seed = _number_of({name: value[:, real] for name, value in recorded.items()})
-            attended = self._proposal.values(
-                self._weights(),
-                seed,
-                {name: value.view(1, 1) for name, value in self.human.covariates(so_far).items()},
-                self.human.log_proposal(so_far, actions[0, real]),
-            )
+            attended, seed = self._attended_in(rounds, self._proposal)
             each = len(attended)
             candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
-            candidates |= {name: value.repeat(number) for name, value in attended.values.items()}
-            number = number * each
-        steps = int(real.sum())
-        part, which = round_views(self.human, candidates, number, observation, told, actions, steps)
+            values = attended.values.items()
+            candidates |= {name: value.repeat(len(alive)) for name, value in values}
+        number = len(alive) * each
+        row = torch.arange(len(rounds), device=alive.device).repeat_interleave(number)
+        candidates = {name: value.repeat(len(rounds)) for name, value in candidates.items()}
+        views, which = views_of_rounds(self.human, candidates, row, rounds)
         if self.screening is not None and self.screening.resolution > 0:
-            part, place = self._merged(part, self.screening)
+            views, place = self._merged(views, self.screening)
             which = place[which]
-        sights = None
-        if attended is not None:
-            seen = which.view(len(alive), -1)
-            first, which = distinct_rows(seen)
-            sights = seen[first]  # [U, G]
+        found = None if self.screening is None else self._log_likelihoods(views)
+        total = torch.zeros(len(self.score), len(alive), device=alive.device)
+        for one, (own, part), seen in zip(
+            rounds.each(), views.split(), which.view(len(rounds), number), strict=True
+        ):
+            seen, sights = seen - own.start, None
+            if attended is not None:
+                of_each = seen.view(len(alive), -1)
+                first, seen = distinct_rows(of_each)
+                sights = of_each[first]  # [U, G]
+            if found is not None:
+                likelihoods = found[:, own]
+                if attended is not None and sights is not None:
+                    joint = self._attending(likelihoods[:, sights], attended)
+                    useful = torch.softmax(joint, -1).mean(1)
+                    likelihoods = torch.logsumexp(joint, -1)
+                    attended = attended.thinned(self._weights() @ useful, KEPT, seed)
+                    sights = sights[:, attended.kept]
+                total = total + likelihoods[:, seen]
+            if attended is not None:
+                self._attended.append(attended)
+                part = replace(part, sights=sights)
+                part = part.kept(torch.arange(len(part), device=alive.device))
+            self._take(one, part, seen, alive)
         if self.screening is not None:
-            found = self._log_likelihoods(part)
-            if attended is not None and sights is not None:
-                found = self._attending(found[:, sights], attended)
-                useful = torch.softmax(found, -1).mean(1)
-                found = torch.logsumexp(found, -1)
-                attended = attended.thinned(self._weights() @ useful, KEPT, seed)
-                sights = sights[:, attended.kept]
-            self._screen(found[:, which], self.screening)
-        if attended is not None:
-            self._attended.append(attended)
-            part = replace(part, sights=sights)
-            part = part.kept(torch.arange(len(part), device=alive.device))
-        self._rounds.append(part)
-        self._seen.append((alive, which))
-        self._recorded.append((actions[0], real))
+            self._screen(total, self.screening)
 
-    def _add_chained(
-        self, observation: Observation, told: Visibility, actions: Tensor, real: Tensor
-    ) -> None:
-        """The same where attention is summed out exactly."""
+    def _attended_in(self, one: Rounds, proposal: Proposal) -> tuple[AttentionValues, int]:
+        """Values of attention that stand for all in a round, and a seed of this round."""
+        so_far, actions = one.so_far(0)
+        recorded = {**one.observation, "actions": one.actions}
+        seed = _number_of({name: value[:, one.real[0]] for name, value in recorded.items()})
+        covariates = self.human.covariates(so_far)
+        attended = proposal.values(
+            self._weights(),
+            seed,
+            {name: value.view(1, 1) for name, value in covariates.items()},
+            self.human.log_proposal(so_far, actions),
+        )
+        return attended, seed
+
+    def _add_chained(self, one: Rounds) -> None:
+        """A round where attention is summed out exactly."""
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
-        part = chained_views(self.human, candidates, len(alive), observation, told, actions, real)
-        chain = part.chain
-        assert chain is not None
+        views, chain = chained_views(self.human, candidates, len(alive), one)
         if self.screening is not None:
             if self.screening.resolution > 0:
-                part, place = self._merged(part, self.screening)
+                views, place = self._merged(views, self.screening)
                 chain = chain.of_views(place)
-            likelihoods = self._log_likelihoods(part)[:, None]
+            likelihoods = self._log_likelihoods(views)[:, None]
             with self._deciding(self.draw_policies()):
                 chances = chain.log_chances(self.human, self.human.prior(), 1)
             self._screen(chain.marginal(likelihoods, chances)[:, 0], self.screening)
-        self._rounds.append(replace(part, chain=chain))
-        self._seen.append((alive, torch.arange(len(alive), device=alive.device)))
-        self._recorded.append((actions[0], real))
+        ((_, part),) = views.split()
+        every = torch.arange(len(alive), device=alive.device)
+        self._take(one, replace(part, chain=chain), every, alive)
+
+    def _take(self, one: Rounds, part: RoundViews, seen: Tensor, alive: Tensor) -> None:
+        """Keep a round: which of its views each combination that was alive has."""
+        self._rounds.append(part)
+        self._seen.append((alive, seen))
+        self._recorded.append((one.actions[0], one.real[0]))
 
     def _screen(self, found: Tensor, screening: Screening) -> None:
         """Count log-likelihoods ``[policies, M']`` of those alive; give up the hopeless ones."""
@@ -317,32 +350,40 @@ class ViewTableBuilder:
         }
         return log_priors(self.human, self.grid, others, 1)[:, 0]
 
-    def _merged(self, part: RoundViews, screening: Screening) -> tuple[RoundViews, Tensor]:
-        """The views of a round with moments that count as one made one; which each view is then."""
+    def _merged(self, views: ManyViews, screening: Screening) -> tuple[ManyViews, Tensor]:
+        """Moments of a round that count as one made one; which each view is then."""
+        if not len(views.acted):  # of padding alone
+            return views, torch.arange(len(views.moments), device=views.moments.device)
         policies = {
             name: policy[: screening.merge_policies]
             for name, policy in self.draw_policies().items()
         }
-        real = torch.zeros_like(part.acted, dtype=torch.bool)
-        real[part.moments[part.moments != NO_VIEW]] = True
-        keys = []
-        for some in torch.arange(len(part.acted), device=part.acted.device).split(CHUNK):
-            found = self._of_moments(policies, part, some)
-            keys.append(torch.round(found / screening.resolution).long().T)
+        keys = [
+            torch.round(self._of_moments(policies, views, some) / screening.resolution).long().T
+            for some in torch.arange(len(views.acted), device=views.acted.device).split(CHUNK)
+        ]
         # What was done tells moments apart, too: theirs is one entry of ``acted``.
-        key = torch.cat([torch.cat(keys), part.acted[:, None]], -1) * real[:, None]
-        first, cluster = distinct_rows(key)
-        moments = part.moments
+        key = torch.cat([torch.cat(keys), views.acted[:, None]], -1)
+        first, cluster = distinct_in_groups(key, views.rounds)
+        moments = views.moments
         moments = torch.where(moments == NO_VIEW, NO_VIEW, cluster[moments.clamp(min=0)])
-        distinct, place = distinct_rows(moments)
-        kept = RoundViews(
-            moments[distinct], part.belief[first], part.values[first], part.acted[first]
+        distinct, place = distinct_in_groups(moments, views.views)
+        kept = ManyViews(
+            moments[distinct],
+            views.belief[first],
+            views.values[first],
+            views.acted[first],
+            views.views[distinct],
+            views.rounds[first],
+            views.number,
         )
         return kept, place
 
-    def _log_likelihoods(self, part: RoundViews) -> Tensor:
-        """Of what was recorded of a round under each policy and view, ``[policies, V]``."""
-        return along_views(self._of_moments(self.draw_policies(), part), part.moments)
+    def _log_likelihoods(self, views: ManyViews) -> Tensor:
+        """Of what was recorded under each policy and view, ``[policies, V]``."""
+        if not len(views.acted):  # of padding alone
+            return self.score.new_zeros(len(self.score), len(views.moments))
+        return along_views(self._of_moments(self.draw_policies(), views), views.moments)
 
     def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
         """Log joint ``[policies, U, G]`` of actions and attention, of their likelihoods."""
@@ -361,10 +402,10 @@ class ViewTableBuilder:
         return self.policies
 
     def _of_moments(
-        self, policies: Mapping[str, Tensor], part: RoundViews, some: Tensor | slice = slice(None)
+        self, policies: Mapping[str, Tensor], views: ManyViews, some: Tensor | slice = slice(None)
     ) -> Tensor:
-        """Log-likelihood ``[policies, N]`` of what was recorded at some moments of a round."""
-        moments = (one[None, some] for one in (part.belief, part.values, part.acted))
+        """Log-likelihood ``[policies, N]`` of what was recorded at some moments."""
+        moments = (one[None, some] for one in (views.belief, views.values, views.acted))
         with self._deciding(policies) as number:
             _, found = choices(self.human, self.human.prior(), *moments)
         # Of a model whose actions depend on no implant they are the same under every policy.

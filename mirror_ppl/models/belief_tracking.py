@@ -50,11 +50,11 @@ class Transition:
 
 @dataclass(frozen=True)
 class Memory:
-    """How beliefs came about in one round so far, as the same can come about at several steps.
+    """How beliefs came about in R rounds so far, as the same can come about time and again.
 
     Attributes:
-        observed: a number for the observation of each step ``[T]``, equal where the encoder cannot
-            tell observations apart.
+        observed: a number for the observation of each step ``[R, T]``, equal where the encoder
+            cannot tell observations apart.
         causes: belief before, action and key of the evidence, ``[k, 3]``.
         effects: the belief after each of them, ``[k]``.
     """
@@ -64,14 +64,14 @@ class Memory:
     effects: Tensor
 
     @classmethod
-    def of_round(cls, human: HumanModel, observation: Observation) -> Memory:
-        """Of the beginning of a round with observations ``[1, T, ...]``."""
+    def of_rounds(cls, human: HumanModel, observation: Observation) -> Memory:
+        """Of the beginning of rounds with observations ``[R, T, ...]``."""
         symbols = human.domain.symbols(observation)
         if type(human).evidence is not HumanModel.evidence:
             symbols = observation  # it may read whatever there is
-        rows = torch.cat([as_whole_numbers(value[0]).flatten(1) for value in symbols.values()], 1)
-        observed = rows @ random_keys(rows.shape[1], rows.device, 1)
-        return cls(observed, rows.new_zeros(0, 3), rows.new_zeros(0))
+        rows = torch.cat([as_whole_numbers(value).flatten(2) for value in symbols.values()], -1)
+        observed = rows @ random_keys(rows.shape[-1], rows.device, 1)
+        return cls(observed, observed.new_zeros(0, 3), observed.new_zeros(0))
 
 
 @dataclass(frozen=True)
@@ -183,14 +183,15 @@ class BeliefState:
 
     def _observed(self, transitions: Sequence[Transition]) -> tuple[Tensor, Tensor]:
         """Which of all observations each has at each step ``[n, T]``, and numbers of these."""
-        rows, begin = [], 0
-        for one in transitions:
-            rows.append((torch.zeros_like(self.belief) if one.row is None else one.row) + begin)
+        rows, numbers, begin = [], [], 0
+        for step, one in enumerate(transitions, self.step):
+            own = torch.zeros_like(self.belief) if one.row is None else one.row
+            rows.append(own + begin)
             begin += len(one.observation["ego"])
+            if self.memory is not None:
+                numbers.append(self.memory.observed[own, step])
         row = torch.stack(rows, -1)
-        if self.memory is None:
-            return row, row
-        return row, self.memory.observed[self.step :][: len(transitions)].expand(row.shape)
+        return row, torch.stack(numbers, -1) if numbers else row
 
     def _infer(
         self,

@@ -163,10 +163,12 @@ def _evidence(
 ) -> tuple[Tensor, Tensor]:
     builder = ViewTableBuilder(human, guide_screening())
     evidence, steps, total = [], [], 0
-    for number, one_round in enumerate(rounds_of(recordings, person), 1):
-        builder.add(*one_round)
-        total += int(one_round[-1].sum())
-        if number in options.rounds:
+    first, rounds = 0, rounds_of(recordings, person)
+    for number in sorted(options.rounds):
+        some = rounds.at(first, number)
+        builder.add(some)
+        total, first = total + sum(some.steps), number
+        if len(some):
             evidence.append(log_evidence(builder))
             steps.append(total)
     return torch.stack(evidence), torch.tensor(steps)

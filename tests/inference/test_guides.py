@@ -278,9 +278,9 @@ def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):
 
 def sightings_of(human, recordings, person, order):
     builder = ViewTableBuilder(human, guide_screening())
-    rounds = list(rounds_of(recordings, person))
+    rounds = rounds_of(recordings, person)
     for number in order:
-        builder.add(*rounds[number])
+        builder.add(rounds.at(number, number + 1))
     return builder
 
 

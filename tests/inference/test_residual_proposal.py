@@ -37,8 +37,7 @@ def played(human):
 @pytest.fixture(scope="module")
 def table(human, played):
     builder = ViewTableBuilder(human, Screening())
-    for one_round in rounds_of(played, 0):
-        builder.add(*one_round)
+    builder.add(rounds_of(played, 0))
     return builder.table()
 
 

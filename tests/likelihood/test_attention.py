@@ -110,7 +110,9 @@ def geometric(probability):
 
 def by_hand(human, implants, recordings, person, number):
     """Log-probabilities ``[16, T, A]`` of actions for each time at which the car is noticed."""
-    observation, told, actions, _ = list(rounds_of(recordings, person))[number]
+    observation, told, actions, _ = vars(
+        rounds_of(recordings, person).at(number, number + 1)
+    ).values()
     when = {NOTICED[0]: torch.arange(STEPS + 1)}
     belief = gone_through(human, when, observation, told, actions)
     values = human.self_model.action_values(belief)
@@ -146,7 +148,7 @@ def test_the_probability_of_attention_is_that_of_the_program(per_item):
 
 
 def test_an_item_is_seen_from_when_it_is_noticed(per_item, recordings):
-    observation, told, _, _ = next(rounds_of(recordings, 0))
+    observation, told, _, _ = vars(rounds_of(recordings, 0).at(0, 1)).values()
     nothing = {name: torch.zeros_like(mask) for name, mask in told.items()}
     when = dict(zip(NOTICED, torch.tensor([[0], [4], [14], [15]]), strict=True))
     open_ = {"assumes_clear": torch.tensor([0]), "assumes_closing": torch.tensor([0])}
@@ -367,8 +369,7 @@ def test_the_posterior_is_the_exact_one(self_model):
     mean = (exact * grid).sum()
     spread = (exact * (grid - mean).square()).sum().sqrt()
     builder = ViewTableBuilder(human, Screening())
-    for one_round in rounds_of(rounds, 0):
-        builder.add(*one_round)
+    builder.add(rounds_of(rounds, 0))
     torch.manual_seed(0)
     found = sample_importance(human, builder.table(), ImportanceOptions())
     weights, value = found.log_weights.exp(), found.policy[NOTICES[0]].flatten().double()
@@ -459,7 +460,7 @@ class Blind(HumanModel):
 
 
 def past_of(recordings, time):
-    observation, _, actions, _ = next(rounds_of(recordings, 0))
+    observation, _, actions, _ = vars(rounds_of(recordings, 0).at(0, 1)).values()
     whole = recordings.observation()
     return RoundSoFar(
         {name: value[0, 0, : time + 1] for name, value in whole.items()},

@@ -83,7 +83,8 @@ def by_combination(human, rounds, draws):
     """
     number = len(draws["reads_type"])
     total, predicted = torch.zeros(number), []
-    for observation, told, actions, real in rounds_of(rounds, 0):
+    for one in rounds_of(rounds, 0).each():
+        observation, told, actions, real = vars(one).values()
         steps = int(real.sum())
         seen = {name: value[:, :steps] for name, value in observation.items()}
         heard = {name: mask[:, :steps] for name, mask in told.items()}
@@ -203,8 +204,7 @@ def test_what_is_given_up_changes_nothing_of_the_rest(defuser):
 def test_screening_counts_what_the_table_does(defuser):
     """Ways are scored as the table of the same rounds has it, without merging moments."""
     builder = ViewTableBuilder(defuser, Screening(margin=1e6, policies=3, resolution=0))
-    for one_round in rounds_of(recorded(), 0):
-        builder.add(*one_round)
+    builder.add(rounds_of(recorded(), 0))
     table = builder.table()
     policy = {name: value for name, value in builder.policies.items() if name not in table.sites}
     joints = log_joints(defuser, table, policy)[:, 0]

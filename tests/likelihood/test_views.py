@@ -25,7 +25,7 @@ from mirror_ppl.likelihood.tables import (
     rounds_of,
 )
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import GROWTH, Screening, ViewTableBuilder
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -322,7 +322,7 @@ def test_infinite_margin_without_merging_changes_nothing(self_model, recordings)
     rounds = ragged(recordings, LENGTHS)
     for human in (Few(self_model), Sure(self_model)):
         screening = Screening(margin=math.inf, resolution=0.0)
-        assert_tables_equal(
+        assert_rounds_equal(
             build_view_table(human, rounds, screening=screening), build_view_table(human, rounds)
         )
 
@@ -343,6 +343,8 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, rec
     score = torch.zeros(screening.policies, rounds.num_people, 14)
     for number in range(4):
         score += likelihood.gather(-1, whole.index[:, number].expand(screening.policies, -1, -1))
+        if 0 < number < GROWTH:
+            continue  # these are gone through together
         best = (score + prior).amax(0).masked_fill(~expected, -math.inf)
         distance = best.amax(-1, keepdim=True) - best
         # Rounding may decide either way at the very margin; nobody is there here.
@@ -379,9 +381,8 @@ def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordi
     resolution = 0.1
     screening = Screening(margin=math.inf, resolution=resolution, merge_policies=8)
     whole, merged = ViewTableBuilder(human, None), ViewTableBuilder(human, screening)
-    for one_round in rounds_of(rounds, 0):
-        whole.add(*one_round)
-        merged.add(*one_round)
+    for builder in (whole, merged):
+        builder.add(rounds_of(rounds, 0))
     tables = [builder.table() for builder in (whole, merged)]
     policies = merged.draw_policies()
     scores = []

@@ -71,7 +71,7 @@ def case(request, generator):
 @torch.no_grad()
 def test_beliefs_are_those_of_each_person_alone(case, remembers):
     human, observation, transitions, expected = case
-    memory = Memory.of_round(human, observation) if remembers else None
+    memory = Memory.of_rounds(human, observation) if remembers else None
     states = BeliefState.initial(human, PEOPLE, memory).through(transitions)
     for state, own in zip(states, expected, strict=True):
         torch.testing.assert_close(state.believed, own.expand(PEOPLE, -1), rtol=0, atol=1e-5)
@@ -83,7 +83,7 @@ def test_beliefs_are_those_of_each_person_alone(case, remembers):
 @torch.no_grad()
 def test_steps_one_by_one_come_to_the_same(case, remembers):
     human, observation, transitions, _ = case
-    memory = Memory.of_round(human, observation) if remembers else None
+    memory = Memory.of_rounds(human, observation) if remembers else None
     state = BeliefState.initial(human, PEOPLE, memory)
     for transition, expected in zip(transitions, state.through(transitions), strict=True):
         state = state.after(transition)
@@ -124,7 +124,7 @@ def test_a_belief_is_inferred_once(case, monkeypatch):
         return infer(self, belief, *rest)
 
     monkeypatch.setattr(type(human), "infer", counted)
-    start = BeliefState.initial(human, PEOPLE, Memory.of_round(human, observation))
+    start = BeliefState.initial(human, PEOPLE, Memory.of_rounds(human, observation))
     states = start.through(transitions)
     assert len(states[-1].memory.causes) == sum(inferred)
     assert len(states[-1].memory.causes.unique(dim=0)) == sum(inferred)

@@ -314,8 +314,7 @@ def test_a_person_s_probabilities_come_out_of_their_rounds():
     recorded = simulate("bomb_defusal", "labelled", people=1, rounds=12, seed=0)
     human.fit_world(recorded)
     builder = ViewTableBuilder(human, Screening())
-    for one_round in rounds_of(recorded, 0):
-        builder.add(*one_round)
+    builder.add(rounds_of(recorded, 0))
     found = sample_importance(human, builder.table(), ImportanceOptions(proposals=256))
     draws = found.sample(200, builder.grid)
     mean = torch.stack([draws[f"notices_terminal {k}"].mean() for k in range(1, 7)]).mean()

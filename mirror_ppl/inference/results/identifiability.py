@@ -31,6 +31,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, combination_values, log_joints
+from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
 from mirror_ppl.likelihood.view_table import combination_number
@@ -260,9 +261,7 @@ def _information(
     scenario = torch.arange(number, device=pairs.device).repeat_interleave(rounds)
     played = play_rounds(human, implants, 1, setting, generator, scenario)
     builder = ViewTableBuilder(human, None, candidates, policy, VALUES)
-    for player in range(len(players)):
-        for one_round in rounds_of(played, player):
-            builder.add(*one_round)
+    builder.add(Rounds.joined([rounds_of(played, player) for player in range(len(players))]))
     table = builder.table()
     with (
         poutine.block(),
