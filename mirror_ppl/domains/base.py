@@ -22,7 +22,7 @@ V    views of a round: the distinct ways to have seen it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -31,8 +31,40 @@ from torch import Tensor
 
 from mirror_ppl.errors import UnknownNameError
 
-Observation = dict[str, Tensor]
+Observation = Mapping[str, Tensor]
 """Values by name: ``"ego"`` ``[..., E]`` and one entry ``[..., K, F]`` for each modality."""
+
+
+class RepeatedObservation(Mapping[str, Tensor]):
+    """Observations ``[n, ...]``, many of them the same; copied only where they are read.
+
+    Args:
+        distinct: observations ``[rows, ...]``.
+        row: which of them each is ``[n]``.
+    """
+
+    def __init__(self, distinct: Observation, row: Tensor) -> None:
+        self.distinct, self.row = distinct, row
+        self._read: dict[str, Tensor] = {}
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._read:
+            self._read[name] = self.distinct[name][self.row]
+        return self._read[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.distinct)
+
+    def __len__(self) -> int:
+        return len(self.distinct)
+
+
+def of_each(function: Callable[[Observation], Tensor], observation: Observation) -> Tensor:
+    """A function of each observation, called once where many are the same."""
+    if isinstance(observation, RepeatedObservation):
+        return function(observation.distinct)[observation.row]
+    return function(observation)
+
 
 Visibility = dict[str, Tensor]
 """Masks by modality, boolean ``[..., K]``: which items are seen (or were communicated)."""

@@ -357,7 +357,7 @@ class BombDefusal:
         expected = self.observe(following)
         new = (following.stage != state.stage) & ~self.over(following)
         visual = expected["visual"].masked_fill(new[..., None, None], torch.nan)
-        return expected | {"visual": visual}
+        return {**expected, "visual": visual}
 
     def nearest(self, observation: Observation) -> Observation:
         """The observation that can be and is nearest to decoded values."""

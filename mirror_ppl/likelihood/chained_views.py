@@ -1,85 +1,188 @@
-"""The views of a round span by span, where it is known when each site of attention is read.
+"""The views of rounds span by span, where it is known when each site of attention is read.
 
 What is left of all that a person may have attended to so far is a belief, what the domain says they
 know, and the values that are read throughout the round. Histories that agree in that are one state
-(:mod:`mirror_ppl.likelihood.chain`).
+(:mod:`mirror_ppl.likelihood.chain`). Rounds are gone through together, step by step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.chain import Chain, Level
 from mirror_ppl.likelihood.round_views import ManyViews, Rounds, moments_along, views_of_moments
+from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.belief_tracking import BeliefState, Memory
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.spans import check_spans
+from mirror_ppl.models.spans import Span, check_spans
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
 
 @torch.no_grad()
 def chained_views(
-    human: HumanModel, combinations: Mapping[str, Tensor], number: int, one: Rounds
-) -> tuple[ManyViews, Chain]:
-    """The distinct views of one round, and a chain of one sight for each combination.
+    human: HumanModel, combinations: Mapping[str, Tensor], number: int, rounds: Rounds
+) -> tuple[ManyViews, list[Chain]]:
+    """The distinct views of R rounds, and of each a chain of one sight for each combination.
 
     Args:
         human: the model of people; its attention is :attr:`HumanModel.chained`.
         combinations: values ``[M]`` of the discrete implants.
         number: M.
-        one: the round, R is 1.
+        rounds: of one person.
+
+    Returns:
+        The views, and chains that lead to these, by their number among those of the round.
 
     Raises:
         HumanModelError: ``spans`` breaks its contract.
     """
-    so_far, actions = one.so_far(0)
-    steps = len(actions)
     supports = attention_sites(human)
-    spans = human.spans(so_far)
-    check_spans(spans, {site: len(support) for site, support in supports.items()}, steps)
-    facts = {name: fact.view(1, 1) for name, fact in human.covariates(so_far).items()}
-    device = actions.device
-    combination = torch.arange(number, device=device)
-    state = BeliefState.initial(human, number, Memory.of_rounds(human, one.observation))
-    throughout: dict[str, Tensor] = {}
-    levels, rows = [], []
-    begins = [0, *(span.first for span in list(spans.values())[1:]), steps]
-    done = 0
-    for place, (site, span) in enumerate(spans.items()):
-        support, shape = supports[site], (1, len(combination), span.values)
-        parent = torch.arange(len(combination), device=device).repeat_interleave(span.values)
-        combination = combination[parent]
-        throughout = {name: own[parent] for name, own in throughout.items()}
-        # Sites of other spans are not read at this one: any value will do.
-        values = {name: own[:1].expand(len(parent)) for name, own in supports.items()} | throughout
-        values[site] = support[: span.values].repeat(shape[1])
-        implants = {name: own[combination] for name, own in combinations.items()} | values
-        span_steps = range(begins[place], begins[place + 1])
-        state, numbers = moments_along(
-            state.at(parent), implants, one, torch.zeros_like(parent), span_steps
+    state = BeliefState.initial(human, number, Memory.of_rounds(human, rounds.observation))
+    ways = []
+    for place, steps in enumerate(rounds.steps):
+        so_far, _ = rounds.so_far(place)
+        spans = human.spans(so_far)
+        check_spans(spans, {site: len(support) for site, support in supports.items()}, steps)
+        facts = {name: fact.view(1, 1) for name, fact in human.covariates(so_far).items()}
+        ways.append(_RoundWays(place, supports, combinations, spans, steps, facts, state))
+    step = 0
+    while True:
+        for own in ways:
+            own.go_on(step)
+        going = [own for own in ways if step < own.steps]
+        if not going:
+            break
+        until = min(own.end for own in going)
+        row = torch.cat([torch.full_like(own.combination, own.round) for own in going])
+        state = replace(
+            state,
+            belief=torch.cat([own.belief for own in going]),
+            knowledge=map_state(lambda *parts: torch.cat(parts), *(own.knowledge for own in going)),
+            step=step,
         )
-        if span.last == steps and span.first == 0:
-            throughout[site] = values[site]
-        others = torch.stack([combination, *map(as_whole_numbers, throughout.values())], -1)
-        first, following = distinct_rows(torch.cat([others, state.key()], -1))
-        index = torch.arange(span.values, device=device)
-        index[-1] += max(len(own) for own in supports.values())  # that value or any later
-        levels.append(
+        implants = {
+            name: torch.cat([own.implants[name] for own in going]) for name in going[0].implants
+        }
+        state, moments = moments_along(state, implants, rounds, row, range(step, until))
+        begin = 0
+        for own in going:
+            some = slice(begin, begin + len(own.combination))
+            own.take(state.at(some), moments[some], slice(step, until))
+            begin = some.stop
+        step = until
+    numbers = [torch.cat(own.rows) for own in ways]
+    row = torch.cat([torch.full_like(own[:, 0], place) for place, own in enumerate(numbers)])
+    views, which = views_of_moments(state, torch.cat(numbers), row, len(rounds))
+    first = torch.searchsorted(views.views, torch.arange(len(rounds), device=row.device))
+    local = (which - first[row]).split([len(own) for own in numbers])
+    return views, [own.chain.of_views(place) for own, place in zip(ways, local, strict=True)]
+
+
+@dataclass
+class _RoundWays:
+    """All ways in which a person may go through one round, up to some step.
+
+    Attributes:
+        round: its number.
+        supports: of the sites of attention ``[n]``.
+        combinations: values ``[M]`` of the discrete implants.
+        spans: of the sites of attention.
+        steps: of the round.
+        covariates: of the round ``[1, 1]``.
+        combination: of which each of n ways is, ``[n]``.
+        belief: the number of the belief of each way ``[n]``.
+        knowledge: what is known by it ``[n]``.
+        implants: the values that are read now, ``[n]``.
+        throughout: those of them that are read throughout the round ``[n]``.
+        moments: of the span that is under way ``[n, T]``.
+        rows: moments of the spans before.
+        levels: of the spans before.
+    """
+
+    round: int
+    supports: Mapping[str, Tensor]
+    combinations: Mapping[str, Tensor]
+    spans: Mapping[str, Span]
+    steps: int
+    covariates: Mapping[str, Tensor]
+    start: BeliefState
+    rows: list[Tensor] = field(default_factory=list)
+    levels: list[Level] = field(default_factory=list)
+    throughout: dict[str, Tensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.belief, self.knowledge = self.start.belief, self.start.knowledge
+        self.combination = torch.arange(len(self.belief), device=self.belief.device)
+        self._begins = [0, *(span.first for span in list(self.spans.values())[1:]), self.steps]
+        self._branch()
+
+    @property
+    def end(self) -> int:
+        """The step before which the span that is under way ends."""
+        return self._begins[len(self.levels) + 1]
+
+    @property
+    def chain(self) -> Chain:
+        """All spans, when the round is over."""
+        return Chain(self.supports, tuple(self.levels), self.covariates)
+
+    def go_on(self, step: int) -> None:
+        """Go on to the spans that begin before a step."""
+        while len(self.levels) < len(self.spans) and self.end == step:
+            self._merge()
+            if len(self.levels) < len(self.spans):
+                self._branch()
+
+    def take(self, state: BeliefState, moments: Tensor, steps: slice) -> None:
+        """What people of each way believe after some steps."""
+        self.belief, self.knowledge = state.belief, state.knowledge
+        self.moments[:, steps] = moments[:, steps]
+
+    def _branch(self) -> None:
+        """Each way goes on with each value that is read at the span that begins."""
+        site, span = list(self.spans.items())[len(self.levels)]
+        states = len(self.combination)
+        parent = torch.arange(states, device=self.belief.device).repeat_interleave(span.values)
+        self.combination, self.belief = self.combination[parent], self.belief[parent]
+        self.knowledge = map_state(lambda part: part[parent], self.knowledge)
+        self.throughout = {name: own[parent] for name, own in self.throughout.items()}
+        # Sites of other spans are not read at this one: any value will do.
+        values = {name: own[:1].expand(len(parent)) for name, own in self.supports.items()}
+        values |= self.throughout
+        values[site] = self.supports[site][: span.values].repeat(states)
+        self.implants = {name: own[self.combination] for name, own in self.combinations.items()}
+        self.implants |= values
+        if span.last == self.steps and span.first == 0:
+            self.throughout[site] = values[site]
+        width = self.start.memory.observed.shape[1]  # pyright: ignore[reportOptionalMemberAccess]
+        self.moments = torch.full((len(parent), width), NO_VIEW, device=parent.device)
+        self._shape = (1, states, span.values)
+
+    def _merge(self) -> None:
+        """The span is over: ways that lead to the same are one from now on."""
+        device = self.belief.device
+        others = [self.combination, *map(as_whole_numbers, self.throughout.values())]
+        state = replace(self.start, belief=self.belief, knowledge=self.knowledge)
+        key = torch.cat([torch.stack(others, -1), state.key()], -1)
+        first, following = distinct_rows(key)
+        index = torch.arange(self._shape[-1], device=device)
+        index[-1] += max(len(own) for own in self.supports.values())  # that value or any later
+        done = sum(map(len, self.rows))
+        self.levels.append(
             Level(
-                view=done + torch.arange(len(numbers), device=device).view(shape),
-                value=index.expand(shape),
-                following=following.view(shape),
-                rounds=torch.zeros(shape[:2], dtype=torch.long, device=device),
+                view=done + torch.arange(len(following), device=device).view(self._shape),
+                value=index.expand(self._shape),
+                following=following.view(self._shape),
+                rounds=torch.zeros(self._shape[:2], dtype=torch.long, device=device),
             )
         )
-        rows.append(numbers)
-        done += len(numbers)
-        state, combination = state.at(first), combination[first]
-        throughout = {name: own[first] for name, own in throughout.items()}
-    numbers = torch.cat(rows)
-    views, which = views_of_moments(state, numbers, torch.zeros_like(numbers[:, 0]), 1)
-    return views, Chain(supports, tuple(levels), facts).of_views(which)
+        self.rows.append(self.moments)
+        self.combination, self.belief = self.combination[first], self.belief[first]
+        self.knowledge = map_state(lambda part: part[first], self.knowledge)
+        self.throughout = {name: own[first] for name, own in self.throughout.items()}

@@ -50,6 +50,8 @@ from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
 SCREENED_ROWS, MOST_ROWS = 4096, 32768
 """Combinations of discrete implants times rounds that are gone through at once: with screening,
 about as many as take as long as the calls themselves, since in later rounds fewer are left."""
+CHAINED_ROUNDS = 32
+"""Rounds that are gone through at once where attention is summed out exactly."""
 GROWTH = 3
 """With screening, so many times the rounds before are gone through at once, at most."""
 PROPOSING_POLICIES = 64
@@ -155,8 +157,7 @@ class ViewTableBuilder:
         while first < len(rounds):
             some = rounds.at(first, first + self._at_once())
             if self.human.chained:
-                for one in some.each():
-                    self._add_chained(one)
+                self._add_chained(some)
             else:
                 self._add_together(some)
             first += len(some)
@@ -165,6 +166,8 @@ class ViewTableBuilder:
         """How many rounds are gone through before combinations are given up."""
         if self._proposal is not None:  # by what the rounds before say
             return 1
+        if self.human.chained:
+            return CHAINED_ROUNDS
         if self.screening is None:
             return max(1, MOST_ROWS // len(self.alive))
         # Few at first: the first ones tell most of what can be given up.
@@ -228,22 +231,30 @@ class ViewTableBuilder:
         )
         return attended, seed
 
-    def _add_chained(self, one: Rounds) -> None:
-        """A round where attention is summed out exactly."""
+    def _add_chained(self, rounds: Rounds) -> None:
+        """Rounds where attention is summed out exactly."""
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
-        views, chain = chained_views(self.human, candidates, len(alive), one)
+        views, chains = chained_views(self.human, candidates, len(alive), rounds)
+        if self.screening is not None and self.screening.resolution > 0:
+            before = [own.start for own, _ in views.split()]
+            views, place = self._merged(views, self.screening)
+            begins = [own.start for own, _ in views.split()]
+            chains = [
+                chain.of_views(place[first:] - begin)
+                for chain, first, begin in zip(chains, before, begins, strict=True)
+            ]
+        parts = views.split()
         if self.screening is not None:
-            if self.screening.resolution > 0:
-                views, place = self._merged(views, self.screening)
-                chain = chain.of_views(place)
             likelihoods = self._log_likelihoods(views)[:, None]
+            together = Chain.one_after_another(chains, [len(part.moments) for _, part in parts])
             with self._deciding(self.draw_policies()):
-                chances = chain.log_chances(self.human, self.human.prior(), 1)
-            self._screen(chain.marginal(likelihoods, chances)[:, 0], self.screening)
-        ((_, part),) = views.split()
+                chances = together.log_chances(self.human, self.human.prior(), len(rounds))
+            found = together.marginal(likelihoods, chances)[:, 0]
+            self._screen(found.unflatten(-1, (len(rounds), -1)).sum(1), self.screening)
         every = torch.arange(len(alive), device=alive.device)
-        self._take(one, replace(part, chain=chain), every, alive)
+        for one, chain, (_, part) in zip(rounds.each(), chains, parts, strict=True):
+            self._take(one, replace(part, chain=chain), every, alive)
 
     def _take(self, one: Rounds, part: RoundViews, seen: Tensor, alive: Tensor) -> None:
         """Keep a round: which of its views each combination that was alive has."""

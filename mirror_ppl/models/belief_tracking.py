@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Observation, Visibility, map_state
+from mirror_ppl.domains.base import Observation, RepeatedObservation, Visibility, map_state
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
@@ -110,7 +110,7 @@ class BeliefState:
         """The belief of each person, ``[n, Z]``."""
         return self.mean[self.belief]
 
-    def at(self, rows: Tensor) -> BeliefState:
+    def at(self, rows: Tensor | slice) -> BeliefState:
         """Of some of these people, or of some more than once."""
         knowledge = map_state(lambda part: part[rows], self.knowledge)
         return replace(self, belief=self.belief[rows], knowledge=knowledge)
@@ -174,7 +174,7 @@ class BeliefState:
         for step, one in enumerate(transitions, self.step):
             now = one.observation
             if one.row is not None:
-                now = {name: value[one.row] for name, value in now.items()}
+                now = RepeatedObservation(now, one.row)
             view, knowledge = self.human.perceive(one.implants, knowledge, now, one.told, step)
             knowledge = map_state(lambda part: part.expand(number, *part.shape[1:]), knowledge)
             views.append(view)

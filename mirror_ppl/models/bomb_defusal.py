@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains.base import Domain, Observation, Visibility, total_reward
+from mirror_ppl.domains.base import Domain, Observation, Visibility, of_each, total_reward
 from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
 from mirror_ppl.domains.bomb_panel import BUTTONS, KINDS, STAGES
 from mirror_ppl.models import implants as implant_priors
@@ -211,7 +211,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         verbal = observation["verbal"][..., 0]
         reads = (implants[READS] == 1)[..., None]
         return {
-            "visual": self.domain.sought(observation) & found[..., None],
+            "visual": of_each(self.domain.sought, observation) & found[..., None],
             "verbal": reads.expand(torch.broadcast_shapes(reads.shape, verbal.shape)),
         }
 
@@ -226,7 +226,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         guess = implants[GUESS].to(observation["verbal"])[..., None, None]
         known = view.visible["verbal"]
         shape = torch.broadcast_shapes(known.shape, guess.shape[:-1])
-        imagined = {**observation, "verbal": guess.expand(*shape, 1)}
+        imagined = {"verbal": guess.expand(*shape, 1)}
         taken = {
             "visual": torch.zeros_like(view.visible["visual"]),
             "verbal": ~known.expand(shape),

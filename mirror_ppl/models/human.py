@@ -255,7 +255,7 @@ class HumanModel(nn.Module):
         embedded = encoder.embed(domain.symbols(observation))
         if not view.taken:
             return encoder.combine(embedded, view.visible)
-        imagined = encoder.embed(domain.symbols(view.imagined))
+        imagined = encoder.embed(domain.symbols({**observation, **view.imagined}))
         return encoder.combine(embedded, view.visible, imagined, view.taken)
 
     def believe(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -19,7 +19,8 @@ class View:
     Attributes:
         visible: seen, told or remembered.
         taken: neither, but taken for granted; empty if nothing is.
-        imagined: the observation ``[..., K, F]`` in which the taken items are as they take them.
+        imagined: the observation ``[..., K, F]`` in which the taken items are as they take them,
+            of the modalities of which any are.
         still: where nothing came up since the step before ``[...]``, so that the belief stays as
             it is; ``None`` if something always does.
     """
@@ -47,7 +48,7 @@ class View:
                 return parts[0].unsqueeze(place)  # no copy
             return torch.stack(torch.broadcast_tensors(*parts), place)
 
-        def stacked(parts: Sequence[dict[str, Tensor]], behind: int) -> dict[str, Tensor]:
+        def stacked(parts: Sequence[Mapping[str, Tensor]], behind: int) -> dict[str, Tensor]:
             return {
                 name: joined([part[name] for part in parts], -2 if name == "ego" else -1 - behind)
                 for name in parts[0]
@@ -69,14 +70,15 @@ class View:
         if not masks:  # of a model that looks at nothing
             return torch.zeros((), dtype=torch.long)
         sizes = [mask.shape[-1] for mask in masks.values()]
-        sizes += [self.imagined[name].shape[-2:].numel() for name in self.taken]
+        taken = {name: mask for name, mask in self.taken.items() if name in self.imagined}
+        sizes += [self.imagined[name].shape[-2:].numel() for name in taken]
         device = next(iter(masks.values())).device
         (*keys,) = random_keys(sum(sizes), device, kind=1).split(sizes)
         total = torch.zeros((), dtype=torch.long, device=device)
         for mask in masks.values():
             # Sums of few keys of 48 bits are exact in 64-bit floats, which multiply faster.
             total = total + (mask.double() @ (keys.pop(0) >> 14).double()).long()
-        for name, mask in self.taken.items():
+        for name, mask in taken.items():
             imagined = self.imagined[name]
             key = keys.pop(0).view(imagined.shape[-2:])
             # Few items are taken for granted, and only those count.
