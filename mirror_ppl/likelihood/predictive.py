@@ -20,6 +20,8 @@ from mirror_ppl.likelihood.enumeration import conditioned
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.human import HumanModel
 
+MOST_NUMBERS = 4_000_000
+"""Numbers in the beliefs that are looked up at once; bounds memory."""
 DRAWS = 50
 """Draws for which attention is summed out at once; bounds memory."""
 
@@ -38,8 +40,14 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
             some = {name: value[begin : begin + DRAWS] for name, value in draws.items()}
             parts.append(_chained(human, table, table.attention, some))
         return torch.cat(parts)
-    person = torch.arange(table.people, device=table.index.device)[:, None]
-    everybody = person[..., None]
+    if table.attention is None:
+        each = table.recorded.numel() * table.belief.shape[-1]
+        at_once = max(1, MOST_NUMBERS // each)
+        parts = []
+        for begin in range(0, number, at_once):
+            some = {name: value[begin : begin + at_once] for name, value in draws.items()}
+            parts.append(_looked_up(human, table, some))
+        return torch.cat(parts)
     results = []
     for draw in range(number):
         own = {name: value[draw] for name, value in draws.items()}
@@ -51,16 +59,24 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
             implants = human.prior()
             # Rounds that a person does not have are as their first view, whoever else is there.
             sight = table.sight_of(implants).clamp(min=0).expand(table.people, table.rounds)
-            if table.attention is not None:
-                results.append(_attentive(human, implants, table, table.attention, sight))
-                continue
-            moments = table.moments[person, sight].clamp(min=0)  # [P, B, T]
-            belief, values = (
-                part[everybody, moments].flatten(1, 2) for part in (table.belief, table.values)
-            )
-            found = human.act(implants, belief, values)
-            results.append(found.expand(*values.shape[:2], -1).unflatten(1, moments.shape[1:]))
+            results.append(_attentive(human, implants, table, table.attention, sight))
     return torch.stack(results)
+
+
+def _looked_up(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
+    """Log-probabilities ``[S, P, B, T, A]`` where a person sees one thing in each round."""
+    number = len(next(iter(draws.values())))
+    person = torch.arange(table.people, device=table.index.device)[:, None]
+    with conditioned(draws, number, table.people):
+        implants = human.prior()
+        # Rounds that a person does not have are as their first view, whoever else is there.
+        sight = table.sight_of(implants).clamp(min=0).expand(number, table.people, table.rounds)
+        moments = table.moments[person, sight].clamp(min=0)  # [S, P, B, T]
+        belief, values = (
+            part[person[..., None], moments].flatten(2, 3) for part in (table.belief, table.values)
+        )
+        found = human.act(implants, belief, values)
+    return found.expand(*values.shape[:3], -1).unflatten(2, moments.shape[2:])
 
 
 def _attentive(

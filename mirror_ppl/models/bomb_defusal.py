@@ -254,8 +254,9 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
 
     def _exchanged(self, presses: Tensor, rule: Tensor) -> Tensor:
         """Values ``[..., P, B, 4]`` of buttons under a rule ``[..., P, 1]``."""
-        exchange = self.exchanges[rule.long()]  # [..., P, 1, 4, 4]
-        return (exchange @ presses[..., None]).squeeze(-1)
+        order = self.exchanges.argmax(-1)[rule.long()]  # [..., P, 1, 4]
+        shape = torch.broadcast_shapes(order.shape, presses.shape)
+        return presses.expand(shape).gather(-1, order.expand(shape))
 
     @torch.no_grad()
     def fit_world(self, demonstrations: Demonstrations) -> None:

@@ -40,15 +40,21 @@ def test_a_group_is_what_was_simulated(toy, group):
     assert torch.equal(group.steps[:, 0], recorded)
 
 
-def test_the_elbo_teaches_the_network_where_people_are(toy, group):
+def test_the_elbo_teaches_the_network_where_people_are(toy):
+    groups = simulated_groups(toy, (2,), torch.Generator().manual_seed(0))
+    groups = list(itertools.islice(groups, 5))
     torch.manual_seed(0)
     network = AmortizedGuide(reference_places(toy)).eval()
-    before = compilation_loss(network, group)
-    training = ELBOTraining(network, itertools.repeat(group), 3e-3)
-    losses = [training.step() for _ in range(120)]
+    before = sum(compilation_loss(network, group) for group in groups) / 5
+    training = ELBOTraining(network, itertools.cycle(groups), 3e-3)
+    losses, distances = [], []
+    for step in range(150):
+        losses.append(training.step())
+        if step >= 100:
+            distances += [compilation_loss(network, group) for group in groups]
     assert sum(losses[-20:]) / 20 < sum(losses[:5]) / 5
-    # It is not told the truth, but gets nearer to it.
-    assert compilation_loss(network, group) < before - 0.2
+    # It is not told the truth, but gets nearer to it; of 100 people, at steps that are noisy.
+    assert sum(distances) / len(distances) < before - 0.1
 
 
 def test_training_takes_as_many_steps_as_asked(toy, monkeypatch):
