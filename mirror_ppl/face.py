@@ -365,9 +365,12 @@ def _human(
         if self_model is not None:
             raise InputError("self_model is for a human model that is to be made; this one has one")
         return human
+    of_class = isinstance(human, type) and issubclass(human, HumanModel)
+    if not (human is None or isinstance(human, str) or of_class):
+        raise InputError(f"human must be a human model, its class or its name, not {human!r}")
     if not isinstance(self_model, SelfModel):
         path = shipped_weights(domain) if self_model is None else Path(self_model)
         self_model, _ = load_self_model(path, domain)
-    if isinstance(human, type) and issubclass(human, HumanModel):
+    if isinstance(human, type):
         return human(self_model)
     return load_human_model(human, self_model)

@@ -186,7 +186,7 @@ class Sampler:
         sites: Mapping[str, Any] | None = None,
     ) -> None:
         if sites is None:
-            require_acting_on_beliefs(human, table)
+            require_acting_on_beliefs(human, table.sites)
         self.human = human
         self.table = table
         self.sites = scalar_sites(human) if sites is None else sites

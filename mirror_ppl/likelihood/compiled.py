@@ -148,7 +148,7 @@ class ViewTables(Compiled):
     @cached_property
     def acts_on_beliefs(self) -> bool:
         """Whether what a person sees reaches their actions through beliefs alone."""
-        return acts_on_beliefs(self.human, self.table)
+        return acts_on_beliefs(self.human, self.table.sites)
 
     @torch.no_grad()
     def log_joint(self, draws: Mapping[str, Tensor]) -> Tensor:

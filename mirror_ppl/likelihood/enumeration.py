@@ -6,7 +6,7 @@ depends on, each with its prior and likelihood, without sampling or optimization
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import pyro
@@ -145,21 +145,22 @@ def expected_counts(
     return actions.scatter(-1, table.acted[0][:, None], often[:, None])
 
 
-def acts_on_beliefs(human: HumanModel, table: ViewTable) -> bool:
+def acts_on_beliefs(human: HumanModel, sites: Iterable[str]) -> bool:
     """Whether what a person sees reaches their actions through beliefs alone.
 
-    If ``act`` reads a site that ``perceive`` reads, too, likelihoods of views are not enough.
+    If ``act`` reads one of the ``sites`` that ``perceive`` reads, likelihoods of views are not
+    enough.
     """
-    return not dependencies(human).actions & set(table.sites)
+    return not dependencies(human).actions & set(sites)
 
 
-def require_acting_on_beliefs(human: HumanModel, table: ViewTable) -> None:
+def require_acting_on_beliefs(human: HumanModel, sites: Iterable[str]) -> None:
     """Refuse models whose likelihoods of views are not enough; see :func:`acts_on_beliefs`.
 
     Raises:
         HumanModelError: this is one.
     """
-    if not acts_on_beliefs(human, table):
+    if not acts_on_beliefs(human, sites):
         raise HumanModelError(
             "act() reads a site that perceive() reads, too; only the engines svi and nuts can fit "
             "this"

@@ -32,6 +32,9 @@ from mirror_ppl.inference.amortized_guide import (
 )
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import run_identity
+from mirror_ppl.likelihood.combinations import perceived_sites
+from mirror_ppl.likelihood.densities import require_compilable
+from mirror_ppl.likelihood.enumeration import require_acting_on_beliefs
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
@@ -116,7 +119,10 @@ def train_guide(
 
     Raises:
         CheckpointError: the checkpoint is damaged or of another run.
+        HumanModelError: the human model cannot be compiled.
     """
+    require_compilable(human)
+    require_acting_on_beliefs(human, perceived_sites(human))
     examples = simulate_examples(human, options, seed, report, checkpoint)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -13,6 +13,7 @@ from mirror_ppl.errors import AssetError
 from mirror_ppl.files import json_text
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, reference_places
 from mirror_ppl.inference.engines import ENGINES
+from mirror_ppl.likelihood.densities import require_compilable
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.variants import VARIANTS
@@ -98,9 +99,12 @@ def network_for(engine: str, path: Path | None, human: HumanModel) -> AmortizedG
     Raises:
         AssetError: the file cannot be read or is for another human model; or the engine needs a
             network and none ships.
+        HumanModelError: the engine needs a network, and of this human model there cannot be one.
     """
     if not ENGINES[engine].takes_network:
         return None
+    if ENGINES[engine].needs_network:
+        require_compilable(human)
     if path is None:
         own = [name for name, kind in VARIANTS.items() if kind is type(human)]
         if not ENGINES[engine].needs_network:

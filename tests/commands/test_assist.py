@@ -236,7 +236,7 @@ def test_posteriors_of_something_else_are_refused(posterior, tmp_path, capsys, a
         (("--domain", "chess"), "chess"),
         (("--communicator", "nobody"), 'unknown communicator "nobody"'),
         (("--people", "3"), "is of 2 people, not 3"),
-        (("--draws", "7"), "holds 6 draws, not 7"),
+        (("--draws", "7"), "holds 6 draws, not 7: ask for 6 or fewer"),
         (("--draws", "0"), "--draws must be at least 1, not 0"),
         (("--horizon", "0"), "--horizon must be at least 1, not 0"),
         (("--patience", "0"), "--patience must be at least 1, not 0"),

@@ -411,8 +411,8 @@ def test_models_whose_views_are_not_enough_are_refused(self_model, recordings):
     human = Peeking(self_model)
     some = recordings.select_people([0]).select_rounds([0])
     table = build_view_table(human, some)
-    assert not acts_on_beliefs(human, table)
-    assert acts_on_beliefs(ToyHuman(self_model), table)
+    assert not acts_on_beliefs(human, table.sites)
+    assert acts_on_beliefs(ToyHuman(self_model), table.sites)
     with pytest.raises(HumanModelError, match="only the engines svi and nuts"):
         infer(human, some, InferenceOptions("importance"), 0)
     for engine, few in (("svi", SVIOptions(steps=2)), ("nuts", NUTSOptions(warmup=5))):

@@ -213,7 +213,7 @@ def test_a_posterior_file_gives_whole_numbers_of_draws():
     file = PosteriorFile(Path("a.nc"), names, ("a",), {"lapse": np.zeros((5, 1))})
     refused(lambda: file.draws(human(), 1.5), "number must be a whole number, not 1.5")
     refused(lambda: file.draws(human(), -1), "number must be at least 0, not -1")
-    refused(lambda: file.draws(human(), 6), "a.nc: holds 5 draws, not 6")
+    refused(lambda: file.draws(human(), 6), "a.nc: holds 5 draws, not 6: ask for 5 or fewer")
     refused(lambda: file.draws("mirror", 2), "human must be of the class HumanModel, not 'mirror'")
 
 

@@ -153,7 +153,7 @@ def test_draws_are_the_same_each_time_and_leave_global_randomness_alone(path):
 def test_more_draws_than_there_are_are_refused(path):
     with pytest.raises(PosteriorError) as error:
         load_posterior(path).draws(human(), 10)
-    assert str(error.value) == f"{path}: holds 9 draws, not 10"
+    assert str(error.value) == f"{path}: holds 9 draws, not 10: ask for 9 or fewer"
 
 
 def test_no_draws_at_all_are_no_person(path):

@@ -13,7 +13,7 @@ from pyro.infer import SVI, Trace_ELBO
 from pyro.infer.autoguide import AutoNormal
 from test_one_program import recordings
 
-from benchmarks.one_program import exact_mean, toy
+from benchmarks.one_program import exact_mean, own_program, toy
 from mirror_ppl.communication.person import Person
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference import batches
@@ -26,6 +26,8 @@ from mirror_ppl.likelihood.compiled import Sequential, ViewTables, compile
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import ToyHuman
+from mirror_ppl.training.guide import GuideOptions, train_guide
+from mirror_ppl.training.guide_file import network_for
 
 __all__ = ["recordings"]
 
@@ -129,6 +131,21 @@ def test_it_is_fitted_and_predicted(recordings):
 def test_engines_that_compile_refuse_it(engine, recordings):
     with pytest.raises(HumanModelError, match=f"cannot be inferred by the engine {engine}; the"):
         infer(Asked(self_model()), recordings, InferenceOptions(engine, 10), 0)
+
+
+def test_there_is_no_network_of_it():
+    human = Asked(self_model())
+    with pytest.raises(HumanModelError, match="overrides model.* and cannot be compiled"):
+        network_for("amortized", None, human)
+    with pytest.raises(HumanModelError, match="overrides model.* and cannot be compiled"):
+        train_guide(human, GuideOptions(), 0)
+    assert network_for("auto", None, human) is None
+
+
+def test_scales_that_pyro_cannot_sum_out_are_refused(recordings):
+    human = own_program("scale", self_model())
+    with pytest.raises(HumanModelError, match=r"Own.model scales some of its discrete sites.*nuts"):
+        infer(human, recordings, InferenceOptions("svi", 5), 0)
 
 
 def test_what_needs_the_methods_refuses_it(recordings):

@@ -118,6 +118,12 @@ def test_human_models_are_named_or_given(recordings, human, fit):
     assert "sight_radius" in found.data.posterior
 
 
+def test_a_human_model_is_an_object_a_class_or_a_name():
+    for wrong in (3, dict):
+        with pytest.raises(InputError, match="human must be a human model, its class or its name"):
+            mirror_ppl.infer(human=wrong)
+
+
 def test_files_are_read(tmp_path):
     save_demonstrations(tmp_path / "one.nc", simulate("driving", "clear", "paper", 1, 2, 0))
     fit = mirror_ppl.infer(str(tmp_path / "one.nc"), draws=5, explore=0)

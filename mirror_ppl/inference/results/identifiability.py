@@ -148,7 +148,7 @@ def identify(
         else:  # draws are too few to tell how many there are
             table = build_view_table(human, one, screening=Screening(), likely=own, values=VALUES)
             candidates = table.possible[0].nonzero().squeeze(-1)
-        if not acts_on_beliefs(human, table):
+        if not acts_on_beliefs(human, table.sites):
             return None
         policy = {name: value[chosen] for name, value in own.items() if name not in sizes}
         joint = log_joints(human, table, policy, candidates)[:, 0]

@@ -56,7 +56,9 @@ class PosteriorFile:
         held = len(next(iter(self.values.values())))
         number = held if number is None else whole_number(number, "number", 0)
         if number > held:
-            raise PosteriorError(f"{self.path}: holds {held} draws, not {number}")
+            raise PosteriorError(
+                f"{self.path}: holds {held} draws, not {number}: ask for {held} or fewer"
+            )
         chosen = np.linspace(0, held - 1, number).round().astype(int)
         with torch.random.fork_rng(devices=[]):
             nodes = sample_sites(human, len(self.people))
