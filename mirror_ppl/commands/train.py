@@ -18,7 +18,7 @@ model's prior; it takes about half an hour. A run that is stopped goes on when t
 given again."""
 SELF_MODEL, GUIDE = "self-model", "guide"
 OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "sizes", "device")
-OF_GUIDE = ("people", "elbo_steps", "human_model", "self_model")
+OF_GUIDE = ("people", "elbo_steps", "dropout", "human_model", "self_model")
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,9 @@ class Options:
     """Of a guide: people to learn from, simulated in the true domain."""
     elbo_steps: int = 0
     """Of a guide: gradient steps of the ELBO among those of inference compilation."""
+    dropout: float = 0.2
+    """Of a guide: share of the network's units that are left out at a step, from 0 to below 1; more
+    where a human model has many sites, or people are few."""
     human_model: str | None = None
     """Of a guide: another human model: one-radius, per-item, perceptual-only and so on, or
     one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
@@ -74,6 +77,8 @@ class Options:
         for name in of_other:
             if getattr(self, name) != defaults[name]:
                 raise OptionError(f"--{name.replace('_', '-')} is for --what {other}")
+        if not 0 <= self.dropout < 1:
+            raise OptionError(f"--dropout must be at least 0 and below 1, not {self.dropout}")
         rate = self.learning_rate
         if rate is not None and not 0 < rate <= 1:
             raise OptionError(f"--learning-rate must be above 0 and at most 1, not {rate}")
@@ -167,7 +172,9 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
     self_model, _ = load_self_model(weights, options.domain)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
-    settings = GuideOptions(people=options.people, elbo_steps=options.elbo_steps)
+    settings = GuideOptions(
+        people=options.people, elbo_steps=options.elbo_steps, dropout=options.dropout
+    )
     with Stages() as stages:
         guide, quality = train_guide(human, settings, options.seed, stages.report, checkpoint)
     card = _described(options, settings, quality, "nats a person, of people held out")

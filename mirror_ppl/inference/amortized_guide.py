@@ -13,7 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from mirror_ppl.errors import InputError
-from mirror_ppl.inference.margins import PriorMargins, prior_knots
+from mirror_ppl.inference.margins import (
+    PriorDependence,
+    PriorMargins,
+    independent,
+    prior_dependence,
+    prior_knots,
+)
 from mirror_ppl.inference.mixture import GaussianMixture
 from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
@@ -37,14 +43,17 @@ def guide_screening() -> Screening:
 class AmortizedGuide(nn.Module):
     """``q(psi | rounds)`` of the scalar sites of a human model, in unconstrained space.
 
-    Before it has learned anything it is about the prior's margins, and independent.
+    Before it has learned anything it is about the prior.
 
     Args:
         places: of the ways that evidence is about, ``[W, D]``.
         prior: of draws from the prior, for its margins, ``[S, D]``; the ways if not given.
+        dependent: whether sites of the prior depend on each other.
+        dropout: share of the network's units that are left out in training.
 
     Attributes:
         knots: of the prior's margins, see :class:`PriorMargins`, ``[D, K]``.
+        mean, log_scale: of the prior's dependence, see :class:`PriorDependence`, ``[D, F]``.
         ways: places of the ways, in which the prior is standard normal, ``[W, D]``.
         gate: how much of the mean, at each temperature of the evidence, is that of importance
             sampling from the prior, ``[temperatures, D]``.
@@ -52,26 +61,46 @@ class AmortizedGuide(nn.Module):
 
     ways: Tensor
     knots: Tensor
+    mean: Tensor
+    log_scale: Tensor
 
-    def __init__(self, places: Tensor, prior: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        places: Tensor,
+        prior: Tensor | None = None,
+        dependent: bool = False,
+        dropout: float = DROPOUT,
+    ) -> None:
         super().__init__()
         number, self.dimensions = places.shape
-        self.register_buffer("knots", prior_knots(places if prior is None else prior))
-        self.register_buffer("ways", PriorMargins(self.knots).inv(places))
+        prior = places if prior is None else prior
+        self.register_buffer("knots", prior_knots(prior))
+        mean, log_scale = independent(self.dimensions)
+        if dependent:
+            mean, log_scale = prior_dependence(torch.as_tensor(PriorMargins(self.knots).inv(prior)))
+        self.register_buffer("mean", mean)
+        self.register_buffer("log_scale", log_scale)
+        self.register_buffer("ways", self.prior.inv(places))
         moments = 2 * self.dimensions + 1
         triangle = self.dimensions * (self.dimensions + 1) // 2
         self.body = nn.Sequential(
             nn.Linear(number + len(TEMPERATURES) * moments + 1, HIDDEN),
             nn.ReLU(),
-            nn.Dropout(DROPOUT),
+            nn.Dropout(dropout),
             nn.Linear(HIDDEN, HIDDEN),
             nn.ReLU(),
-            nn.Dropout(DROPOUT),
+            nn.Dropout(dropout),
         )
         self.head = nn.Linear(HIDDEN, COMPONENTS * (1 + self.dimensions + triangle))
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.normal_(self.head.bias, std=0.1)
         self.gate = nn.Parameter(torch.zeros(len(TEMPERATURES), self.dimensions))
+
+    @property
+    def prior(self) -> dist.transforms.Transform:
+        """From standard normal numbers to places ``[..., D]``."""
+        dependence = PriorDependence(self.mean, self.log_scale)
+        return dist.transforms.ComposeTransform([dependence, PriorMargins(self.knots)])
 
     def features(self, log_evidence: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
         """What the network reads ``[..., F]`` of evidence ``[..., W]`` of so many steps ``[...]``.
@@ -96,7 +125,7 @@ class AmortizedGuide(nn.Module):
         """Whether it learned to read evidence about ways at these places ``[W, D]``."""
         if self.ways.shape != places.shape:
             return False
-        own = torch.as_tensor(PriorMargins(self.knots)(self.ways))
+        own = torch.as_tensor(self.prior(self.ways))
         return torch.allclose(own, places.to(own), atol=1e-3)
 
     def mixture_parameters(self, log_evidence: Tensor, steps: Tensor) -> Tensor:
@@ -124,7 +153,7 @@ class AmortizedGuide(nn.Module):
             dist.Categorical(logits=logits.squeeze(-1)),
             dist.MultivariateNormal(mean, scale_tril=lower),
         )
-        return dist.TransformedDistribution(mixture, [PriorMargins(self.knots)])
+        return dist.TransformedDistribution(mixture, [self.prior])
 
     def forward(
         self, sites: Mapping[str, dist.transforms.Transform], log_evidence: Tensor, steps: Tensor

@@ -1,11 +1,19 @@
-"""The map from standard normal numbers to a prior's margins, as a guide reads and proposes them.
+"""The map from standard normal numbers to a prior, as a guide reads and proposes them.
 
 Some sites of a prior have long tails in unconstrained space: the logit of the probability of
 noticing a terminal is sometimes -40. No mixture of a few Gaussians is near such a prior. Each of
-its margins is a standard normal number, mapped piecewise linearly between quantiles of draws.
+its margins is a standard normal number ``y_d``, mapped piecewise linearly between quantiles of
+draws. Where sites of the prior depend on those before them, such as probabilities on their common
+mean, that is taken out, too::
+
+    y_d = m_d(y_<d) + s_d(y_<d) u_d        m_d and log s_d quadratic, u_d about standard normal
+
+so that who has learned nothing proposes about what the prior does.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -14,6 +22,9 @@ from torch.distributions import Normal, Transform, constraints
 KNOTS = 33
 REACH = 3.0
 LEAST_GAP = 1e-3
+RIDGE = 1e-7
+LEAST_SCALE = 1e-2
+MOST_LOG_SCALE = 4.0
 
 
 def normal_knots() -> Tensor:
@@ -66,6 +77,94 @@ class PriorMargins(Transform):
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
         """Log of the stretch ``[...]`` of all dimensions together."""
         return _interpolated(x, self.normal, self.knots)[1].log().sum(-1)
+
+
+class PriorDependence(Transform):
+    """From ``[..., D]`` independent numbers u to standard normal ones y that depend as the prior's.
+
+    Args:
+        mean: coefficients of m ``[D, F]``, see :func:`prior_dependence`.
+        log_scale: of log s ``[D, F]``.
+    """
+
+    bijective = True
+    domain = constraints.independent(constraints.real, 1)
+    codomain = constraints.independent(constraints.real, 1)
+
+    def __init__(self, mean: Tensor, log_scale: Tensor) -> None:
+        super().__init__(cache_size=1)
+        self.mean, self.log_scale = mean, log_scale
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PriorDependence) and all(
+            torch.equal(own, its)
+            for own, its in ((self.mean, other.mean), (self.log_scale, other.log_scale))
+        )
+
+    __hash__ = Transform.__hash__
+
+    def _conditionals(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """M and log s ``[..., D]``, of which that of each d reads only what is before it."""
+        terms = _quadratic(y)
+        limit = MOST_LOG_SCALE
+        return terms @ self.mean.T, (terms @ self.log_scale.T).clamp(-limit, limit)
+
+    def _call(self, x: Tensor) -> Tensor:
+        y = torch.zeros_like(x)
+        for place in range(x.shape[-1]):
+            mean, log_scale = (part[..., place] for part in self._conditionals(y))
+            own = mean + log_scale.exp() * x[..., place]
+            y = torch.cat([y[..., :place], own[..., None], y[..., place + 1 :]], -1)
+        return y
+
+    def _inverse(self, y: Tensor) -> Tensor:
+        mean, log_scale = self._conditionals(y)
+        return (y - mean) * (-log_scale).exp()
+
+    def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
+        """Log of the stretch ``[...]`` of all dimensions together."""
+        del x
+        return self._conditionals(y)[1].sum(-1)
+
+
+def prior_dependence(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients ``[D, F]`` of means and log scales, of draws ``[S, D]`` with normal margins.
+
+    By least squares, of each number on those before it.
+    """
+    terms = _quadratic(normal)
+    order = _quadratic(torch.arange(1.0, normal.shape[-1] + 1), torch.maximum)
+    mean, log_scale = torch.zeros(2, normal.shape[-1], terms.shape[-1])
+    for place in range(1, normal.shape[-1]):
+        before = order <= place
+        some = terms[:, before]
+        ridge = RIDGE * len(normal) * torch.eye(some.shape[1])
+
+        def fitted(values: Tensor, some: Tensor = some, ridge: Tensor = ridge) -> Tensor:
+            return torch.linalg.solve(some.T @ some + ridge, some.T @ values)
+
+        mean[place, before] = fitted(normal[:, place])
+        left = normal[:, place] - some @ mean[place, before]
+        log_scale[place, before] = fitted((left.abs() + LEAST_SCALE).log())
+        # Of the logarithms it is the spread up to a factor.
+        log_scale[place, 0] += (left / (some @ log_scale[place, before]).exp()).std().log()
+    return mean, log_scale
+
+
+def independent(dimensions: int) -> tuple[Tensor, Tensor]:
+    """Coefficients ``[D, F]`` with which nothing depends on anything."""
+    terms = len(_quadratic(torch.zeros(dimensions)))
+    return torch.zeros(dimensions, terms), torch.zeros(dimensions, terms)
+
+
+def _quadratic(y: Tensor, product: Callable[[Tensor, Tensor], Tensor] = torch.mul) -> Tensor:
+    """One, the numbers and their products ``[..., F]``, of numbers ``[..., D]`` within reach."""
+    size = y.shape[-1]
+    rows, columns = torch.triu_indices(size, size)
+    if product is torch.mul:
+        y = y.clamp(-REACH, REACH)
+    products = product(y[..., rows], y[..., columns])
+    return torch.cat([torch.ones_like(y[..., :1]), y, products], -1)
 
 
 def _interpolated(place: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

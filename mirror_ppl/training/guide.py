@@ -25,6 +25,7 @@ from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.amortized import log_evidence
 from mirror_ppl.inference.amortized_guide import (
+    DROPOUT,
     PRIOR_DRAWS,
     AmortizedGuide,
     guide_screening,
@@ -32,6 +33,7 @@ from mirror_ppl.inference.amortized_guide import (
 )
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import run_identity
+from mirror_ppl.inference.hierarchical_proposal import dependent_sites
 from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.densities import require_compilable
 from mirror_ppl.likelihood.enumeration import require_acting_on_beliefs
@@ -56,6 +58,8 @@ class GuideOptions:
         batch: examples in a gradient step, of a person and a number of rounds each.
         learning_rate: of AdamW at the start; it falls to nothing on a cosine.
         weight_decay: of AdamW.
+        dropout: share of the network's units that are left out at a step; more where there are
+            many sites, or few people.
         held_out: share of the people who only tell when to stop.
         together: people who are simulated at once.
     """
@@ -67,6 +71,7 @@ class GuideOptions:
     batch: int = 256
     learning_rate: float = 1e-3
     weight_decay: float = 0.1
+    dropout: float = DROPOUT
     held_out: float = 0.1
     together: int = 20
 
@@ -75,6 +80,8 @@ class GuideOptions:
         for name, least in least_of.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"dropout must be at least 0 and below 1, not {self.dropout}")
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
             raise ValueError(f"rounds must be positive and increase, not {self.rounds}")
 
@@ -195,7 +202,12 @@ def _optimize(
     report: Report,
 ) -> tuple[AmortizedGuide, dict[str, float]]:
     sites = scalar_sites(human)
-    guide = AmortizedGuide(reference_places(human), reference_places(human, PRIOR_DRAWS))
+    guide = AmortizedGuide(
+        reference_places(human),
+        reference_places(human, PRIOR_DRAWS),
+        bool(dependent_sites(human, sites)),
+        options.dropout,
+    )
     held_out = max(1, round(options.held_out * len(examples)))
     learned = len(examples) - held_out
     numbers = examples.steps.shape[1]

@@ -19,7 +19,7 @@ from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import fingerprint, read_tensors, save_tensors
 
-FORMAT = "mirror_ppl guide 2"
+FORMAT = "mirror_ppl guide 3"
 FIRST = next(iter(VARIANTS))
 
 

@@ -488,7 +488,7 @@ def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, c
     monkeypatch.setattr(
         guide_training,
         "GuideOptions",
-        lambda people, elbo_steps: replace(TRAINING, people=people, steps=50),
+        lambda people, **others: replace(TRAINING, people=people, steps=50),
     )
     path, human = tmp_path / "guide.safetensors", ("--human-model", f"{tmp_path / 'toy.py'}:Toy")
     assert command(train, "--what", "guide", "--people", 40, *human, "--out", path) == 0
