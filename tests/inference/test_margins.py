@@ -27,7 +27,7 @@ def test_what_depends_is_taken_out():
     inside = y[:, 0].abs() < REACH  # beyond, what depends is as at the edge
     found, u = found[inside], u[inside]
     # Standard errors of regression coefficients of 20,000 draws are about 1/140.
-    assert (found - u).abs().quantile(0.999) < 0.1
+    assert (found - u).abs().quantile(0.999) < 0.2  # scales are right to some five percent
     assert (torch.corrcoef(found.T) - torch.eye(3)).abs().max() < 5 / 140
 
 
