@@ -203,7 +203,8 @@ class Sampler:
         self._joints: list[Tensor] = []
         self._log_prior = torch.zeros(2, 0, device=table.index.device)  # of scalars, of discrete
         self._corrections: list[Tensor] = []
-        self._perceived = {site: discrete_sites(human)[site] for site in table.sites}
+        discrete = discrete_sites(human)
+        self._perceived = {site: discrete[site] for site in table.sites}
         self._residual: ResidualProposal | None = None
         self._log_residual = torch.zeros(2, 0, device=table.index.device)
 
