@@ -19,8 +19,9 @@ from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.likelihood import view_table_builder as builder
 from mirror_ppl.likelihood.enumeration import log_joints
 from mirror_ppl.likelihood.round_views import Rounds
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.prior import Draws, draw_prior
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.variants import PerItem

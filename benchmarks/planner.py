@@ -34,7 +34,7 @@ from mirror_ppl.communication import (
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.svi import SVIOptions, fit_implants
 from mirror_ppl.likelihood.compiled import compile
-from mirror_ppl.likelihood.view_table_builder import Screening
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models import HumanModel, SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 

@@ -20,7 +20,8 @@ from mirror_ppl.inference.marginal_elbo import MarginalELBO
 from mirror_ppl.inference.svi import continuous_guide
 from mirror_ppl.likelihood.combinations import grid_of, log_priors, perceived_sites
 from mirror_ppl.likelihood.compiled import ViewTables
-from mirror_ppl.likelihood.tables import Screening, build_view_table
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import residual

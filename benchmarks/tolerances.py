@@ -16,7 +16,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.engines import InferenceOptions
 from mirror_ppl.inference.results.fitting import Fit, fit_people
-from mirror_ppl.likelihood.tables import Screening
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -21,7 +21,8 @@ from mirror_ppl.inference.margins import (
     prior_knots,
 )
 from mirror_ppl.inference.mixture import GaussianMixture
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, scalar_sites, unconstrained
 

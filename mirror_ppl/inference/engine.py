@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.likelihood.view_table_builder import Screening
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.progress import Report, silent
 

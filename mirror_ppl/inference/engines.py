@@ -26,7 +26,7 @@ from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.likelihood.combinations import require_unread
 from mirror_ppl.likelihood.contract import check_contract
-from mirror_ppl.likelihood.view_table_builder import Screening
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel, has_own_program, require_standard_program
 from mirror_ppl.models.measured import require_measurable

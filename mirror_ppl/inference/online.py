@@ -17,8 +17,9 @@ from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening
 from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
 from mirror_ppl.likelihood.round_views import Rounds
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites

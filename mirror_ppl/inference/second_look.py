@@ -12,7 +12,8 @@ from dataclasses import replace
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.likelihood.round_views import Rounds
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 
 LIKELY_DRAWS, COARSE_DRAWS = 64, 256

@@ -24,10 +24,11 @@ from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.likelihood.densities import PLATES, Given, log_prob
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import TableProgram
 from mirror_ppl.likelihood.tables import join_tables, person_builders, restricted, rounds_of
 from mirror_ppl.likelihood.view_table import ViewTable
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import ACTION, HumanModel, has_own_program
 from mirror_ppl.models.measured import with_measurements
 from mirror_ppl.models.prior import Draws, draw_prior, values_of

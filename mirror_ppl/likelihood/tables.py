@@ -13,8 +13,9 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.likelihood.attention import VALUES
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.round_views import Rounds, RoundViews
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, Attention, ViewTable
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.measured import with_measurements
 

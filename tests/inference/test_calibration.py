@@ -22,7 +22,8 @@ from mirror_ppl.inference.calibration.study import (
     prior_people,
 )
 from mirror_ppl.likelihood.enumeration import draw_combinations, log_joint
-from mirror_ppl.likelihood.tables import Screening, build_view_table
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import policy_implants
 from mirror_ppl.models.simulation import play_rounds

@@ -12,8 +12,9 @@ from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_i
 from mirror_ppl.inference.residual_proposal import ResidualProposal, _laplace
 from mirror_ppl.inference.sampler import Sampler, complete
 from mirror_ppl.likelihood.enumeration import expected_counts
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -32,6 +32,7 @@ from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.densities import log_weighted_latents
 from mirror_ppl.likelihood.enumeration import log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import (
     build_view_table,
@@ -40,7 +41,7 @@ from mirror_ppl.likelihood.tables import (
     restricted,
     rounds_of,
 )
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import first_success, noticed_sites, policy_implants
 from mirror_ppl.models.loading import load_human_model

@@ -16,9 +16,10 @@ from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.enumeration import conditioned, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, restricted, rounds_of
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior

@@ -17,6 +17,7 @@ from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combinations import MAX_COMBINATIONS, log_priors
 from mirror_ppl.likelihood.enumeration import combination_values
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import (
     build_view_table,
@@ -25,7 +26,7 @@ from mirror_ppl.likelihood.tables import (
     rounds_of,
 )
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
-from mirror_ppl.likelihood.view_table_builder import GROWTH, Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import GROWTH, ViewTableBuilder
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights

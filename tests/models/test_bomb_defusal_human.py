@@ -19,8 +19,9 @@ from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_i
 from mirror_ppl.inference.results.summary import summarize
 from mirror_ppl.likelihood.attention import Proposal, site_probabilities
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.loading import load_human_model

@@ -29,8 +29,9 @@ from mirror_ppl.inference.svi import SVIOptions, continuous_guide
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.densities import PLATES
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
-from mirror_ppl.likelihood.tables import Screening, build_view_table
+from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.simulation import play_rounds

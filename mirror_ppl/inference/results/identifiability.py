@@ -32,10 +32,11 @@ from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, combination_values, log_joints
 from mirror_ppl.likelihood.round_views import Rounds
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
 from mirror_ppl.likelihood.view_table import combination_number
-from mirror_ppl.likelihood.view_table_builder import Screening, ViewTableBuilder
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.progress import Report, silent
