@@ -45,7 +45,10 @@ def human_and_rounds(domain, setting, people):
     recordings = load_demonstrations(asset_path(f"{domain}_{setting}_paper.nc"))
     recordings = recordings.select_people(recordings.people[:people])
     self_model, _ = load_self_model(shipped_weights(domain), domain)
-    return load_human_model(None, self_model), recordings
+    human = load_human_model(None, self_model)
+    if hasattr(human, "fit_world"):  # what rewards tell of the rules, as every fit learns it
+        human.fit_world(recordings)
+    return human, recordings
 
 
 def plan():

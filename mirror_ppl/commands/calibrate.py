@@ -12,7 +12,7 @@ from mirror_ppl.console import console_for_tables
 from mirror_ppl.errors import OptionError
 from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers
-from mirror_ppl.models.world_knowledge import fit_world
+from mirror_ppl.models.world_knowledge import fit_shipped_world
 from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
@@ -88,7 +88,6 @@ def main(options: Options) -> int:
     Raises:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
-    from mirror_ppl.data import asset_path, load_demonstrations
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.files import output_folder, write_together
     from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
@@ -109,8 +108,7 @@ def main(options: Options) -> int:
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
     # What is so for everybody is learned first, as by a fit: people are drawn from what is open.
-    name = f"{options.domain}_{setting}_paper.nc"
-    fit_world(human, load_demonstrations(asset_path(name)))
+    fit_shipped_world(human, setting)
     network = network_for(guide, options.guide_file, human)
     trial = CalibrationOptions(options.people, options.rounds, batch=5)
     what = [settings, setting, options.seed, trial]

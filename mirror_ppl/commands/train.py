@@ -165,6 +165,7 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
     from mirror_ppl.likelihood.contract import check_contract
     from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
+    from mirror_ppl.models.world_knowledge import fit_shipped_world
     from mirror_ppl.training.guide import GuideOptions, train_guide
     from mirror_ppl.training.guide_file import save_guide
 
@@ -172,6 +173,8 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
     self_model, _ = load_self_model(weights, options.domain)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
+    # What is so for everybody is learned first, as by a fit: people are drawn from what is open.
+    fit_shipped_world(human, human.domain.settings[-1])
     settings = GuideOptions(
         people=options.people, elbo_steps=options.elbo_steps, dropout=options.dropout
     )

@@ -33,7 +33,9 @@ class OnlinePosterior:
     """What is known of a person so far; a round more is one term more of their likelihood.
 
     Args:
-        human: the model of people.
+        human: the model of people. One that learns about the world, such as which rules hold in
+            bomb defusal, has to have done so before (`mirror_ppl.models.world_knowledge.fit_world`,
+            which every fit calls): else all that it leaves open is up to the person.
         network: a trained guide (see :func:`mirror_ppl.training.guide_file.load_guide`); without,
             draws are those of ``importance``, which takes longer at each asking.
         seed: of everything random. The same rounds in the same order, with draws asked for after

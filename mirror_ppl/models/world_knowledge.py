@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.models.human import HumanModel
 
@@ -52,6 +52,12 @@ def fit_world(human: HumanModel, demonstrations: Demonstrations) -> None:
     """Let a human model learn about the world, if it can; see :class:`WorldKnowledge`."""
     if isinstance(human, WorldKnowledge):
         human.fit_world(demonstrations)
+
+
+def fit_shipped_world(human: HumanModel, setting: str) -> None:
+    """The same from the recordings that ship, for people who are drawn from what is left open."""
+    if isinstance(human, WorldKnowledge):
+        human.fit_world(load_demonstrations(asset_path(f"{human.domain.name}_{setting}_paper.nc")))
 
 
 def planning_domain(human: HumanModel, draws: Mapping[str, Tensor]) -> Domain:
