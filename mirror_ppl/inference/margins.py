@@ -104,7 +104,7 @@ class PriorDependence(Transform):
     __hash__ = Transform.__hash__
 
     def _conditionals(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """M and log s ``[..., D]``, of which that of each d reads only what is before it."""
+        """Means m and log scales ``[..., D]``; those of each d read only what is before it."""
         terms = _quadratic(y)
         limit = MOST_LOG_SCALE
         return terms @ self.mean.T, (terms @ self.log_scale.T).clamp(-limit, limit)

@@ -510,10 +510,26 @@ def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, c
     assert "pareto_k" in summary["people"][0]
 
 
+def test_guides_are_trained_with_the_rules_learned_first(tmp_path, monkeypatch):
+    """As fits infer people: the rules of the world are not up to the person."""
+    trained = []
+
+    def stop(human, *others):
+        trained.append(human)
+        raise HumanModelError("enough")
+
+    monkeypatch.setattr(guide_training, "train_guide", stop)
+    out = tmp_path / "guide.safetensors"
+    assert command(train, "--what", "guide", "--domain", "bomb_defusal", "--out", out) == 2
+    assert (trained[0].rule_logits.softmax(-1).amax(-1) > 0.9).all()
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [
         (("--what", "nothing"), "--what must be self-model or guide, not nothing"),
+        (("--what", "guide", "--dropout", "1"), "--dropout must be at least 0 and below 1, not 1"),
+        (("--dropout", "0.5"), "--dropout is for --what guide"),
         (("--what", "guide", "--people", "3"), "--people must be at least 10, not 3"),
         (("--what", "guide", "--device", "cuda"), "--device is for --what self-model"),
         (("--what", "guide", "--phases", "3"), "--phases is for --what self-model"),

@@ -8,6 +8,7 @@ from example_course import go_through
 from test_bomb_defusal_human import WAIT, course
 
 from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.domains.base import RepeatedObservation, of_each
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models import HumanModel
@@ -140,3 +141,21 @@ def test_before_the_first_step_there_is_one_belief(case):
     assert own.tolist() == [0] * 5 and state.mean.shape == (1, human.belief_size)
     assert not state.believed.any()
     assert state.step == 0
+
+
+def test_what_many_observe_is_worked_out_once():
+    row, calls = torch.tensor([1, 0, 1, 1]), []
+    distinct = {"ego": torch.arange(4.0).view(2, 2), "visual": torch.zeros(2, 3, 1)}
+
+    def doubled(observation):
+        calls.append(observation)
+        return 2 * observation["ego"]
+
+    repeated = RepeatedObservation(distinct, row)
+    assert torch.equal(of_each(doubled, repeated), 2 * distinct["ego"][row])
+    assert calls == [distinct]
+    assert {name: value.shape for name, value in repeated.items()} == {
+        "ego": (4, 2),
+        "visual": (4, 3, 1),
+    }
+    assert torch.equal(of_each(doubled, distinct), 2 * distinct["ego"])
