@@ -119,7 +119,9 @@ def _argument_error(box: str, prog: str) -> str:
     parts = [part for part in parts if part] or [" ".join(box.split())]
     meant = [word for part in parts if part.startswith("Perhaps") for word in part.split()]
     options = dict.fromkeys(word.rstrip(",") for word in meant if word.startswith("--"))
-    message = parts[0].rstrip(".")
+    # Of an option that may be left out, tyro lists every type that the value was tried as.
+    tried = re.match(r"(Error parsing \S+: ).* - <class '\w+'>: (?!\[)(.*)", parts[0])
+    message = ("".join(tried.groups()) if tried else parts[0]).rstrip(".")
     if options:
         message += f"; perhaps you meant {' or '.join(options)}"
     return f"{message}; see {prog} --help"

@@ -225,12 +225,15 @@ class BeliefState:
             found.append(self.human.infer(before, evidence[shown[own]], action[own], stays))
         scales = [part.scale for part in found if isinstance(part, Gaussian)]
         scale = torch.cat(scales) if scales and self.memory is None else None
+        if still is not None and scale is not None and self.scale is not None:
+            # A belief that stays as it is stays as sure as it was.
+            scale = torch.where(still[some, None], self.scale[self.belief[some]], scale)
         begin = len(mean)
         mean = torch.cat([mean, *(part.mean if scales else part for part in found)])
         place = torch.arange(begin, len(mean), device=mean.device)
         if still is not None and len(some):
             # Beliefs that stay as they are, are the same ones however long ago they were formed.
-            kept, own = _first_of_equal(mean)
+            kept, own = _first_of_equal(mean if scale is None else torch.cat([mean, scale], 1))
             mean, scale, place = mean[kept], None if scale is None else scale[kept], own[begin:]
         effects = torch.cat([effects, torch.zeros_like(action)])
         effects[some + known] = place

@@ -102,6 +102,7 @@ def test_what_is_no_share(text):
     [
         (fit, ("--drws", "3"), "Unrecognized options: --drws, 3; perhaps you meant --draws"),
         (fit, ("--draws", "x"), "Error parsing --draws: invalid literal for int()"),
+        (fit, ("--train-rounds", "20x"), "Error parsing --train-rounds: invalid literal for int()"),
         (fit, ("more",), "Unrecognized options: more"),
         (fit, ("--demos",), "Missing value for argument '--demos'"),
         (compare, (), "give at least two posteriors to compare, not 0"),

@@ -80,6 +80,38 @@ def test_beliefs_are_those_of_each_person_alone(case, remembers):
     assert 1 < len(states[-1].belief.unique()) < PEOPLE
 
 
+@torch.no_grad()
+def test_a_belief_that_stays_is_as_sure_as_it_was(case):
+    human, _, transitions, _ = case
+    states = BeliefState.initial(human, PEOPLE).through(transitions)
+    views, _ = BeliefState.initial(human, PEOPLE).perceive(transitions)
+    stayed = 0
+    for step, (before, after) in enumerate(zip(states, states[1:], strict=False), 1):
+        assert len(after.scale) == len(after.mean)
+        some = torch.zeros(PEOPLE, dtype=torch.bool)
+        if views.still is not None:
+            some = views.still[:, step]
+        stayed += int(some.sum())
+        assert torch.equal(after.scale[after.belief][some], before.scale[before.belief][some])
+    # Each person alone has the same density, whoever else comes to the same mean.
+    for person in range(0, PEOPLE, 7):
+        alone = BeliefState.initial(human, 1)
+        own = [
+            replace(
+                one,
+                implants={name: value[[person]] for name, value in one.implants.items()},
+                action=one.action[[person]],
+                told={name: mask[[person]] for name, mask in one.told.items()},
+            )
+            for one in transitions
+        ]
+        for state, one in zip(states, alone.through(own), strict=True):
+            torch.testing.assert_close(
+                state.scale[state.belief[[person]]], one.scale, rtol=0, atol=1e-5
+            )
+    assert stayed or views.still is None
+
+
 @pytest.mark.parametrize("remembers", [False, True])
 @torch.no_grad()
 def test_steps_one_by_one_come_to_the_same(case, remembers):
