@@ -24,7 +24,7 @@ from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 
 CHUNK = 2**21
-"""Steps of views, of all draws together, that are worked out at once; bounds memory."""
+"""Views and moments, of all draws together, that are worked out at once; bounds memory."""
 
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
@@ -78,7 +78,7 @@ def log_joints(
         grid = combination_values(human, table)
     if combinations is not None:
         grid = {site: value[combinations] for site, value in grid.items()}
-    size = max(1, CHUNK // max(1, table.runs[0].numel()))
+    size = max(1, CHUNK // (table.moments.shape[:2].numel() + table.acted.numel()))
     parts = []
     for begin in range(0, number, size):
         some = {name: value[begin : begin + size] for name, value in draws.items()}

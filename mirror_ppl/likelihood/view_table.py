@@ -18,6 +18,7 @@ from torch.distributions import constraints
 
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.densities import log_weighted_latents
+from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.models.human import HumanModel, Implants
 
 NO_VIEW = -1
@@ -33,23 +34,6 @@ def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
         value = implants[site].long()
         number = number.to(value.device) * size + value
     return number
-
-
-def along_views(found: Tensor, moments: Tensor, repeats: Tensor | None = None) -> Tensor:
-    """Log-likelihood ``[..., V]`` of what was recorded along views.
-
-    Args:
-        found: of each moment, ``[..., N]``.
-        moments: of each step of each view, which of the N it is, ``[..., V, T]``; ``NO_VIEW`` in
-            padding.
-        repeats: how often each of them occurs ``[..., V, T]``; once unless given.
-    """
-    steps = moments.clamp(min=0).flatten(-2)
-    found = found.gather(-1, steps.expand(*found.shape[:-1], steps.shape[-1]))
-    found = found.unflatten(-1, moments.shape[-2:])
-    if repeats is not None:
-        found = found * repeats
-    return torch.where(moments == NO_VIEW, 0.0, found).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -143,20 +127,8 @@ class ViewTable:
     attention: Attention | Chain | None = None
 
     @cached_property
-    def runs(self) -> tuple[Tensor, Tensor | None]:
-        """The moments of each view without order ``[P, V, C]``, and how often each occurs.
-
-        Where spans of rounds are views, their moments are few. All others occur once (``None``).
-        """
-        if not isinstance(self.attention, Chain):
-            return self.moments, None
-        ordered = self.moments.sort(-1).values
-        new = torch.nn.functional.pad(ordered.diff(dim=-1) != 0, [1, 0])
-        place = new.long().cumsum(-1)
-        number = int(place.max()) + 1
-        moments = torch.full_like(ordered[..., :1], NO_VIEW).repeat(1, 1, number)
-        repeats = torch.zeros_like(moments).scatter_add(-1, place, torch.ones_like(place))
-        return moments.scatter(-1, place, ordered), repeats.to(self.belief)
+    def _steps_of_views(self) -> Sums:
+        return Sums.of(self.moments, self.moments != NO_VIEW, self.acted.shape[-1])
 
     @property
     def people(self) -> int:
@@ -224,7 +196,7 @@ class ViewTable:
 
     def along_views(self, moments: Tensor) -> Tensor:
         """Log-likelihood ``[..., P, V]`` of what was recorded, of moments ``[..., P, N]``."""
-        return along_views(moments, *self.runs)
+        return self._steps_of_views(moments)
 
 
 class RecordedActions(TorchDistribution):

@@ -42,7 +42,8 @@ from mirror_ppl.likelihood.round_views import (
     views_of_rounds,
 )
 from mirror_ppl.likelihood.screening import Screening
-from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable, along_views
+from mirror_ppl.likelihood.sums import Sums
+from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.belief_tracking import CHUNK
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
@@ -363,7 +364,9 @@ class ViewTableBuilder:
         """Of what was recorded under each policy and view, ``[policies, V]``."""
         if not len(views.acted):  # of padding alone
             return self.score.new_zeros(len(self.score), len(views.moments))
-        return along_views(self._of_moments(self.draw_policies(), views), views.moments)
+        moments = views.moments[None]
+        along = Sums.of(moments, moments != NO_VIEW, len(views.acted))
+        return along(self._of_moments(self.draw_policies(), views)[:, None])[:, 0]
 
     def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
         """Log joint ``[policies, U, G]`` of actions and attention, of their likelihoods."""
