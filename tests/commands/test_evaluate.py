@@ -292,10 +292,6 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
             ("prediction", "--domain", "driving", "bomb_defusal", "--setting", "fog"),
             "--setting: bomb_defusal has none of fog; it has labelled, unlabelled",
         ),
-        (
-            ("prediction", "--domain", "bomb_defusal", "--models", "mirror-amortized"),
-            "mirror-amortized: no trained guide ships for bomb_defusal",
-        ),
         (("prediction", "--population", "us"), 'unknown population "us"'),
         (("prediction", "--rounds", "0", "5"), "--rounds must be from 1 to 20, not 0"),
         (("prediction", "--rounds", "30"), "--rounds must be from 1 to 20, not 30"),
