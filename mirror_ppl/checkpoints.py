@@ -23,13 +23,18 @@ def save_checkpoint(path: str | os.PathLike[str], run: Any, content: dict[str, A
     Raises:
         OutputError: the file cannot be written.
     """
+    write_whole(path, checkpoint_content(run, content))
+
+
+def checkpoint_content(run: Any, content: dict[str, Any]) -> memoryview:
+    """What the file of a checkpoint holds; arguments as of `save_checkpoint`."""
     import torch
 
     buffer = io.BytesIO()
     torch.save({"run": run, **content}, buffer)
     # torch does not check all of what it reads.
     buffer.write(sha256(buffer.getbuffer()).digest())
-    write_whole(path, buffer.getbuffer())
+    return buffer.getbuffer()
 
 
 def read_checkpoint(path: str | os.PathLike[str], run: Any) -> dict[str, Any]:

@@ -25,10 +25,10 @@ from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.results.export import add_identifiability, netcdf_content
-from mirror_ppl.inference.results.identifiability import identify
+from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
+from mirror_ppl.inference.workers import Workers
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
@@ -38,6 +38,7 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import PEOPLE
 from mirror_ppl.plots.fit import FILES, FitPlots
 from mirror_ppl.progress import Report, Stages, silent
+from mirror_ppl.timing import clocked, stage
 from mirror_ppl.training.guide_file import network_for
 
 if TYPE_CHECKING:
@@ -113,11 +114,18 @@ class Fit(fitting.Fit):
             OutputError: a file cannot be written.
         """
         folder = Path(folder)
-        pictures = self.plot.files()
+        with clocked() as seconds:
+            with stage("draw"):
+                pictures = self.plot.files()
+                drawn = {name: picture.content() for name, (picture, _) in pictures.items()}
+            with stage("write"):
+                posterior = netcdf_content(self.data)
+        summary = self.summary | told
+        summary["processor_seconds"] = self.summary["processor_seconds"] | seconds
         contents = {
-            folder / "posterior.nc": netcdf_content(self.data),
-            **{folder / name: picture.content() for name, (picture, _) in pictures.items()},
-            folder / "summary.json": json_text(self.summary | told),
+            folder / "posterior.nc": posterior,
+            **{folder / name: content for name, content in drawn.items()},
+            folder / "summary.json": json_text(summary),
         }
         # Those of an older fit go first: it may have drawn what this one does not, and results of
         # a fit that is killed here cannot be taken for whole without their summary.
@@ -265,6 +273,9 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     guide_file: str | Path | None = None,
     self_model: SelfModel | str | Path | None = None,
     device: str = "cpu",
+    jobs: int | None = 1,
+    scheduler: str | None = None,
+    every_draw: bool = False,
     report: Report | None = None,
     checkpoint: str | Path | None = None,
 ) -> Fit:
@@ -293,6 +304,12 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         self_model: the robot's networks, or a file of them; those that ship unless given. Not with
             a human model that is an object, which has its own.
         device: where to compute: cpu, cuda or cuda:0.
+        jobs: processes that share the people; -1 for one a core, None for as many as pay. Results
+            do not depend on it. The engines svi and nuts infer people together, in one process.
+        scheduler: address of a Dask cluster that does the work instead, such as
+            ``tcp://host:8786``.
+        every_draw: keep predictions of held-out actions under every draw in place of their mean,
+            and all sites of the prior in place of those that are one number a person.
         report: told of progress; shown on stderr if that is a terminal unless given.
         checkpoint: file to continue from; written on the way, and kept.
 
@@ -323,6 +340,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         if pooling != "none":
             raise InputError("prior_from is for people who are not pooled; leave out pooling")
         population = load_population(Path(prior_from), Pooling(model), recordings.setting)
+    workers = Workers(None if jobs is None else whole_number(jobs, "jobs", -1), scheduler)
     with Stages() if report is None and sys.stderr.isatty() else nullcontext() as stages:
         report = report or (stages.report if stages is not None else silent)
         found = fitting.fit_people(
@@ -335,21 +353,10 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             None if checkpoint is None else Path(checkpoint),
             network,
             population,
-        )
-        open_questions = identify(
-            model,
-            found.train,
-            found.posterior.draws,
-            seed,
-            found.posterior.population,
-            report,
+            workers,
             explore,
+            every_draw,
         )
-    if open_questions is not None:
-        scenarios = get_domain(recordings.domain).scenarios
-        for number, person in enumerate(found.summary["people"]):
-            person["identifiability"] = open_questions.of(number, scenarios)
-        add_identifiability(found.data, open_questions, found.data["posterior"].attrs)
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)
     return Fit(**vars(found))

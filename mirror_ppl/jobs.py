@@ -18,6 +18,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar, cast
 
+from mirror_ppl.checkpoints import checkpoint_content, read_checkpoint
 from mirror_ppl.errors import MirrorError, PosteriorError, WorkerError
 from mirror_ppl.files import Content, write_whole
 from mirror_ppl.progress import Progress
@@ -31,7 +32,7 @@ Result = TypeVar("Result")
 
 DISPATCHED = 2
 """Cells for each process that have been handed out when one of them kills its process."""
-FILE = re.compile(r"[0-9a-f]{24}\.(json|nc)")
+FILE = re.compile(r"[0-9a-f]{24}\.(json|nc|pt)")
 """Names of the files of results."""
 
 
@@ -97,6 +98,21 @@ class DatasetFormat:
         return data, json.loads(data.attrs.pop("about"))
 
 
+class TensorFormat:
+    """Results that are dicts of tensors and plain values, as a checkpoint."""
+
+    suffix = ".pt"
+
+    def write(self, result: dict[str, Any], about: dict[str, Any]) -> Content:
+        """See `Format`."""
+        return checkpoint_content("", {"result": result, "about": about})
+
+    def read(self, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+        """See `Format`."""
+        content = read_checkpoint(path, "")
+        return content["result"], content["about"]
+
+
 @dataclass(frozen=True)
 class Outcome(Generic[Result]):
     """What came of a cell.
@@ -140,6 +156,7 @@ class Runner:
         cells: Sequence[Cell],
         work: Callable[[Any], Result],
         form: Format[Result] | None = None,
+        given: Callable[[Any], Any] | None = None,
     ) -> list[Outcome[Result]]:
         """Do the work of every cell that is not done yet.
 
@@ -149,6 +166,7 @@ class Runner:
             cells: in the order in which they are begun.
             work: of one cell; can be pickled if other processes do it.
             form: of results in files; JSON unless given.
+            given: what the work gets in place of the cell, made when its turn comes.
 
         Returns:
             One outcome a cell, in their order.
@@ -162,13 +180,14 @@ class Runner:
         found = [_kept(path, cell, form) for path, cell in zip(paths, cells, strict=True)]
         outcomes = {place: kept for place, kept in enumerate(found) if kept is not None}
         self.progress.resume(len(outcomes))
-        todo = {
-            place: partial(_done, place, cell, work, self.keep_going)
-            for place, cell in enumerate(cells)
-            if place not in outcomes
-        }
+
+        def task(place: int) -> Callable[[], tuple[int, Outcome[Result]]]:
+            own = partial(work, cells[place] if given is None else given(cells[place]))
+            return partial(_done, place, cells[place], own, self.keep_going)
+
+        todo = [place for place in range(len(cells)) if place not in outcomes]
         with nullcontext() if self.scheduler is None else cluster(self.scheduler):
-            for place, outcome in self._each(todo):
+            for place, outcome in self._each(todo, task):
                 cell, path = outcome.cell, paths[place]
                 if outcome.error is not None and not self.keep_going:
                     raise WorkerError(f"{cell.label}: {outcome.error}")
@@ -196,24 +215,25 @@ class Runner:
         return self.folder / (digest[:24] + suffix)
 
     def _each(
-        self, tasks: dict[int, Callable[[], tuple[int, Outcome[Result]]]]
+        self, places: list[int], task: Callable[[int], Callable[[], tuple[int, Outcome[Result]]]]
     ) -> Iterator[tuple[int, Outcome[Result]]]:
         """Outcomes by place, in the order in which cells end."""
         from joblib import effective_n_jobs
 
-        left = dict(tasks)
+        left = dict.fromkeys(places)
         while left:
             try:
-                for place, outcome in run_tasks(list(left.values()), self.jobs, self._here):
+                for place, outcome in run_tasks(map(task, list(left)), self.jobs, self._here):
                     del left[place]
                     yield place, outcome
             except WorkerError:
-                suspects = list(left.items())[: DISPATCHED * effective_n_jobs(self.jobs)]
-                for place, task in suspects:
+                suspects = list(left)[: DISPATCHED * effective_n_jobs(self.jobs)]
+                for place in suspects:
+                    own = task(place)
                     try:
-                        (ended,) = run_tasks([task], 2, self._here)
+                        (ended,) = run_tasks([own], 2, self._here)
                     except WorkerError as error:
-                        ended = place, Outcome(task.args[1], error=str(error))
+                        ended = place, Outcome(cast(Any, own).args[1], error=str(error))
                     del left[place]
                     yield ended
 
@@ -223,11 +243,11 @@ class Runner:
 
 
 def _done(
-    place: int, cell: Cell, work: Callable[[Any], Result], keep_going: bool
+    place: int, cell: Cell, work: Callable[[], Result], keep_going: bool
 ) -> tuple[int, Outcome[Result]]:
     began = perf_counter()
     try:
-        result = work(cell)
+        result = work()
     except (Exception, SystemExit) as error:
         if not keep_going:
             raise

@@ -53,6 +53,8 @@ def check_numbers(options: Any, *names: str, **least: int) -> None:
             option = f"--{name.replace('_', '-')}"
             if number < low:
                 raise OptionError(f"{option} must be at least {low}, not {number}")
+            if name == "jobs" and number == 0:
+                raise OptionError(f"{option} must be at least 1, or -1 for all, not 0")
             if number > high:
                 raise OptionError(f"{option} must be at most {high}, not {number}")
 

@@ -134,6 +134,35 @@ class Progress:
         self.update(self.done + 1, message)
 
 
+class Reported(Progress):
+    """Tells a report instead of a terminal, in units of which each step does several.
+
+    Args:
+        name: what is being done.
+        total: units in all.
+        each: units of a step; the last one may have fewer.
+        report: told of units done.
+    """
+
+    def __init__(self, name: str, total: int, each: int, report: Report) -> None:
+        super().__init__(name, total, quiet=True)
+        self._each, self._report = each, report
+
+    def resume(self, done: int) -> None:
+        """Tell how many steps an earlier run did."""
+        super().resume(done)
+        self._tell()
+
+    def update(self, done: int, message: str = "") -> None:
+        """Tell that `done` steps are done in all."""
+        super().update(done, message)
+        self._tell()
+
+    def _tell(self) -> None:
+        assert self.total is not None
+        self._report(self.name, min(self.done * self._each, self.total), self.total, "people")
+
+
 class Stages:
     """Progress of one stage of work after the other; a context manager."""
 

@@ -75,8 +75,6 @@ class Options:
             numbers = " ".join(map(str, self.rounds))
             raise OptionError(f"--rounds must be positive and increase, not {numbers or 'none'}")
         check_numbers(self, "rounds", "jobs")
-        if self.jobs == 0:
-            raise OptionError("--jobs must be at least 1, or -1 for all, not 0")
 
 
 def main(options: Options) -> int:

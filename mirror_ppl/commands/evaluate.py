@@ -90,8 +90,6 @@ class Options:
             raise OptionError(
                 f"--rounds must be from 1 to 20, not {', '.join(map(str, wrong)) or 'none'}"
             )
-        if self.jobs == 0:
-            raise OptionError("--jobs must be at least 1, or -1 for all, not 0")
 
 
 def main(options: Options) -> int:

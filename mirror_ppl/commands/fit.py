@@ -81,6 +81,14 @@ class Options:
     """Posterior draws."""
     seed: int = 0
     """Seed of everything random: the same seed gives the same summary."""
+    jobs: int | None = None
+    """Processes that share the people; -1 for one a core. Results do not depend on it. Default: as
+    many as pay, and one with --device cuda."""
+    scheduler: str | None = None
+    """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
+    every_draw: bool = False
+    """Keep in posterior.nc the predictions of held-out actions under every draw, not their mean
+    alone, and all sites of the prior."""
     device: str = "cpu"
     """Where to compute: cpu, cuda or cuda:0."""
 
@@ -91,7 +99,7 @@ class Options:
             raise OptionError("--prior-from is for people who are not pooled; leave out --pooling")
         if self.refine and self.guide not in ("auto", "amortized"):
             raise OptionError("--refine is for --guide auto and amortized")
-        check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed")
+        check_numbers(self, "steps", "draws", "train_rounds", "explore", "refine", "seed", "jobs")
         share(self.allow_contradictions, "--allow-contradictions")
 
 
@@ -106,7 +114,9 @@ def main(options: Options) -> None:
     from mirror_ppl.evaluation.fit_report import show_fit
     from mirror_ppl.face import RESULTS, infer
     from mirror_ppl.files import output_folder
+    from mirror_ppl.inference.results.fitting import parts_of
     from mirror_ppl.inference.svi import SVIOptions
+    from mirror_ppl.inference.workers import Workers
 
     recordings = _recordings(options)
     engine = told_engine(options.guide)
@@ -129,11 +139,15 @@ def main(options: Options) -> None:
             guide_file=options.guide_file,
             self_model=options.self_model,
             device=options.device,
+            jobs=1 if options.jobs is None and options.device != "cpu" else options.jobs,
+            scheduler=options.scheduler,
+            every_draw=options.every_draw,
             report=stages.report,
             checkpoint=folder / CHECKPOINT,
         )
         seconds = round(monotonic() - began, 1)
         pictures = fit.save(folder, seconds=seconds)
+        Workers(folder=parts_of(folder / CHECKPOINT)).clean()
         for file in folder.glob(f"{CHECKPOINT}*"):
             if CHECKPOINTS.fullmatch(file.name) and file.is_file():
                 file.unlink()

@@ -239,6 +239,18 @@ class Demonstrations:
         variables = {name: value[index] for name, value in self.variables().items()}
         return self._like(variables, [self.people[number] for number in chosen])
 
+    def part(self, people: range) -> Demonstrations:
+        """These people, with all the padding, so that shapes are those of everybody."""
+        if len(people) == self.num_people:
+            return self
+        return Demonstrations.from_variables(
+            self.domain,
+            self.setting,
+            self.people[people.start : people.stop],
+            {name: value[people.start : people.stop] for name, value in self.variables().items()},
+            self.provenance,
+        )
+
     def select_rounds(self, rounds: slice | Sequence[int]) -> Demonstrations:
         """Only these rounds of each person, with no more padding than they need.
 

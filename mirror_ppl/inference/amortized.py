@@ -156,6 +156,7 @@ ENGINE = Engine(
     "amortized",
     infer_amortized,
     AmortizedOptions,
+    each_alone=True,
     pooled_draws=4000,
     takes_network=True,
     needs_network=True,

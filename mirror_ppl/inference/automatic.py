@@ -59,6 +59,7 @@ ENGINE = Engine(
     "auto",
     infer_automatically,
     AutomaticOptions,
+    each_alone=True,
     pooled_draws=4000,
     takes_network=True,
 )

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.inference.workers import People, Workers
+from mirror_ppl.likelihood.densities import BATCH
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.progress import Report, silent
@@ -30,6 +32,8 @@ class Inferred:
         population: that people are from, if they were pooled.
         effective: number ``[P]`` of each person's own draws that pooling leaves, if they were.
         engines: name of the engine that inferred each person.
+        seconds: of processors that it took, by stage; nothing of engines that infer people
+            together.
     """
 
     draws: Mapping[str, Tensor]
@@ -38,6 +42,21 @@ class Inferred:
     population: Population | None = None
     effective: Tensor | None = None
     engines: tuple[str, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+def rounded(draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Draws ``[S, P, 1, ...]`` with eight significant bits of weights, which are most of them.
+
+    Weights are sites of more than one number a person. The rest of their bits says nothing beside
+    the spread of the posterior, and takes two thirds of a file.
+    """
+    return {
+        name: value.bfloat16().to(value.dtype)
+        if value.is_floating_point() and value.dim() > BATCH
+        else value
+        for name, value in draws.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -56,6 +75,8 @@ class Job:
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused).
         refine: gradient steps on each person's rounds that refine what a network proposes.
+        workers: who does it, of engines that infer each person by themselves.
+        first: number of the first of these people among all; seeds of a person depend on it.
     """
 
     human: HumanModel
@@ -68,12 +89,19 @@ class Job:
     report: Report = silent
     checkpoint: tuple[Path, str] | None = None
     refine: int = 0
+    workers: Workers = Workers()
+    first: int = 0
 
     def of(self, people: range) -> Job:
         """The part of the job about some of the people."""
         if len(people) == self.rounds.num_people:
             return self
-        return replace(self, rounds=self.rounds.select_people(people))
+        return replace(self, rounds=self.rounds.select_people(people), first=people.start)
+
+    def part(self, people: People) -> Job:
+        """The part about some of the people, as another process can do it."""
+        own = self.of(people.range)
+        return replace(own, report=silent, checkpoint=None, workers=Workers())
 
 
 @dataclass(frozen=True)
@@ -84,6 +112,8 @@ class Engine:
         name: by which users know it.
         run: does a job.
         settings: class of the engine's settings; made without arguments unless they are given.
+        each_alone: whether it infers each person by themselves, so that parts of the people can be
+            inferred by several processes.
         pooled_draws: of each person under the human model's own prior, from which pooling chooses.
         any_program: whether it runs human models that cannot be compiled.
         takes_network: whether it proposes by an amortized guide, if there is one.
@@ -93,6 +123,7 @@ class Engine:
     name: str
     run: Callable[[Job], Inferred]
     settings: type
+    each_alone: bool = False
     pooled_draws: int = 1000
     any_program: bool = False
     takes_network: bool = False

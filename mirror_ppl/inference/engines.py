@@ -12,8 +12,11 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
@@ -21,9 +24,10 @@ from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.inference import amortized, automatic, importance, nuts, svi
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, require_network_of
-from mirror_ppl.inference.engine import Engine, Inferred, Job
+from mirror_ppl.inference.engine import Engine, Inferred, Job, rounded
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
+from mirror_ppl.inference.workers import Workers
 from mirror_ppl.likelihood.combinations import require_unread
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.screening import Screening
@@ -33,6 +37,7 @@ from mirror_ppl.models.measured import require_measurable
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.timing import add_seconds, clocked, stage
 from mirror_ppl.version import __version__
 
 ENGINES: Mapping[str, Engine] = {
@@ -106,7 +111,7 @@ class InferenceOptions:
             raise InputError(f"refining is for the engines {names}, not {self.engine}")
 
 
-def infer(
+def infer(  # noqa: PLR0913 - everything that inference can depend on
     human: HumanModel,
     demonstrations: Demonstrations,
     options: InferenceOptions,
@@ -115,6 +120,7 @@ def infer(
     report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
     population: Population | None = None,
+    workers: Workers = Workers(),  # noqa: B008 - frozen
 ) -> Inferred:
     """Posterior draws of the implants of P people.
 
@@ -129,6 +135,7 @@ def infer(
             identifies this run (a checkpoint of another run is refused); not of ``nuts``. Of many
             people there are more, whose names begin alike.
         population: that the people are from, if it is known from others: their prior, then.
+        workers: who does it, of engines that infer each person by themselves.
 
     Raises:
         HumanModelError: the human model breaks its contract, or cannot be fitted by this engine.
@@ -172,6 +179,7 @@ def infer(
         report,
         checkpoint,
         options.refine,
+        workers,
     )
     if options.pooling == "none" and population is None:
         return _each(engine, job)
@@ -200,10 +208,42 @@ def _each(engine: Engine, job: Job) -> Inferred:
             f"{what} needs its network, not None; see load_guide, and train --what guide for one "
             "of this human model"
         )
-    found = engine.run(job)
+    found = _in_parts(engine, job) if engine.each_alone else engine.run(job)
     if not found.engines:
         found = replace(found, engines=(engine.name,) * job.rounds.num_people)
-    return found
+    return replace(found, draws=rounded(found.draws))
+
+
+def _in_parts(engine: Engine, job: Job) -> Inferred:
+    """By engines that infer each person by themselves: part after part of the people."""
+    identity = "" if job.checkpoint is None else job.checkpoint[1]
+    parts = job.workers.run(
+        "infer", job.rounds.num_people, partial(_infer_part, engine), job.part, identity
+    )
+    draws = {
+        name: torch.cat([part["draws"].pop(name) for part in parts], 1)
+        for name in list(parts[0]["draws"])
+    }
+    seconds: dict[str, float] = {}
+    for part in parts:
+        add_seconds(seconds, part["seconds"])
+    return Inferred(
+        draws,
+        torch.cat([part["pareto_k"] for part in parts]),
+        engines=tuple(name for part in parts for name in part["engines"]),
+        seconds=seconds,
+    )
+
+
+def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
+    with clocked() as seconds, stage("infer"):
+        found = engine.run(part)
+    return {
+        "draws": dict(found.draws),
+        "pareto_k": found.pareto_k,
+        "engines": list(found.engines) or [engine.name] * part.rounds.num_people,
+        "seconds": seconds,
+    }
 
 
 def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequence[object]) -> str:

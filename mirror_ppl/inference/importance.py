@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
-from time import monotonic
 
 import torch
 
-from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.sampler import Weighted
@@ -17,9 +13,8 @@ from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
 from mirror_ppl.likelihood.tables import person_builders, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.measured import measured_draws
-from mirror_ppl.models.prior import Draws, sample_sites
-
-SECONDS_BETWEEN_CHECKPOINTS = 10.0
+from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.timing import stage
 
 
 def infer_by_importance(
@@ -34,67 +29,42 @@ def infer_by_importance(
             from; adaptive importance sampling unless given.
     """
     first_pass = first_pass or _by_importance
-    people = job.rounds.num_people
-    done = _People() if job.checkpoint is None else _People.restored(*job.checkpoint)
-    saved = monotonic()
+    people, found, drawn, engines = job.rounds.num_people, [], [], []
     with torch.random.fork_rng(devices=[]):
-        job.report("infer", len(done), people, "people")
-        for builder in person_builders(job.human, job.rounds, job.screening, first=len(done)):
-            human, person = builder.human, len(done)
-            # Whatever the number of draws that others took.
-            torch.manual_seed((job.seed + 1) * 1_000_003 + person)
+        builders = person_builders(job.human, job.rounds, job.screening)
+        for person in range(people):
+            job.report("infer", person, people, "people")
+            with stage("compile"):
+                builder = next(builders)
+            human = builder.human
+            # Whoever else there is, and whatever the number of draws that they took.
+            torch.manual_seed((job.seed + 1) * 1_000_003 + job.first + person)
             first = coarse(job.settings) if looks_twice(human) else job.settings
-            engine, found = first_pass(builder, first)
+            engine, own = first_pass(builder, first)
             if looks_twice(human):
                 rounds = rounds_of(job.rounds, person)
-                builder, found = second_look(
-                    human, rounds, job.screening, job.settings, builder, found
-                )
-            drawn = found.sample(job.draws, builder.grid)
+                builder, own = second_look(human, rounds, job.screening, job.settings, builder, own)
+            draws = own.sample(job.draws, builder.grid)
             if job.rounds.measurements:
-                drawn |= measured_draws(job.rounds.select_people([person]), job.draws)
-            done.draws.append(drawn)
-            done.pareto_k.append(found.pareto_k)
-            done.engines.append(engine)
-            if job.checkpoint is not None and monotonic() - saved > SECONDS_BETWEEN_CHECKPOINTS:
-                done.save(*job.checkpoint)
-                saved = monotonic()
-            job.report("infer", len(done), people, "people")
+                draws |= measured_draws(job.rounds.select_people([person]), job.draws)
+            found.append(own.pareto_k)
+            drawn.append(draws)
+            engines.append(engine)
         order = sample_sites(job.human, 1)
+    job.report("infer", people, people, "people")
     # Site after site, so that draws of pooled people, which are many, are not in memory twice.
-    draws = {name: torch.cat([own.pop(name) for own in done.draws], 1) for name in order}
-    return Inferred(draws, torch.tensor(done.pareto_k), engines=tuple(done.engines))
+    joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
+    return Inferred(joined, torch.tensor(found), engines=tuple(engines))
 
 
 def _by_importance(builder: ViewTableBuilder, options: ImportanceOptions) -> tuple[str, Weighted]:
     return ENGINE.name, sample_importance(builder.human, builder.table(), options)
 
 
-@dataclass(frozen=True)
-class _People:
-    """Those who are done."""
-
-    draws: list[Draws] = field(default_factory=list)
-    pareto_k: list[float] = field(default_factory=list)
-    engines: list[str] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.draws)
-
-    def save(self, path: Path, run: str) -> None:
-        save_checkpoint(path, run, vars(self))
-
-    @classmethod
-    def restored(cls, path: Path, run: str) -> _People:
-        if not path.exists():
-            return cls()
-        content = read_checkpoint(path, run)
-        return cls(content["draws"], content["pareto_k"], content["engines"])
-
-
 ENGINE = Engine(
     "importance",
     infer_by_importance,
     ImportanceOptions,
+    each_alone=True,
     pooled_draws=4000,
 )

@@ -27,9 +27,13 @@ def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
         human: the model of people.
         grid: values ``[M]`` of the discrete sites that perception reads.
     """
-    for name, parents in dependencies(human).prior.items():
-        if (name in grid or parents & grid.keys()) and parents - grid.keys():
-            return None
+    found = dependencies(human)
+    for name, parents in found.prior.items():
+        if name in grid or parents & grid.keys():
+            # What scales or masks a sampled site depends on its value, too.
+            own = {name} & found.latent
+            if (parents | own) - grid.keys():
+                return None
     return log_priors(human, grid, {}, 1)[0, 0]
 
 

@@ -16,11 +16,13 @@ from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.densities import (
     BATCH,
     check_plates,
+    correction,
     is_observed,
     log_prob,
     prior_nodes,
 )
 from mirror_ppl.models.dependencies import dependencies
+from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
 
@@ -76,8 +78,9 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
     latents = attention_sites(human)
     implants = Readable({name: support[:1] for name, support in (supports | latents).items()})
     knowledge: Any = domain.nothing_known(1, device=device)
-    for step in range(domain.horizon):
-        _, knowledge = human.perceive(implants, knowledge, observation, told, step)
+    with WithoutSites(BELIEVING):
+        for step in range(domain.horizon):
+            _, knowledge = human.perceive(implants, knowledge, observation, told, step)
     supports = {name: support for name, support in supports.items() if name in implants.read}
     number = prod(len(support) for support in supports.values())
     if number > MAX_COMBINATIONS:
@@ -122,7 +125,8 @@ def log_priors(
 ) -> Tensor:
     """Log prior probability ``[S, P, M]`` of each combination.
 
-    With all that ``prior`` observes or adds by a factor, as far as it depends on these sites.
+    With all that ``prior`` observes, adds by a factor, scales or masks, as far as it depends on
+    these sites; the rest is :func:`mirror_ppl.likelihood.densities.log_correction`.
 
     Args:
         human: the model of people.
@@ -140,15 +144,15 @@ def log_priors(
     for name, node in nodes.items():
         if name in grid:
             own = _log_prior(node, grid[name])
-        elif len(node["fn"].batch_shape) <= BATCH:
-            continue
-        elif not is_observed(node):
+        elif not is_observed(node) and len(node["fn"].batch_shape) > BATCH:
             raise HumanModelError(
                 f'the prior of "{name}" depends on a discrete site that perceive() reads; let that '
                 f'site depend on "{name}" instead'
             )
-        else:
-            own = log_prob(node)
+        else:  # scales and masks may depend on these sites where the density does not
+            own = correction(node)
+            if own is None or own.dim() <= BATCH:  # as in log_correction, which counts it
+                continue
         check_plates(name, own, people)
         total = total + own
     size = max([len(value) for value in grid.values()], default=1)

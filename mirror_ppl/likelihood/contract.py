@@ -16,8 +16,9 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
 from mirror_ppl.errors import HumanModelError, MirrorError
-from mirror_ppl.likelihood.densities import sample_nodes
+from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
 from mirror_ppl.likelihood.span_contract import check_spans_hold
+from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.user_code import describe
@@ -80,26 +81,21 @@ def check_contract(human: HumanModel) -> None:
             }
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
             knowledge: Any = domain.nothing_known(people, device=device)
-            before = set(trace.trace.nodes)
             for step, now in enumerate(observed):
-                method = "perceive"
-                readable = Readable(discrete | latents)
-                view, knowledge = human.perceive(readable, knowledge, now, told, step)
-                method = "evidence"
-                evidence = human.evidence(view, now)
-                method = "believe"
-                belief = human.belief_after(
-                    belief, evidence, none if step == 0 else done, view.still
-                )
+                with WithoutSites(BELIEVING):
+                    method = "perceive"
+                    readable = Readable(discrete | latents)
+                    view, knowledge = human.perceive(readable, knowledge, now, told, step)
+                    method = "evidence"
+                    evidence = human.evidence(view, now)
+                    method = "believe"
+                    belief = human.belief_after(
+                        belief, evidence, none if step == 0 else done, view.still
+                    )
                 if tuple(belief.shape) != (people, human.belief_size):
                     raise HumanModelError(
                         f"believe returned shape {tuple(belief.shape)}, expected "
                         f"({people}, {human.belief_size}) for {people} beliefs"
-                    )
-                for name in sample_nodes(trace.trace).keys() - before:
-                    raise HumanModelError(
-                        f'sees, perceive, evidence or believe has the site "{name}", which engines '
-                        "would leave out; put it into prior, round_latents or act"
                     )
                 method = "act"
                 _check_act(human, implants, belief)
@@ -119,8 +115,10 @@ def check_contract(human: HumanModel) -> None:
 def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
     """Runs inside the person plate, of people with a round each; of beliefs ``[P, Z]``."""
     belief = belief[:, None]
+    with WithoutSites("action_values"):
+        values = human.action_values(belief)
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
-        found = human.act(implants, belief, human.action_values(belief))
+        found = human.act(implants, belief, values)
     for name in latent_sites(trace.trace):
         raise HumanModelError(f'act samples "{name}" at every step; sample it in prior')
     _refuse_parameters(trace.trace)
@@ -189,6 +187,15 @@ def _refuse_parameters(trace: poutine.Trace) -> None:
 def _check_sites(trace: poutine.Trace, people: int) -> None:
     """Refuse what could be sampled, but not inferred."""
     _refuse_parameters(trace)
+    for name, site in sample_nodes(trace).items():
+        for frame in site["cond_indep_stack"]:
+            if frame.dim < -PLATES:
+                raise HumanModelError(
+                    f'"{name}" is in the plate "{frame.name}" at dimension {frame.dim}, which '
+                    "draws of people take; give its distribution .to_event(1) in place of a plate"
+                )
+        if site["is_observed"]:
+            check_plates(name, log_prob(site), people)
     for name, site in latent_sites(trace).items():
         fn = site["fn"]
         if fn.support.is_discrete and not fn.has_enumerate_support:

@@ -13,6 +13,7 @@ from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.belief_tracking import CHUNK, BeliefState, Memory, Transition
+from mirror_ppl.models.handlers import WithoutSites
 from mirror_ppl.models.human import HumanModel, at_step, messages_at
 from mirror_ppl.row_hashing import distinct_rows
 
@@ -268,7 +269,8 @@ def views_of_moments(
     moments[real] = place
     rounds, moment = used // many, used % many
     some, belief = (moment // action_count).unique(return_inverse=True)
-    values = [human.action_values(part) for part in state.mean[some].split(CHUNK)]
+    with WithoutSites("action_values"):
+        values = [human.action_values(part) for part in state.mean[some].split(CHUNK)]
     found = torch.cat(values) if len(some) else state.mean.new_zeros(0, action_count)
     return (
         ManyViews(

@@ -159,13 +159,12 @@ def person_builders(
     candidates: Sequence[Tensor] | None = None,
     values: int = VALUES,
     report: Callable[[int], None] = lambda people: None,
-    first: int = 0,
 ) -> Iterator[ViewTableBuilder]:
-    """Person after person from the first on, a builder with their rounds; see `build_view_table`.
+    """Person after person, a builder with their rounds; see `build_view_table`.
 
     What was measured of a person is observed by the human model of their builder.
     """
-    for person in range(first, demonstrations.num_people):
+    for person in range(demonstrations.num_people):
         own = None
         if likely is not None:
             own = {name: value[:, person : person + 1] for name, value in likely.items()}

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, RepeatedObservation, Visibility, map_state
+from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
@@ -131,7 +132,15 @@ class BeliefState:
         return self.through([transition])[-1]
 
     def through(self, transitions: Sequence[Transition]) -> list[BeliefState]:
-        """What the same people believe and know after each of some steps."""
+        """What the same people believe and know after each of some steps.
+
+        Raises:
+            HumanModelError: a method that leads to beliefs has sites.
+        """
+        with WithoutSites(BELIEVING):
+            return self._through(transitions)
+
+    def _through(self, transitions: Sequence[Transition]) -> list[BeliefState]:
         number, steps = len(self.belief), len(transitions)
         view, knowledge = self.perceive(transitions)
         row, observed = self._observed(transitions)

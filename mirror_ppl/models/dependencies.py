@@ -9,7 +9,7 @@ assigned to part of a tensor or leaves torch. So densities are also compared und
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +18,7 @@ from weakref import WeakKeyDictionary
 import pyro
 import torch
 from pyro import poutine
+from pyro.distributions.util import scale_and_mask
 from pyro.ops.provenance import detach_provenance, get_provenance, track_provenance
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
@@ -25,9 +26,11 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.sites import latent_sites, sample_nodes
+from mirror_ppl.models.sites import latent_sites, latent_values, sample_nodes
 
 Sites = frozenset[str]
+TRIED = 32
+"""Values of a discrete site, at most, under which densities are compared."""
 
 FROM_SHAPE_OF_FIRST = {
     *(getattr(Tensor, f"new_{kind}") for kind in ("empty", "full", "ones", "tensor", "zeros")),
@@ -49,11 +52,13 @@ class Dependencies:
         prior: of each site of ``prior``, observed sites and factors among them, other sites of it.
         round_latents: of each site of ``round_latents``, sites of ``prior`` and others of it.
         actions: of the action of a step, and of what else ``act`` observes or adds, given beliefs.
+        latent: the sites of ``prior`` that are sampled.
     """
 
     prior: Mapping[str, Sites]
     round_latents: Mapping[str, Sites]
     actions: Sites
+    latent: Sites
 
 
 _found: WeakKeyDictionary[HumanModel, Dependencies] = WeakKeyDictionary()
@@ -89,10 +94,13 @@ def _run(human: HumanModel) -> Dependencies:
                 human.choose(implants, belief, values, action.to(like.device))
         found = _parents(prior.trace)
         actions = frozenset().union(*_parents(act.trace).values())
+    sites = latent_sites(prior.trace)
+    of_latents, hidden = _hidden_causes(human, sites, latent_values(latents.trace))
     return Dependencies(
         found | _hidden_parents(human, found),
-        _parents(latents.trace),
-        actions | _hidden_causes(human, latent_sites(prior.trace)),
+        {name: parents | of_latents for name, parents in _parents(latents.trace).items()},
+        actions | hidden,
+        frozenset(sites),
     )
 
 
@@ -124,40 +132,66 @@ def _hidden_parents(human: HumanModel, found: Mapping[str, Sites]) -> dict[str, 
     latent, hidden = frozenset(latent_sites(trace.trace)), {}
     for name in found.keys() & nodes[0].keys() & nodes[1].keys():
         value = nodes[0][name]["value"]
-        one, other = (each[name]["fn"].log_prob(value) for each in nodes)
+        one, other = (_density(each[name], value) for each in nodes)
         if not found[name] and not torch.equal(one, other):
             hidden[name] = latent - {name}
     return hidden
 
 
-def _hidden_causes(human: HumanModel, sites: Mapping[str, Any]) -> Sites:
-    """Discrete sites of ``prior`` that change what ``act`` says, also where provenance loses them.
+def _hidden_causes(
+    human: HumanModel, sites: Mapping[str, Any], latents: Mapping[str, Any]
+) -> tuple[Sites, Sites]:
+    """Discrete sites of ``prior`` that change ``round_latents`` or ``act``, by their densities.
 
-    Each is tried at its first and its last value, with all others the same.
+    Provenance may have lost them. Each is tried at its values, with all others the same.
     """
     like = next(human.parameters())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         belief = torch.randn(1, 1, human.belief_size).to(like)
     values, action = human.action_values(belief), torch.zeros(1, 1, dtype=torch.long)
+    same = {name: detach_provenance(value) for name, value in latents.items()}
 
-    def said(given: Mapping[str, Tensor]) -> list[Tensor]:
-        with _as_drawn(0, given):
+    def said(given: Mapping[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        with _as_drawn(0, {**given, **same}):
             implants = human.prior()
-            with pyro.plate("round", 1, dim=-1), poutine.trace() as act:
-                human.choose(implants, belief, values, action.to(like.device))
-        nodes = sample_nodes(act.trace).values()
-        return [torch.as_tensor(node["fn"].log_prob(node["value"])) for node in nodes]
+            with pyro.plate("round", 1, dim=-1):
+                with poutine.trace() as attended:
+                    human.round_latents(implants)
+                with poutine.trace() as act:
+                    human.choose(implants, belief, values, action.to(like.device))
+        return _densities(attended.trace), _densities(act.trace)
 
     usual = {name: detach_provenance(node["value"]) for name, node in sites.items()}
-    found = set()
+    of_latents, of_actions = set(), set()
     for name, node in sites.items():
         if node["fn"].has_enumerate_support and not node["fn"].event_dim:
             support = node["fn"].enumerate_support(expand=False).flatten()
-            ends = [said({**usual, name: end.view(1, 1)}) for end in support[[0, -1]]]
-            if not all(map(torch.equal, *ends)):
-                found.add(name)
-    return frozenset(found)
+            tried = [said({**usual, name: value.view(1, 1)}) for value in _some(support)]
+            for found, each in ((of_latents, 0), (of_actions, 1)):
+                if any(not _equal(tried[0][each], one[each]) for one in tried):
+                    found.add(name)
+    return frozenset(of_latents), frozenset(of_actions)
+
+
+def _some(support: Tensor) -> Tensor:
+    """All of a few values, and of many some that are spread evenly."""
+    number = min(len(support), TRIED)
+    return support[torch.linspace(0, len(support) - 1, number).round().long()]
+
+
+def _densities(trace: poutine.Trace) -> list[Tensor]:
+    """Of all nodes, with what scales and masks them."""
+    return [_density(node, node["value"]) for node in sample_nodes(trace).values()]
+
+
+def _density(node: Mapping[str, Any], value: Any) -> Tensor:
+    found = scale_and_mask(node["fn"].log_prob(value), node["scale"], node["mask"])
+    return torch.as_tensor(found)
+
+
+def _equal(one: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
+    return len(one) == len(other) and all(map(torch.equal, one, other))
 
 
 def _parents(trace: poutine.Trace) -> dict[str, Sites]:

@@ -9,6 +9,12 @@ from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
+from mirror_ppl.errors import HumanModelError
+
+
+BELIEVING = "sees, perceive, evidence or believe"
+"""Methods that lead to beliefs."""
+
 
 class AtStep(Messenger):
     """Sites get the number of the step appended: ``action`` becomes ``action_3``."""
@@ -22,6 +28,25 @@ class AtStep(Messenger):
         if not msg["infer"].get("has_step"):
             msg["infer"] = {**msg["infer"], "has_step": True}
             msg["name"] = f"{msg['name']}_{self.step}"
+
+
+class WithoutSites(Messenger):
+    """Refuses sites where a human model has none, as engines would leave them out.
+
+    Args:
+        methods: that run, for the message.
+    """
+
+    def __init__(self, methods: str) -> None:
+        super().__init__()
+        self.methods = methods
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if not (site_is_subsample(msg) or msg["infer"].get("_deterministic")):
+            raise HumanModelError(
+                f'{self.methods} has the site "{msg["name"]}", which engines would leave out; put '
+                "it into prior, round_latents or act"
+            )
 
 
 class MaskObserved(Messenger):

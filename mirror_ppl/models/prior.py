@@ -83,6 +83,23 @@ def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
         return values_of(sample_sites(human, people, number))
 
 
+def draw_prior_of_each(human: HumanModel, people: range, number: int, seed: int) -> Draws:
+    """Draws ``[S, P, 1, ...]`` as `draw_prior`, of each person whoever else there is.
+
+    Args:
+        human: the model of people.
+        people: numbers of the P people.
+        number: number of draws S of each.
+        seed: of everything random.
+    """
+    each = []
+    with torch.random.fork_rng(devices=[]):
+        for person in people:
+            torch.manual_seed(seed * 1_000_003 + person)
+            each.append(values_of(sample_sites(human, 1, number)))
+    return {name: torch.cat([own[name] for own in each], 1) for name in each[0]}
+
+
 @torch.no_grad()
 def checked_draws(human: HumanModel, draws: Any, people: int) -> Draws:
     """Draws as the human model samples them, on its device.

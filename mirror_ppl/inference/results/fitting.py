@@ -16,20 +16,20 @@ from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.amortized_guide import AmortizedGuide
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.population.pooling import Pooling, Population
-from mirror_ppl.inference.results.posterior_predictive import predict_people
+from mirror_ppl.inference.results.description import Description, describe
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
+from mirror_ppl.inference.workers import Workers
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.models.world_knowledge import fit_world
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.timing import add_seconds
 from mirror_ppl.version import __version__
 
 if TYPE_CHECKING:
     import arviz as az
 
-PRIOR_DRAWS = 100
 TRAIN_ROUNDS, TEST_ROUNDS = 20, range(30, 36)
 """Rounds 1-20 train and 31-36 test (21-30 are for validation, 37-40 spare), counted from 0."""
 
@@ -98,6 +98,9 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     checkpoint: Path | None = None,
     network: AmortizedGuide | None = None,
     population: Population | None = None,
+    workers: Workers = Workers(),  # noqa: B008 - frozen
+    explore: int = 0,
+    every_draw: bool = False,
 ) -> Fit:
     """Infer the implants of everybody in recordings, and predict their held-out actions.
 
@@ -108,9 +111,13 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         seed: seed of everything random.
         train_rounds: see :func:`split_rounds`.
         report: told of progress.
-        checkpoint: file to continue from; written on the way, removed by nobody.
+        checkpoint: file to continue from; written on the way, removed by nobody. What is done for
+            some people after others is kept in a folder of that name with ``.parts``.
         network: of the engines that take one.
         population: that the people are from, if it is known from others.
+        workers: who does the work; report and folder are the others' here.
+        explore: rounds that the model plays in each scenario, to find the most informative one.
+        every_draw: keep predictions of held-out actions under every draw, and all of the prior.
 
     Raises:
         InputError: an argument of another kind, or rounds of another domain.
@@ -125,53 +132,69 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     seed = seed_number(seed)
     checkpoint = None if checkpoint is None else as_path(checkpoint, "checkpoint")
     train, test = split_rounds(demonstrations, train_rounds)
-    people = train.num_people
     fit_world(human, train)
-    run = None
+    workers, run, identity = replace(workers, report=report), None, ""
     if checkpoint is not None:
-        run = (
-            checkpoint,
-            run_identity(human, network, [options, population is None, _recorded(train), seed]),
-        )
+        workers = replace(workers, folder=parts_of(checkpoint))
+        which = [options, population is None, _recorded(train), seed]
+        identity = run_identity(human, network, which)
+        run = checkpoint, identity
     # All rounds were checked together.
     checked = replace(options, allow_contradictions=1.0)
-    posterior = infer(human, train, checked, seed, network, report, run, population)
-    prior = draw_prior(human, people, PRIOR_DRAWS, seed)
-    predicted = predict_people(human, (train, test), (posterior.draws, prior), seed, report)
+    posterior = infer(human, train, checked, seed, network, report, run, population, workers)
+    how = Description(human, seed, explore, posterior.population, every_draw)
+    if checkpoint is not None and test is not None:
+        identity += f"{_recorded(test)} {explore} {every_draw}"
+    described = describe(how, train, test, posterior.draws, workers, identity)
     # Results live where everybody can read them.
     learned = train
     train, test = train.to("cpu"), None if test is None else test.to("cpu")
-    drawn, prior = (
-        {name: value.cpu() for name, value in draws.items()} for draws in (posterior.draws, prior)
-    )
+    drawn = {name: value.cpu() for name, value in posterior.draws.items()}
 
-    from mirror_ppl.inference.results.export import in_units, to_inference_data
+    from mirror_ppl.inference.results.export import (
+        add_identifiability,
+        in_units,
+        to_inference_data,
+    )
     from mirror_ppl.inference.results.population_file import add_population
 
     pooling = options.pooling if population is None else "known population"
     attributes = _attributes(human, train, options, pooling, seed)
-    data = to_inference_data(train, test, drawn, prior, predicted, attributes)
+    predicted, unidentified = described.predictions, described.identifiability
+    data = to_inference_data(train, test, drawn, described.prior, predicted, attributes)
     newcomer = {}
     if posterior.population is not None:
         newcomer = add_population(data, Pooling(human), posterior.population, attributes, seed)
         newcomer = {"newcomer": summarize_newcomer(newcomer, human.value_names)}
+    if unidentified is not None:
+        add_identifiability(data, unidentified, attributes)
     drawn = in_units(get_domain(train.domain), drawn)
     found = summarize(drawn, train, predicted.scores, human.value_names)
-    for person, engine in zip(found, posterior.engines, strict=True):
+    scenarios = get_domain(train.domain).scenarios
+    for number, (person, engine) in enumerate(zip(found, posterior.engines, strict=True)):
         person["engine"] = engine
-    if posterior.pareto_k is not None:
-        for person, value in zip(found, posterior.pareto_k.tolist(), strict=True):
+        if posterior.pareto_k is not None:
+            value = float(posterior.pareto_k[number])
             person["pareto_k"] = value if isfinite(value) else None
-    if posterior.effective is not None:
-        for person, value in zip(found, posterior.effective.tolist(), strict=True):
-            person["effective_draws"] = round(value, 1)
+        if posterior.effective is not None:
+            person["effective_draws"] = round(float(posterior.effective[number]), 1)
+        if unidentified is not None:
+            person["identifiability"] = unidentified.of(number, scenarios)
+    seconds = dict(posterior.seconds)
+    add_seconds(seconds, described.seconds)
     summary = attributes | {
         "options": asdict(options),
         "contradictions": contradictions.as_data(),
+        "processor_seconds": seconds,
         "people": found,
     }
     summary |= newcomer
     return Fit(human, learned, posterior, data, summary)
+
+
+def parts_of(checkpoint: Path) -> Path:
+    """The folder in which a fit with this checkpoint keeps what is done for some of the people."""
+    return checkpoint.with_name(f"{checkpoint.name}.parts")
 
 
 def _attributes(

@@ -79,6 +79,15 @@ class Identifiability:
     information: Tensor
     information_error: Tensor
 
+    @classmethod
+    def joined(cls, parts: Sequence[Mapping[str, Any]]) -> Identifiability:
+        """Of the people of all parts, of each of which these are the attributes."""
+        tensors = [name for name in parts[0] if name != "sites"]
+        return cls(
+            tuple(parts[0]["sites"]),
+            **{name: torch.cat([part[name] for part in parts]) for name in tensors},
+        )
+
     @property
     def nothing(self) -> bool:
         """Whether of nobody anything is open, or could be told, that is worth telling."""
@@ -114,6 +123,7 @@ def identify(
     population: Population | None = None,
     report: Report = silent,
     rounds: int = 8,
+    first: int = 0,
 ) -> Identifiability | None:
     """What is open about people after a fit.
 
@@ -125,6 +135,7 @@ def identify(
         population: that people are from, if it was the prior.
         report: told of people done.
         rounds: that are played in each scenario; 0 for none.
+        first: number of the first of these people among all.
 
     Returns:
         ``None`` of models in which there is nothing discrete to see, or in which actions depend on
@@ -165,7 +176,9 @@ def identify(
         told = (weights.new_zeros(0),) * 2
         if rounds:
             # Of each person their own worlds, so that averages over people are of many.
-            generator = torch.Generator(weights.device).manual_seed(seed * 1_000_003 + person)
+            generator = torch.Generator(weights.device).manual_seed(
+                seed * 1_000_003 + first + person
+            )
             some, pairs = _represented(weights, generator)
             told = _information(
                 human,

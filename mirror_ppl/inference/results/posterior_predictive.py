@@ -83,6 +83,7 @@ def predict_people(
     draws: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
     seed: int,
     report: Report = silent,
+    first: int = 0,
 ) -> Predictions:
     """Predict what P people do, each action given what was done before it.
 
@@ -95,15 +96,16 @@ def predict_people(
         draws: of implants, from the posterior ``[S, P, 1, ...]`` and the prior ``[S', P, 1, ...]``.
         seed: of predictive draws.
         report: told of people done.
+        first: number of the first of these people among all.
     """
     (train, test), parts = rounds, []
     people = train.num_people
     for some in _groups(people):
         report("predict", some.start, people, "people")
         posterior, prior = (_of_people(own, some) for own in draws)
-        own = _select(train, some)
+        own = train.part(some)
         generators = [
-            torch.Generator().manual_seed(PREDICTIVE_STREAM + seed * 1_000_003 + person)
+            torch.Generator().manual_seed(PREDICTIVE_STREAM + seed * 1_000_003 + first + person)
             for person in some
         ]
         learned = predict_rounds(human, own, posterior).cpu()
@@ -114,7 +116,7 @@ def predict_people(
         )
         del learned
         if test is not None:
-            own = _select(test, some)
+            own = test.part(some)
             found = predict_rounds(human, own, posterior).cpu()
             part = replace(part, held_out=found.exp(), scores=score(found, own.to("cpu")))
         parts.append(part)
@@ -144,7 +146,7 @@ def predict_rounds(
     sizes = {site: len(support) for site, support in perceived_sites(human).items()}
     parts = []
     for some in _groups(rounds.num_people):
-        own, recorded = _of_people(draws, some), _select(rounds, some)
+        own, recorded = _of_people(draws, some), rounds.part(some)
         # Only what some draw sees is looked at: exact views, without screening or merging.
         candidates = [
             combination_number({site: own[site][:, person, 0] for site in sizes}, sizes).unique()
@@ -179,19 +181,6 @@ def _groups(people: int) -> list[range]:
 def _of_people(draws: Mapping[str, Tensor], some: range) -> dict[str, Tensor]:
     """Draws ``[S, P', 1, ...]`` of some people."""
     return {name: value[:, some.start : some.stop] for name, value in draws.items()}
-
-
-def _select(rounds: Demonstrations, some: range) -> Demonstrations:
-    """The rounds of some people, with all the padding, so that shapes are those of everybody."""
-    if len(some) == rounds.num_people:
-        return rounds
-    return Demonstrations.from_variables(
-        rounds.domain,
-        rounds.setting,
-        rounds.people[some.start : some.stop],
-        {name: value[some.start : some.stop] for name, value in rounds.variables().items()},
-        rounds.provenance,
-    )
 
 
 def _drawn(log_probabilities: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
