@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Communicator", "Fit", "HumanModel", "infer", "load_recordings", "worlds"]
 
+KEPT = ("means", "draws")
+"""What may be kept of predictions."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
 """Names of all files that a fit may write."""
 
@@ -60,6 +62,7 @@ class Fit(fitting.Fit):
         posterior: draws ``[S, P, 1, ...]`` by site, and how they came about.
         data: posterior, predictions and recordings as ArviZ ``InferenceData``.
         summary: the numbers that `summary.json` holds.
+        seconds: of processors that it took, by stage.
     """
 
     def __repr__(self) -> str:
@@ -120,8 +123,8 @@ class Fit(fitting.Fit):
                 drawn = {name: picture.content() for name, (picture, _) in pictures.items()}
             with stage("write"):
                 posterior = netcdf_content(self.data)
-        summary = self.summary | told
-        summary["processor_seconds"] = self.summary["processor_seconds"] | seconds
+        spent = {name: round(each, 2) for name, each in (self.seconds | seconds).items()}
+        summary = self.summary | told | {"processor_seconds": spent}
         contents = {
             folder / "posterior.nc": posterior,
             **{folder / name: content for name, content in drawn.items()},
@@ -275,7 +278,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     device: str = "cpu",
     jobs: int | None = 1,
     scheduler: str | None = None,
-    every_draw: bool = False,
+    keep: str = "means",
     report: Report | None = None,
     checkpoint: str | Path | None = None,
 ) -> Fit:
@@ -308,8 +311,8 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             do not depend on it. The engines svi and nuts infer people together, in one process.
         scheduler: address of a Dask cluster that does the work instead, such as
             ``tcp://host:8786``.
-        every_draw: keep predictions of held-out actions under every draw in place of their mean,
-            and all sites of the prior in place of those that are one number a person.
+        keep: of predicted held-out actions, ``means`` over draws or ``draws``; with ``draws`` also
+            all sites of the prior, not only those that are one number a person.
         report: told of progress; shown on stderr if that is a terminal unless given.
         checkpoint: file to continue from; written on the way, and kept.
 
@@ -355,7 +358,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             population,
             workers,
             explore,
-            every_draw,
+            require_known(keep, "keep", KEPT) == "draws",
         )
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)

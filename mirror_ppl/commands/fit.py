@@ -86,9 +86,9 @@ class Options:
     many as pay, and one with --device cuda."""
     scheduler: str | None = None
     """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
-    every_draw: bool = False
-    """Keep in posterior.nc the predictions of held-out actions under every draw, not their mean
-    alone, and all sites of the prior."""
+    keep: str = "means"
+    """What posterior.nc keeps of predicted held-out actions: means over draws, or draws (also of
+    all sites of the prior; a larger file)."""
     device: str = "cpu"
     """Where to compute: cpu, cuda or cuda:0."""
 
@@ -114,15 +114,15 @@ def main(options: Options) -> None:
     from mirror_ppl.evaluation.fit_report import show_fit
     from mirror_ppl.face import RESULTS, infer
     from mirror_ppl.files import output_folder
-    from mirror_ppl.inference.results.fitting import parts_of
     from mirror_ppl.inference.svi import SVIOptions
-    from mirror_ppl.inference.workers import Workers
+    from mirror_ppl.inference.workers import Workers, parts_of
 
     recordings = _recordings(options)
     engine = told_engine(options.guide)
     allowed = share(options.allow_contradictions, "--allow-contradictions")
     _require_memory(recordings, options)
-    with output_folder(options.out, (*RESULTS, CHECKPOINT)) as folder, Stages() as stages:
+    results = output_folder(options.out, (*RESULTS, CHECKPOINT), parts=[f"{CHECKPOINT}.parts"])
+    with results as folder, Stages() as stages:
         fit = infer(
             recordings,
             human=options.human_model,
@@ -141,7 +141,7 @@ def main(options: Options) -> None:
             device=options.device,
             jobs=1 if options.jobs is None and options.device != "cpu" else options.jobs,
             scheduler=options.scheduler,
-            every_draw=options.every_draw,
+            keep=options.keep,
             report=stages.report,
             checkpoint=folder / CHECKPOINT,
         )

@@ -27,7 +27,7 @@ from mirror_ppl.inference.amortized_guide import AmortizedGuide, require_network
 from mirror_ppl.inference.engine import Engine, Inferred, Job, rounded
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
-from mirror_ppl.inference.workers import Workers
+from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.likelihood.combinations import require_unread
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.screening import Screening
@@ -133,7 +133,8 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         report: told of progress.
         checkpoint: a file that is written now and then and continued from if it exists, and what
             identifies this run (a checkpoint of another run is refused); not of ``nuts``. Of many
-            people there are more, whose names begin alike.
+            people there are more, whose names begin alike. Engines that infer each person by
+            themselves keep parts of the people in a folder, and leave those of other runs alone.
         population: that the people are from, if it is known from others: their prior, then.
         workers: who does it, of engines that infer each person by themselves.
 
@@ -154,8 +155,10 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         require_network_of(human, require_kind(network, AmortizedGuide, "network"))
     if population is not None:
         require_kind(population, Population, "population")
+    workers = replace(workers, report=report)
     if checkpoint is not None:
         checkpoint = as_path(checkpoint[0], "checkpoint"), checkpoint[1]
+        workers = replace(workers, folder=parts_of(checkpoint[0]))
     engine = ENGINES[options.engine]
     if demonstrations.measurements:
         require_measurable(human, demonstrations)

@@ -19,6 +19,11 @@ PEOPLE_OF_A_PROCESS = 10
 """People that are worth the seconds in which a further process starts."""
 
 
+def parts_of(checkpoint: Path) -> Path:
+    """The folder in which a run with this checkpoint keeps what is done for some of the people."""
+    return checkpoint.with_name(f"{checkpoint.name}.parts")
+
+
 @dataclass(frozen=True)
 class People:
     """Some of the people, one after the other.

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from mirror_ppl.errors import HumanModelError
 
-
 BELIEVING = "sees, perceive, evidence or believe"
 """Methods that lead to beliefs."""
 

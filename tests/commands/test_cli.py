@@ -65,6 +65,9 @@ def summary_of(folder):
     """The summary of results but for their times."""
     summary = json.loads((folder / "summary.json").read_text())
     assert summary.pop("seconds") > 0
+    spent = summary.pop("processor_seconds")
+    assert {"predict", "identify", "draw", "write"} <= set(spent)
+    assert all(each >= 0 for each in spent.values())
     return summary
 
 
@@ -313,7 +316,7 @@ def test_fit_refuses_what_cannot_be_done(folder, tmp_path, monkeypatch, capsys, 
 
 def test_fit_refuses_a_checkpoint_of_something_else(folder, tmp_path, capsys):
     (tmp_path / "fit.checkpoint").write_bytes(b"nonsense")
-    args = "--demos", folder / "some.nc", "--out", tmp_path, "--steps", 2
+    args = "--demos", folder / "some.nc", "--out", tmp_path, "--guide", "svi", "--steps", 2
     capsys.readouterr()
     assert command(fit, *args) == 2
     errors = [line for line in capsys.readouterr().err.splitlines() if "error" in line]

@@ -7,7 +7,7 @@ import torch
 
 import mirror_ppl
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference import automatic, importance
+from mirror_ppl.inference import automatic, workers
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import AmortizedOptions
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, reference_places
@@ -86,7 +86,7 @@ def test_each_person_is_judged_alone(toy, recordings, network, monkeypatch):
 def test_a_run_that_goes_on_knows_who_was_inferred_how(
     toy, recordings, network, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(importance, "SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    monkeypatch.setattr(workers, "PART", 1)
     checkpoint = (tmp_path / "checkpoint", "this run")
 
     def stop(name, done, total, message):

@@ -18,7 +18,7 @@ from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.results.description import Description, describe
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
-from mirror_ppl.inference.workers import Workers
+from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
@@ -44,6 +44,7 @@ class Fit:
         posterior: draws, and how they came about.
         data: the posterior and predictions as ArviZ ``InferenceData``.
         summary: what ``summary.json`` holds.
+        seconds: of processors that it took, by stage.
     """
 
     human: HumanModel
@@ -51,6 +52,7 @@ class Fit:
     posterior: Inferred
     data: az.InferenceData
     summary: dict[str, Any]
+    seconds: dict[str, float]
 
 
 def split_rounds(
@@ -185,16 +187,10 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     summary = attributes | {
         "options": asdict(options),
         "contradictions": contradictions.as_data(),
-        "processor_seconds": seconds,
         "people": found,
     }
     summary |= newcomer
-    return Fit(human, learned, posterior, data, summary)
-
-
-def parts_of(checkpoint: Path) -> Path:
-    """The folder in which a fit with this checkpoint keeps what is done for some of the people."""
-    return checkpoint.with_name(f"{checkpoint.name}.parts")
+    return Fit(human, learned, posterior, data, summary, seconds)
 
 
 def _attributes(

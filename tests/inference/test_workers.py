@@ -1,0 +1,134 @@
+"""People worked on part by part: whoever does it, and whoever else there is, nothing changes."""
+
+import numpy as np
+import pytest
+
+import mirror_ppl
+from mirror_ppl.errors import InputError
+from mirror_ppl.inference.workers import PART, PEOPLE_OF_A_PROCESS, People, Workers
+from mirror_ppl.timing import clocked, stage
+
+PEOPLE = 6
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return mirror_ppl.load_recordings(population="diverse").part(range(PEOPLE))
+
+
+@pytest.fixture(scope="module")
+def fit(recordings):
+    return mirror_ppl.infer(recordings, draws=20, train_rounds=3, explore=1)
+
+
+def assert_same(data, other, tolerance=0.0):
+    assert data.groups() == other.groups()
+    for group in data.groups():
+        assert set(data[group].data_vars) == set(other[group].data_vars)
+        for name, values in data[group].data_vars.items():
+            np.testing.assert_allclose(
+                values.values, other[group][name].values, rtol=0, atol=tolerance, equal_nan=True
+            )
+
+
+def test_processes_make_no_difference(fit, recordings):
+    assert PEOPLE > PART  # or there would be one part
+    shared = mirror_ppl.infer(recordings, draws=20, train_rounds=3, explore=1, jobs=2)
+    assert_same(shared.data, fit.data)
+    assert shared.summary == fit.summary
+    assert set(shared.seconds) == {"compile", "infer", "predict", "identify"}
+
+
+def test_what_is_kept_makes_no_difference(fit, recordings, tmp_path):
+    told = []
+
+    def stop(name, done, total, message):
+        told.append((name, done, total))
+        if (name, done) == ("infer", PART):
+            raise KeyboardInterrupt
+
+    options = {"draws": 20, "train_rounds": 3, "explore": 1, "checkpoint": tmp_path / "c"}
+    with pytest.raises(KeyboardInterrupt):
+        mirror_ppl.infer(recordings, report=stop, **options)
+    assert told == [("infer", 0, PEOPLE), ("infer", PART, PEOPLE)]
+    told.clear()
+    again = mirror_ppl.infer(recordings, report=lambda *one: told.append(one[:3]), **options)
+    assert told[0] == ("infer", PART, PEOPLE)
+    assert_same(again.data, fit.data)
+    # A damaged part counts as missing.
+    folder = tmp_path / "c.parts"
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[:-100])
+    assert_same(mirror_ppl.infer(recordings, **options).data, fit.data)
+    Workers(folder=folder).clean()
+    assert not folder.exists()
+
+
+def test_nobody_depends_on_who_else_there_is(fit, recordings):
+    """Of the first people; seeds of later ones are by their number."""
+    some = mirror_ppl.infer(recordings.part(range(3)), draws=20, train_rounds=3, explore=1)
+    for name, values in some.data.posterior.data_vars.items():
+        own = fit.data.posterior[name].isel(person=slice(0, 3))
+        np.testing.assert_array_equal(values, own)
+    for group in ("predictions", "posterior_predictive", "prior", "identifiability"):
+        for name, values in some.data[group].data_vars.items():
+            if "person" in values.dims:
+                own = fit.data[group][name].isel(person=slice(0, 3))
+                np.testing.assert_allclose(values, own, rtol=0, atol=1e-5, equal_nan=True)
+
+
+def test_weights_have_eight_bits(fit):
+    bits = fit.data.posterior["residual_in"].values.view(np.uint32)
+    assert not (bits & 0xFFFF).any()
+    assert (fit.data.posterior["consistency"].values.view(np.uint32) & 0xFFFF).any()
+
+
+def test_all_draws_are_kept_if_asked_for(fit, recordings):
+    every = mirror_ppl.infer(recordings, draws=20, train_rounds=3, explore=1, keep="draws")
+    probability = every.data.predictions["action_probability"]
+    assert probability.sizes["draw"] == 20
+    mean = fit.data.predictions["action_probability"]
+    assert mean.sizes["draw"] == 1
+    np.testing.assert_allclose(probability.mean("draw"), mean.isel(draw=0), atol=1e-6)
+    assert "residual_in" in every.data.prior and "residual_in" not in fit.data.prior
+
+
+@pytest.mark.parametrize("what", ["", "all", 3])
+def test_what_is_kept_has_a_name(what, recordings):
+    with pytest.raises(mirror_ppl.errors.MirrorError, match="keep"):
+        mirror_ppl.infer(recordings, keep=what)
+
+
+def test_processes_are_as_many_as_pay(monkeypatch):
+    monkeypatch.setattr("joblib.cpu_count", lambda: 4)
+    found = [
+        Workers(None)._processes(people)
+        for people in (1, PEOPLE_OF_A_PROCESS, PEOPLE_OF_A_PROCESS + 1, 1000)
+    ]
+    assert found == [1, 1, 2, 4]
+    assert Workers(7)._processes(1) == 7
+    with pytest.raises(InputError, match="jobs must be at least 1, or -1"):
+        Workers(0)
+
+
+def test_parts_come_in_order_with_what_they_need():
+    told = []
+    workers = Workers(report=lambda *one: told.append(one))
+    found = workers.run("count", 10, lambda given: {"is": given}, lambda people: people.last)
+    assert found == [{"is": 4}, {"is": 8}, {"is": 10}]
+    assert [one[1] for one in told] == [0, 4, 8, 10]
+    assert People(4, 8).label == "people 5 to 8"
+
+
+def test_stages_within_others_count_once():
+    with clocked() as seconds:
+        with stage("outer"):
+            with stage("inner"):
+                pass
+            with stage("inner"):
+                pass
+        assert set(seconds) == {"outer", "inner"}
+    before = dict(seconds)
+    with stage("nobody measures"):
+        pass
+    assert seconds == before
