@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
 from mirror_ppl.domains.driving import ROAD_END
@@ -86,10 +87,9 @@ def _draw(ax: Axes, seen: xr.DataArray) -> None:
     for distance, lane in CARS:
         draw_car(ax, distance, lane + 0.5, RED)
     draw_car(ax)
-    for (lane, cell), sees in np.ndenumerate(seen.values):
-        if not sees:
-            here = (cell - end, float(lane))
-            ax.add_patch(Rectangle(here, 1, 1, fc=DARK, ec=DARK, lw=0.4, zorder=8))
+    # One artist for all cells: a hundred roads have thousands of them.
+    dark = [Rectangle((cell - end, lane), 1, 1) for lane, cell in np.argwhere(seen.values == 0)]
+    ax.add_collection(PatchCollection(dark, fc=DARK, ec=DARK, lw=0.4, zorder=8))
     ax.set(xlim=(-end, end), ylim=(0, 2), xticks=[], yticks=[])
     ax.set_aspect(1.4)
     for spine in ax.spines.values():

@@ -213,7 +213,12 @@ def test_samples_are_drawn_beside_what_is_really_seen(data):
     titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
     assert titles == ["what they see", *(f"sample {number}" for number in range(1, 5))]
     black = [
-        sum(patch.get_facecolor()[:3] == (0, 0, 0) for patch in ax.patches) for ax in figure.axes
+        sum(
+            len(cells.get_paths())
+            for cells in ax.collections
+            if tuple(cells.get_facecolor()[0][:3]) == (0, 0, 0)
+        )
+        for ax in figure.axes
     ]
     own = [int(50 - one.sum()) for one in seen_of_draws(data, "anna").values]
     # Of the four draws in order; ben sees everything, and of him the truth is not known.
@@ -224,8 +229,8 @@ def test_samples_are_drawn_beside_what_is_really_seen(data):
 
 
 def test_outlines_are_drawn_where_the_truth_is_known(data):
-    assert len(plot_sight(data, "anna").collections) == 2  # a line and its dark edge
-    assert len(plot_sight(data, "ben").collections) == 0
+    known, unknown = (len(plot_sight(data, name).collections) for name in ("anna", "ben"))
+    assert known - unknown == 2  # a line and its dark edge
 
 
 def test_explanation_tells_of_the_truth_only_where_there_is_one(rng):
