@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
@@ -45,18 +46,21 @@ class Inferred:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def rounded(draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def narrowed(draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Draws ``[S, P, 1, ...]`` with eight significant bits of weights, which are most of them.
 
     Weights are sites of more than one number a person. The rest of their bits says nothing beside
     the spread of the posterior, and takes two thirds of a file.
     """
     return {
-        name: value.bfloat16().to(value.dtype)
-        if value.is_floating_point() and value.dim() > BATCH
-        else value
+        name: value.bfloat16() if value.is_floating_point() and value.dim() > BATCH else value
         for name, value in draws.items()
     }
+
+
+def widened(value: Tensor, like: Tensor) -> Tensor:
+    """Narrowed draws of a site as its human model has them, whose parameters are like this one."""
+    return value.to(like.dtype) if value.dtype is torch.bfloat16 else value
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.inference import amortized, automatic, importance, nuts, svi
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, require_network_of
-from mirror_ppl.inference.engine import Engine, Inferred, Job, rounded
+from mirror_ppl.inference.engine import Engine, Inferred, Job, narrowed, widened
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.inference.workers import Workers, parts_of
@@ -211,10 +211,13 @@ def _each(engine: Engine, job: Job) -> Inferred:
             f"{what} needs its network, not None; see load_guide, and train --what guide for one "
             "of this human model"
         )
-    found = _in_parts(engine, job) if engine.each_alone else engine.run(job)
-    if not found.engines:
-        found = replace(found, engines=(engine.name,) * job.rounds.num_people)
-    return replace(found, draws=rounded(found.draws))
+    if engine.each_alone:
+        return _in_parts(engine, job)
+    found = engine.run(job)
+    found = replace(found, engines=(engine.name,) * job.rounds.num_people)
+    like = next(job.human.parameters())
+    draws = {name: widened(value, like) for name, value in narrowed(found.draws).items()}
+    return replace(found, draws=draws)
 
 
 def _in_parts(engine: Engine, job: Job) -> Inferred:
@@ -223,8 +226,10 @@ def _in_parts(engine: Engine, job: Job) -> Inferred:
     parts = job.workers.run(
         "infer", job.rounds.num_people, partial(_infer_part, engine), job.part, identity
     )
+    like = next(job.human.parameters())
+    # Site after site, and narrow until then: of many people there is only just room for it.
     draws = {
-        name: torch.cat([part["draws"].pop(name) for part in parts], 1)
+        name: widened(torch.cat([part["draws"].pop(name) for part in parts], 1), like)
         for name in list(parts[0]["draws"])
     }
     seconds: dict[str, float] = {}
@@ -242,7 +247,7 @@ def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
     with clocked() as seconds, stage("infer"):
         found = engine.run(part)
     return {
-        "draws": dict(found.draws),
+        "draws": narrowed(found.draws),
         "pareto_k": found.pareto_k,
         "engines": list(found.engines) or [engine.name] * part.rounds.num_people,
         "seconds": seconds,
