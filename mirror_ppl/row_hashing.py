@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
 
+@lru_cache(maxsize=1024)
 def random_keys(number: int, device: torch.device, kind: int = 0) -> Tensor:
     """Random 62-bit keys ``[number]``: sums of different sets of them differ.
 

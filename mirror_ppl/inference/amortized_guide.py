@@ -22,9 +22,8 @@ from mirror_ppl.inference.margins import (
 )
 from mirror_ppl.inference.mixture import GaussianMixture
 from mirror_ppl.likelihood.screening import Screening
-from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.prior import Draws, scalar_sites, unconstrained
+from mirror_ppl.models.prior import Draws, draw_prior, scalar_sites, unconstrained
 
 WAYS = 64
 COMPONENTS = 4
@@ -186,8 +185,7 @@ def sample_scalars(
 
 def reference_places(human: HumanModel, number: int = WAYS) -> Tensor:
     """Places ``[W, D]`` of ways from the prior; always the same of a human model."""
-    builder = ViewTableBuilder(human, Screening(policies=number))
-    return unconstrained(scalar_sites(human), builder.draw_policies())
+    return unconstrained(scalar_sites(human), draw_prior(human, 1, number, Screening.seed))
 
 
 def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:

@@ -16,7 +16,7 @@ from typing import Any, cast
 import pyro
 import torch
 from pyro import poutine
-from pyro.infer import SVI, config_enumerate
+from pyro.infer import SVI, TraceEnum_ELBO, config_enumerate
 from pyro.infer.autoguide import AutoGuide, AutoNormal, init_to_median
 from pyro.infer.autoguide.utils import deep_setattr
 from pyro.nn import PyroParam
@@ -31,12 +31,13 @@ from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.marginal_elbo import elbo_of
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
-from mirror_ppl.likelihood.densities import PLATES
+from mirror_ppl.likelihood.densities import PLATES, log_prob
 from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import combination_scores
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.prior import Draws, sample_sites
+from mirror_ppl.models.sites import sample_nodes
 from mirror_ppl.progress import Report, silent
 
 PRUNING_DRAWS = 4
@@ -192,13 +193,16 @@ def optimize(
         },
     )
     program = config_enumerate(compiled.program, "parallel")
-    svi = SVI(program, guide, optimizer, elbo_of(compiled))
+    elbo = elbo_of(compiled)
+    if isinstance(elbo, TraceEnum_ELBO):
+        _refuse_scales(compiled)
+    svi = SVI(program, guide, optimizer, elbo)
     losses: list[float] = []
     if checkpoint is not None and checkpoint[0].exists():
         losses = _restore(*checkpoint, cast(AutoGuide, guide), optimizer, compiled)
     while len(losses) < options.steps:
         # What is wrong with a model shows at the first step; checking all of them costs a third.
-        with pyro.validation_enabled(not losses), _one_scale(compiled):
+        with pyro.validation_enabled(not losses):
             losses.append(cast(float, svi.step()))
         optimizer.step()
         report("fit", len(losses), options.steps, f"negative ELBO {losses[-1]:.1f}")
@@ -211,19 +215,25 @@ def optimize(
     return losses
 
 
-@contextmanager
-def _one_scale(compiled: Compiled) -> Iterator[None]:
-    """Say in a line which sites Pyro cannot sum out together."""
-    try:
-        yield
-    except ValueError as error:
-        if "common poutine.scale" not in str(error):
-            raise
-        raise HumanModelError(
-            f"{type(compiled.human).__name__}.model scales some of its discrete sites, or what "
-            "depends on them, and not others: the engine svi (Pyro's TraceEnum_ELBO) cannot sum "
-            "them out; the engine nuts can"
-        ) from error
+@torch.no_grad()
+def _refuse_scales(compiled: Compiled) -> None:
+    """Refuse scales around what is summed out: Pyro's TraceEnum_ELBO takes them out of the sum."""
+    program = cast(Callable[[], None], config_enumerate(compiled.program, "parallel"))
+    with (
+        torch.random.fork_rng(devices=[]),
+        poutine.block(),
+        poutine.enum(first_available_dim=-1 - PLATES),
+        poutine.trace() as trace,
+    ):
+        program()
+    for name, node in sample_nodes(trace.trace).items():
+        plain = isinstance(node["scale"], (int, float)) and node["scale"] == 1
+        if not plain and log_prob(node).dim() > PLATES:
+            raise HumanModelError(
+                f'{type(compiled.human).__name__} scales "{name}", which is discrete or depends on '
+                "discrete sites: the engine svi (Pyro's TraceEnum_ELBO) cannot sum them out; the "
+                "engine nuts can"
+            )
 
 
 @torch.no_grad()

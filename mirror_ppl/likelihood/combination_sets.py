@@ -16,7 +16,13 @@ from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.view_table import NO_VIEW, ViewTable
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import distinct_rows
+
+TRIED = 32
+"""Draws of other implants under which priors of combinations are compared,"""
+COMPARED = 2048
+"""of so many combinations, some of all."""
 
 
 @torch.no_grad()
@@ -34,6 +40,16 @@ def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
             own = {name} & found.latent
             if (parents | own) - grid.keys():
                 return None
+    others = draw_prior(human, 1, TRIED, 0)
+    policy = {name: value for name, value in others.items() if name not in grid}
+    number = len(next(iter(grid.values()), (0,)))
+    order = torch.randperm(number, generator=torch.Generator().manual_seed(0))
+    some = order[:COMPARED].to(next(human.parameters()).device)
+    few = {name: value[some] for name, value in grid.items()}
+    tried = log_priors(human, few, policy, 1)[:, 0]
+    # Provenance is lost where parts of a tensor are assigned.
+    if bool((tried != tried[:1]).any()):
+        return None
     return log_priors(human, grid, {}, 1)[0, 0]
 
 

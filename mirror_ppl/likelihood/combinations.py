@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from math import prod
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import pyro
 import torch
@@ -21,7 +22,7 @@ from mirror_ppl.likelihood.densities import (
     log_prob,
     prior_nodes,
 )
-from mirror_ppl.models.dependencies import dependencies
+from mirror_ppl.models.dependencies import Sites, dependencies
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
@@ -63,25 +64,18 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of those discrete sites that ``perceive`` reads, in the program's order.
 
     Raises:
-        HumanModelError: ``perceive`` reads a site that cannot be enumerated, or there are too many
-            combinations of values.
+        HumanModelError: ``perceive`` reads a site that cannot be enumerated, one whose values are
+            not 0, 1 and so on, or there are too many combinations of values.
     """
     supports = discrete_sites(human)
-    domain = human.domain
-    device = next(human.parameters()).device
-    state = domain.initial(1, torch.Generator(device).manual_seed(0))
-    observation = domain.observe(state)
-    told = {
-        m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=device)
-        for m in domain.modalities
-    }
-    latents = attention_sites(human)
-    implants = Readable({name: support[:1] for name, support in (supports | latents).items()})
-    knowledge: Any = domain.nothing_known(1, device=device)
-    with WithoutSites(BELIEVING):
-        for step in range(domain.horizon):
-            _, knowledge = human.perceive(implants, knowledge, observation, told, step)
-    supports = {name: support for name, support in supports.items() if name in implants.read}
+    others = unread_sites(human, supports)
+    supports = {name: support for name, support in supports.items() if name not in others}
+    for name, support in supports.items():
+        if not torch.equal(support.long(), torch.arange(len(support), device=support.device)):
+            raise HumanModelError(
+                f'perceive() reads "{name}", whose values are not 0, 1 and so on; sample a place '
+                "in a list of its values"
+            )
     number = prod(len(support) for support in supports.values())
     if number > MAX_COMBINATIONS:
         raise HumanModelError(
@@ -89,6 +83,48 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
             f"at most {MAX_COMBINATIONS} can be marginalized"
         )
     return supports
+
+
+_unread: WeakKeyDictionary[HumanModel, tuple[Sites, Sites]] = WeakKeyDictionary()
+
+
+def unread_sites(human: HumanModel, supports: Mapping[str, Tensor] | None = None) -> Sites:
+    """Those discrete sites of the prior that ``perceive`` does not read, in rounds of some kinds.
+
+    Args:
+        human: the model of people.
+        supports: of all discrete sites; those for which this was found last unless given.
+
+    Raises:
+        HumanModelError: ``perceive`` reads a site that cannot be enumerated.
+    """
+    known = _unread.get(human)
+    if known is None or (supports is not None and known[0] != frozenset(supports)):
+        supports = discrete_sites(human) if supports is None else supports
+        names = frozenset(supports)
+        known = _unread[human] = names, names - _read(human, supports)
+    return known[1]
+
+
+def _read(human: HumanModel, supports: Mapping[str, Tensor]) -> set[str]:
+    """Sites that ``perceive`` reads, where nothing is communicated and where all that can be is."""
+    domain, device = human.domain, next(human.parameters()).device
+    sites = {**supports, **attention_sites(human)}
+    implants = Readable({name: support[:1] for name, support in sites.items()})
+    with WithoutSites(BELIEVING):
+        for telling in (False, True):
+            state = domain.initial(1, torch.Generator(device).manual_seed(0))
+            knowledge: Any = domain.nothing_known(1, device=device)
+            for step in range(domain.horizon):
+                now = domain.observe(state)
+                told = {
+                    name: mask if telling else torch.zeros_like(mask)
+                    for name, mask in domain.communicable(now).items()
+                }
+                _, knowledge = human.perceive(implants, knowledge, now, told, step)
+                action = torch.full((1,), step % len(domain.actions), device=device)
+                state = domain.transition(state, action)
+    return implants.read
 
 
 def require_unread(human: HumanModel, names: Iterable[str]) -> None:

@@ -16,10 +16,11 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
 from mirror_ppl.errors import HumanModelError, MirrorError
+from mirror_ppl.likelihood.agreement import check_agreement
 from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
-from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.models.human import HumanModel, Implants, has_own_program
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.user_code import describe
 
@@ -69,6 +70,7 @@ def check_contract(human: HumanModel) -> None:
                 raise HumanModelError(
                     f"prior returned {type(implants).__name__}, expected a dict of sites by name"
                 )
+            _check_returned("prior", implants, latent_sites(trace.trace))
             method = "round_latents"
             latents = _round_latents(human, implants, people)
             for name in set(latents) & set(latent_sites(trace.trace)):
@@ -84,7 +86,7 @@ def check_contract(human: HumanModel) -> None:
             for step, now in enumerate(observed):
                 with WithoutSites(BELIEVING):
                     method = "perceive"
-                    readable = Readable(discrete | latents)
+                    readable = Readable(discrete | latents, implants.keys())
                     view, knowledge = human.perceive(readable, knowledge, now, told, step)
                     method = "evidence"
                     evidence = human.evidence(view, now)
@@ -104,6 +106,9 @@ def check_contract(human: HumanModel) -> None:
         if human.chained:
             check_spans_hold(human, {name: value[:1] for name, value in discrete.items()})
         _check_sites(trace.trace, people)
+        if not has_own_program(human):
+            method = "model"
+            check_agreement(human)
     except MirrorError:
         raise
     except (Exception, SystemExit) as error:
@@ -122,6 +127,7 @@ def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
     for name in latent_sites(trace.trace):
         raise HumanModelError(f'act samples "{name}" at every step; sample it in prior')
     _refuse_parameters(trace.trace)
+    _refuse_plates(trace.trace)
     expected = (len(belief), 1, len(human.domain.actions))
     if tuple(found.shape[-3:]) != expected:
         raise HumanModelError(
@@ -144,6 +150,7 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
         raise HumanModelError(
             "round_latents has to return a dict of the sites that it samples, by name"
         )
+    _check_returned("round_latents", returned, sites)
     for name, site in trace.trace.nodes.items():
         if not sites and site["type"] == "sample" and not site_is_subsample(site):
             raise HumanModelError(
@@ -151,6 +158,7 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
                 "into prior"
             )
     _refuse_parameters(trace.trace)
+    _refuse_plates(trace.trace)
     for name, site in sites.items():
         if not site["fn"].support.is_discrete:
             raise HumanModelError(f'"{name}" of round_latents is not discrete')
@@ -184,9 +192,7 @@ def _refuse_parameters(trace: poutine.Trace) -> None:
             raise HumanModelError(f'"{name}" is a pyro.param; sample it, so that it has a prior')
 
 
-def _check_sites(trace: poutine.Trace, people: int) -> None:
-    """Refuse what could be sampled, but not inferred."""
-    _refuse_parameters(trace)
+def _refuse_plates(trace: poutine.Trace) -> None:
     for name, site in sample_nodes(trace).items():
         for frame in site["cond_indep_stack"]:
             if frame.dim < -PLATES:
@@ -194,7 +200,30 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
                     f'"{name}" is in the plate "{frame.name}" at dimension {frame.dim}, which '
                     "draws of people take; give its distribution .to_event(1) in place of a plate"
                 )
+
+
+def _check_returned(method: str, returned: Mapping[str, Any], sites: Mapping[str, Any]) -> None:
+    """Refuse values under the name of a site that are not its own: engines go by the sites."""
+    for name in returned:
+        if name in sites:
+            own = torch.as_tensor(sites[name]["value"])
+            value = torch.as_tensor(returned[name])
+            if not torch.equal(*torch.broadcast_tensors(value, own)):
+                raise HumanModelError(
+                    f'{method} returns other values of "{name}" than those that it sampled; sample '
+                    "what it returns, or let the method that reads it change it"
+                )
+
+
+def _check_sites(trace: poutine.Trace, people: int) -> None:
+    """Refuse what could be sampled, but not inferred."""
+    _refuse_parameters(trace)
+    _refuse_plates(trace)
+    for name, site in sample_nodes(trace).items():
         if site["is_observed"]:
+            value = torch.as_tensor(site["value"])
+            if value.numel():  # a factor has none
+                check_plates(name, value[(..., *(0,) * site["fn"].event_dim)], people)
             check_plates(name, log_prob(site), people)
     for name, site in latent_sites(trace).items():
         fn = site["fn"]
@@ -207,4 +236,10 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
             raise HumanModelError(
                 f'"{name}" has batch shape {tuple(fn.batch_shape)}, expected ({people}, 1) for '
                 f"{people} people; use .to_event() for several numbers a person"
+            )
+        bounds = [bound for bound in vars(fn.support).values() if torch.is_tensor(bound)]
+        if not fn.event_dim and any(bool((bound != bound.flatten()[0]).any()) for bound in bounds):
+            raise HumanModelError(
+                f'what "{name}" can be depends on another site; sample it from 0 to 1, say, and '
+                "stretch it where it is read"
             )

@@ -11,10 +11,12 @@ from torch.nn.functional import pad
 
 from mirror_ppl.domains import Observation, Visibility
 from mirror_ppl.likelihood.chain import Chain
+from mirror_ppl.likelihood.combinations import unread_sites
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.belief_tracking import CHUNK, BeliefState, Memory, Transition
 from mirror_ppl.models.handlers import WithoutSites
 from mirror_ppl.models.human import HumanModel, at_step, messages_at
+from mirror_ppl.models.sites import OnlyRead
 from mirror_ppl.row_hashing import distinct_rows
 
 
@@ -233,6 +235,7 @@ def moments_along(
     number, action_count = len(state.belief), len(state.human.domain.actions)
     moments = torch.full((number, rounds.actions.shape[1]), NO_VIEW, device=row.device)
     several, transitions = len(rounds) > 1, []
+    implants = OnlyRead(implants, unread_sites(state.human))
     for step in steps:
         before = torch.full_like(row, action_count)
         if step:

@@ -34,6 +34,7 @@ from mirror_ppl.likelihood.densities import (
     log_weighted_latents,
     require_compilable,
 )
+from mirror_ppl.likelihood.policies import draw_policies
 from mirror_ppl.likelihood.round_views import (
     ManyViews,
     Rounds,
@@ -45,6 +46,7 @@ from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.belief_tracking import CHUNK
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
@@ -81,7 +83,7 @@ class ViewTableBuilder:
         sizes: number of values of each of these sites.
         alive: numbers of the combinations that are left.
         score: log-likelihood ``[policies, M]`` of each of them under each policy.
-        policies: these policies, see :meth:`draw_policies`; what is likely, if that is known.
+        policies: these policies, see :func:`draw_policies`; what is likely, if that is known.
     """
 
     def __init__(
@@ -102,12 +104,17 @@ class ViewTableBuilder:
         self.alive = torch.arange(prod(self.sizes), device=device)
         if candidates is not None:
             self.alive = candidates
+        self.policies: dict[str, Tensor] = {}
+        if screening is not None and likely is not None:
+            some = torch.arange(screening.policies, device=device)
+            self.policies = {name: value[some % len(value)] for name, value in likely.items()}
+        elif screening is not None:
+            found = draw_policies(human, self.grid, screening.policies, screening.seed)
+            self.policies = found or {}
+            if found is None:  # nobody is known under whom combinations could be given up
+                self.screening = screening = None
         policies = 0 if screening is None else screening.policies
         self.score = torch.zeros(policies, prod(self.sizes), device=device)
-        self.policies: dict[str, Tensor] = {}
-        if likely is not None and screening is not None:
-            some = torch.arange(policies, device=device) % len(next(iter(likely.values())))
-            self.policies = {name: value[some] for name, value in likely.items()}
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
@@ -116,7 +123,7 @@ class ViewTableBuilder:
         if human.has_round_latents:
             require_own_attention(human, supports)
         if human.has_round_latents and not human.chained:
-            known = {} if likely is not None else self.draw_policies()
+            known = {} if likely is not None else self.policies
             anybody = known or draw_prior(human, 1, PROPOSING_POLICIES, 0)
             self._proposal = Proposal(human, anybody, likely, values)
 
@@ -218,7 +225,7 @@ class ViewTableBuilder:
         if self.screening is not None:
             likelihoods = self._log_likelihoods(views)[:, None]
             together = Chain.one_after_another(chains, [len(part.moments) for _, part in parts])
-            with self._deciding(self.draw_policies()):
+            with self._deciding(self.policies):
                 chances = together.log_chances(self.human, self.human.prior(), len(rounds))
             found = together.marginal(likelihoods, chances)[:, 0]
             self._screen(found.unflatten(-1, (len(rounds), -1)).sum(1), self.screening)
@@ -238,7 +245,11 @@ class ViewTableBuilder:
         score = self.score[:, alive] + found
         self.score[:, alive] = score
         # With their prior: what it says, by a factor or an observed site too, may decide.
-        best = (score + self.log_prior[:, alive]).amax(0)
+        joint = score + self.log_prior[:, alive]
+        if dependencies(self.human).adds_to_actions:
+            # What is recorded besides actions may tell of somebody whom no policy is like.
+            joint = joint - joint.amax(-1, keepdim=True)
+        best = joint.amax(0)
         self.alive = alive[best >= best.max() - screening.margin]
 
     def table(self) -> ViewTable:
@@ -326,9 +337,7 @@ class ViewTableBuilder:
     @cached_property
     def log_prior(self) -> Tensor:
         """Log prior probability of each combination under each policy, ``[policies, M]``."""
-        others = {
-            name: policy for name, policy in self.draw_policies().items() if name not in self.grid
-        }
+        others = {name: policy for name, policy in self.policies.items() if name not in self.grid}
         return log_priors(self.human, self.grid, others, 1)[:, 0]
 
     def _merged(self, views: ManyViews, screening: Screening) -> tuple[ManyViews, Tensor]:
@@ -336,8 +345,7 @@ class ViewTableBuilder:
         if not len(views.acted):  # of padding alone
             return views, torch.arange(len(views.moments), device=views.moments.device)
         policies = {
-            name: policy[: screening.merge_policies]
-            for name, policy in self.draw_policies().items()
+            name: policy[: screening.merge_policies] for name, policy in self.policies.items()
         }
         keys = [
             torch.round(self._of_moments(policies, views, some) / screening.resolution).long().T
@@ -366,23 +374,17 @@ class ViewTableBuilder:
             return self.score.new_zeros(len(self.score), len(views.moments))
         moments = views.moments[None]
         along = Sums.of(moments, moments != NO_VIEW, len(views.acted))
-        return along(self._of_moments(self.draw_policies(), views)[:, None])[:, 0]
+        return along(self._of_moments(self.policies, views)[:, None])[:, 0]
 
     def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
         """Log joint ``[policies, U, G]`` of actions and attention, of their likelihoods."""
         values = {name: value[None, None] for name, value in attended.values.items()}
-        with self._deciding(self.draw_policies()):
+        with self._deciding(self.policies):
             implants = self.human.prior()
             chances = log_weighted_latents(
                 self.human, implants, values, attended.log_weights[None, None], attended.covariates
             )
         return likelihoods + chances[:, 0]
-
-    def draw_policies(self) -> dict[str, Tensor]:
-        """The policies, ``[policies, 1, 1, ...]``; always the same."""
-        if not self.policies and self.screening is not None:
-            self.policies = draw_prior(self.human, 1, self.screening.policies, self.screening.seed)
-        return self.policies
 
     def _of_moments(
         self, policies: Mapping[str, Tensor], views: ManyViews, some: Tensor | slice = slice(None)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, RepeatedObservation, Visibility, map_state
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import HumanModel, overrides
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
@@ -68,7 +68,7 @@ class Memory:
     def of_rounds(cls, human: HumanModel, observation: Observation) -> Memory:
         """Of the beginning of rounds with observations ``[R, T, ...]``."""
         symbols = human.domain.symbols(observation)
-        if type(human).evidence is not HumanModel.evidence:
+        if overrides(human, "evidence"):
             symbols = observation  # it may read whatever there is
         rows = torch.cat([as_whole_numbers(value).flatten(2) for value in symbols.values()], -1)
         observed = rows @ random_keys(rows.shape[-1], rows.device, 1)

@@ -25,7 +25,7 @@ from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.human import ACTION, HumanModel
 from mirror_ppl.models.sites import latent_sites, latent_values, sample_nodes
 
 Sites = frozenset[str]
@@ -53,12 +53,15 @@ class Dependencies:
         round_latents: of each site of ``round_latents``, sites of ``prior`` and others of it.
         actions: of the action of a step, and of what else ``act`` observes or adds, given beliefs.
         latent: the sites of ``prior`` that are sampled.
+        adds_to_actions: whether ``act`` says more than how probable actions are: by a factor, an
+            observed site, a scale or a mask.
     """
 
     prior: Mapping[str, Sites]
     round_latents: Mapping[str, Sites]
     actions: Sites
     latent: Sites
+    adds_to_actions: bool
 
 
 _found: WeakKeyDictionary[HumanModel, Dependencies] = WeakKeyDictionary()
@@ -101,7 +104,14 @@ def _run(human: HumanModel) -> Dependencies:
         {name: parents | of_latents for name, parents in _parents(latents.trace).items()},
         actions | hidden,
         frozenset(sites),
+        any(name != ACTION or _changed(node) for name, node in sample_nodes(act.trace).items()),
     )
+
+
+def _changed(node: Mapping[str, Any]) -> bool:
+    """Whether a scale or a mask is around a node."""
+    plain = isinstance(node["scale"], (int, float)) and node["scale"] == 1
+    return node["mask"] is not None or not plain
 
 
 @contextmanager

@@ -168,7 +168,7 @@ class HumanModel(nn.Module):
     @property
     def chained(self) -> bool:
         """Whether attention is summed out exactly: the model has it, and declares :meth:`spans`."""
-        return self.has_round_latents and type(self).spans is not HumanModel.spans
+        return self.has_round_latents and overrides(self, "spans")
 
     def log_proposal(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
         """How well values of attention explain what was done, as logarithms ``[n]`` by site.
@@ -186,7 +186,7 @@ class HumanModel(nn.Module):
     @cached_property
     def has_round_latents(self) -> bool:
         """Whether something differs from round to round."""
-        if type(self).round_latents is HumanModel.round_latents:
+        if not overrides(self, "round_latents"):
             return False
         with (
             torch.random.fork_rng(devices=[]),
@@ -369,10 +369,12 @@ class HumanModel(nn.Module):
 
 def has_own_program(human: HumanModel) -> bool:
     """Whether a human model overrides the program itself, and not only what it calls."""
-    kind = type(human)
-    of_instance = {"model", "choose"} & vars(human).keys()
-    overrides = kind.model is not HumanModel.model or kind.choose is not HumanModel.choose
-    return overrides or bool(of_instance)
+    return overrides(human, "model") or overrides(human, "choose")
+
+
+def overrides(human: HumanModel, method: str) -> bool:
+    """Whether the class of a human model, or it alone, has a method of its own."""
+    return method in vars(human) or getattr(type(human), method) is not getattr(HumanModel, method)
 
 
 def require_standard_program(human: HumanModel, what: str) -> None:
@@ -395,7 +397,7 @@ def require_standard_program(human: HumanModel, what: str) -> None:
 
 def recorded_covariates(human: HumanModel, rounds: Demonstrations) -> dict[str, Tensor]:
     """The covariates ``[P, B]`` of recorded rounds, of each as far as it went."""
-    if type(human).covariates is HumanModel.covariates:
+    if not overrides(human, "covariates"):
         return {}
     observation = rounds.observation()
     each = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from pyro.poutine import Trace
@@ -41,10 +41,16 @@ def discrete_names(trace: Trace) -> set[str]:
 
 
 class Readable(Mapping[str, Tensor]):
-    """Implants for ``perceive``: notes which are read, and refuses those that are not discrete."""
+    """Implants for ``perceive``: notes which are read, and refuses those that are not discrete.
 
-    def __init__(self, known: Mapping[str, Tensor]) -> None:
+    Args:
+        known: values of discrete sites by name.
+        others: names of all else that ``prior`` returned.
+    """
+
+    def __init__(self, known: Mapping[str, Tensor], others: Collection[str] = ()) -> None:
         self.known = known
+        self.others = others
         self.read: set[str] = set()
 
     def __getitem__(self, name: str) -> Tensor:
@@ -57,10 +63,40 @@ class Readable(Mapping[str, Tensor]):
         return self.known[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self.known
+        if name in self.known or name in self.others:  # whoever asks goes by the answer
+            return self[str(name)] is not None
+        return False
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.known)
 
     def __len__(self) -> int:
         return len(self.known)
+
+
+class OnlyRead(dict[str, Tensor]):
+    """Implants for ``perceive`` where all but some were found never to be read: refuses those.
+
+    Args:
+        known: values by name.
+        others: names of the sites that are not read.
+    """
+
+    def __init__(self, known: Mapping[str, Tensor], others: Collection[str]) -> None:
+        super().__init__(known)
+        self.others = others
+
+    def __missing__(self, name: str) -> Tensor:
+        raise HumanModelError(
+            f'perceive() reads "{name}" in some rounds only, and did not where it was tried; let '
+            "it read the same sites at every step, whatever it does with their values"
+        )
+
+    def __contains__(self, name: object) -> bool:
+        if name in self.others:
+            self.__missing__(str(name))
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """See :meth:`dict.get`."""
+        return super().get(name, default) if name in self else default

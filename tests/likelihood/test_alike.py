@@ -25,8 +25,8 @@ class Cautious(Few):
         own = super().prior()
         cautious = pyro.sample("cautious", dist.Bernoulli(0.02))
         near = torch.tensor([5.0, 1, 1, 1, 1, 1, 1]).log() * cautious[..., None]
-        own["sight_front_own"] = pyro.sample("sight_of_them", dist.Categorical(logits=near))
-        return own | {"cautious": cautious, "sight_of_them": own["sight_front_own"]}
+        sight = pyro.sample("sight_of_them", dist.Categorical(logits=near))
+        return own | {"cautious": cautious, "sight_of_them": sight}
 
     def perceive(self, implants, knowledge, observation, told, step):
         own = {"sight_front_own": implants["sight_of_them"]}

@@ -61,8 +61,7 @@ class OneItem(PerItem):
 
     def prior(self):
         like = next(self.self_model.parameters())
-        known = {"assumes_clear": torch.tensor(1), "assumes_closing": torch.tensor(0)}
-        known[NOTICES[0]] = pyro.sample(NOTICES[0], dist.Beta(1.0, 1.0))
+        known = {NOTICES[0]: pyro.sample(NOTICES[0], dist.Beta(1.0, 1.0))}
         return known | policy_implants(self.domain, self.self_model.latent, like)
 
     def round_latents(self, implants):
@@ -79,7 +78,6 @@ class Fixed(OneItem):
 
     def prior(self):
         known = {"consistency": torch.tensor(4.0), "lapse": torch.tensor(0.02)}
-        known |= {"assumes_clear": torch.tensor(1), "assumes_closing": torch.tensor(0)}
         return known | {NOTICES[0]: pyro.sample(NOTICES[0], dist.Beta(1.0, 1.0))}
 
 

@@ -385,7 +385,7 @@ def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordi
     for builder in (whole, merged):
         builder.add(rounds_of(rounds, 0))
     tables = [builder.table() for builder in (whole, merged)]
-    policies = merged.draw_policies()
+    policies = merged.policies
     scores = []
     for table in tables:
         with (

@@ -1,0 +1,190 @@
+"""A trial that what engines compute of a human model is its program, number by number.
+
+Made-up rounds have a density under the program, run as it is for one draw at a time, and another
+one that is put together as engines do it, for all draws at once. Both are the same unless a method
+says something that the parts leave out, count twice, or take from somebody else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pyro
+import torch
+from pyro import poutine
+from torch import Tensor
+
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains.base import Domain
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.likelihood.combination_sets import fixed_prior
+from mirror_ppl.likelihood.combinations import log_priors, perceived_sites
+from mirror_ppl.likelihood.densities import Given, choices, log_correction, log_latents, prior_nodes
+from mirror_ppl.models.belief_tracking import BeliefState, Transition
+from mirror_ppl.models.human import HumanModel, at_step, messages_at, recorded_covariates
+from mirror_ppl.models.prior import Draws, draw_prior
+from mirror_ppl.models.sites import latent_sites
+
+DRAWS, ROUNDS, STEPS = 3, 2, 4
+SEED = 0
+TOLERANCE = 1e-3
+"""In nats, and of what the density is; both are sums of the same numbers in 32 bits."""
+
+
+@torch.no_grad()
+def check_agreement(human: HumanModel) -> None:
+    """Compare the densities.
+
+    Raises:
+        HumanModelError: they differ.
+    """
+    rounds = made_up_rounds(human.domain, next(human.parameters()).device)
+    draws = draw_prior(human, 1, DRAWS, SEED)
+    expected, latents = log_densities(human, rounds, draws)
+    found = _put_together(human, rounds, draws, latents)
+    close = torch.isclose(found, expected, rtol=TOLERANCE, atol=TOLERANCE)
+    if bool(close.all()):
+        return
+    draw = int((~close).nonzero()[0])
+    kind = type(human).__name__
+    raise HumanModelError(
+        f"{kind} says something that is not of one person or not seen by the engines: of made-up "
+        f"rounds they would compute a log density of {float(found[draw]):.6g}, and its program "
+        f"has {float(expected[draw]):.6g}. A sum over all dimensions, as in factor(x.sum()), mixes "
+        "people; Python's `if` on values decides for all of them; values that are changed in place "
+        "are not followed. Or override model(), if only to call super().model(rounds, world), "
+        "which the engines svi and nuts then run as it is, slowly"
+    )
+
+
+def made_up_rounds(domain: Domain, device: torch.device) -> Demonstrations:
+    """Short rounds of one person, of arbitrary actions and messages; always the same."""
+    generator = torch.Generator(device).manual_seed(SEED)
+    steps = min(STEPS, domain.horizon)
+    actions = torch.randint(
+        len(domain.actions), (ROUNDS, steps), generator=generator, device=device
+    )
+    state = domain.initial(ROUNDS, generator)
+    observed = [domain.observe(state)]
+    for step in range(steps):
+        state = domain.transition(state, actions[:, step])
+        observed.append(domain.observe(state))
+    seen = {name: torch.stack([one[name] for one in observed], 1)[None] for name in observed[0]}
+    told = {
+        name: mask[:, :, :steps]
+        & (torch.rand(mask[:, :, :steps].shape, generator=generator, device=device) < 0.3)
+        for name, mask in domain.communicable(seen).items()
+    }
+    return Demonstrations(
+        domain=domain.name,
+        setting=domain.settings[0],
+        people=("somebody",),
+        ego=seen.pop("ego"),
+        observations=seen,
+        actions=actions[None],
+        told=told,
+        round_counts=torch.tensor([ROUNDS], device=device),
+        lengths=torch.tensor([[steps, *(max(1, steps - 1),) * (ROUNDS - 1)]], device=device),
+    )
+
+
+@torch.no_grad()
+def log_densities(
+    human: HumanModel, rounds: Demonstrations, draws: Mapping[str, Tensor]
+) -> tuple[Tensor, Draws]:
+    """Of the program as it is, for each of some draws by itself.
+
+    Args:
+        human: the model of people.
+        rounds: of one person.
+        draws: values ``[S, 1, 1, ...]`` of all sites of ``prior``.
+
+    Returns:
+        Log densities ``[S]``, and the latents of rounds ``[S, 1, B]`` that they are of.
+    """
+    found, latents = [], []
+    number = len(next(iter(draws.values()), (0,)))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(SEED)
+        for draw in range(number):
+            own = {name: value[draw] for name, value in draws.items()}
+            with poutine.block(), Given(own), poutine.trace() as trace:
+                human.model(rounds)
+            found.append(torch.as_tensor(trace.trace.log_prob_sum()))
+            sites = latent_sites(trace.trace)
+            latents.append({name: sites[name]["value"] for name in sites if name not in own})
+    together = {
+        name: torch.stack([one[name].expand(1, rounds.shape[1]) for one in latents])
+        for name in latents[0]
+    }
+    return torch.stack(found), together
+
+
+def _put_together(
+    human: HumanModel,
+    rounds: Demonstrations,
+    draws: Mapping[str, Tensor],
+    latents: Mapping[str, Tensor],
+) -> Tensor:
+    """Log densities ``[S]`` of the same, of the parts that engines compute."""
+    read = perceived_sites(human)
+    number, every = DRAWS, torch.arange(DRAWS)
+    policy = {name: value for name, value in draws.items() if name not in read}
+    grid = {name: draws[name].flatten() for name in read}
+    total = log_correction(human, read, policy, 1)[:, 0].expand(number)
+    for name, node in prior_nodes(human, draws, number, 1).items():
+        if name in policy:
+            total = total + node["fn"].log_prob(node["value"]).reshape(-1).expand(number)
+    if grid:
+        prior = fixed_prior(human, grid)
+        if prior is None:
+            prior = log_priors(human, grid, policy, 1)[:, 0].expand(number, -1)[every, every]
+        total = total + prior
+    with (
+        poutine.block(),
+        poutine.condition(data=dict(draws)),
+        pyro.plate("draw", number, dim=-3),
+        pyro.plate("person", 1, dim=-2),
+    ):
+        implants = human.prior()
+        if human.has_round_latents:
+            values = {name: value[:, 0].T[None] for name, value in latents.items()}
+            covariates = recorded_covariates(human, rounds)
+            for own in log_latents(human, implants, values, covariates).values():
+                own = own.expand(number, 1, rounds.shape[1], number)
+                total = total + own[every, 0, :, every].sum(-1)
+        for step, state in enumerate(_beliefs(human, rounds, grid, latents)):
+            mean = state.believed[None]  # [1, S B, Z]
+            acted = rounds.actions[0, :, step].clamp(min=0).repeat(number)[None]
+            _, said = choices(human, implants, mean, human.action_values(mean), acted)
+            said = said.expand(number, 1, mean.shape[1]).unflatten(-1, (number, -1))
+            total = total + (said[every, 0, every] * rounds.mask[0, :, step]).sum(-1)
+    return total
+
+
+def _beliefs(
+    human: HumanModel,
+    rounds: Demonstrations,
+    grid: Mapping[str, Tensor],
+    latents: Mapping[str, Tensor],
+) -> list[BeliefState]:
+    """After each step, of somebody of each draw in each round, ``[S B]``."""
+    number, count = DRAWS, rounds.shape[1]
+    implants = {name: value.repeat_interleave(count) for name, value in grid.items()}
+    implants |= {name: value.flatten() for name, value in latents.items()}
+    row = torch.arange(count, device=rounds.actions.device).repeat(number)
+    observation = {name: value[0] for name, value in rounds.observation().items()}
+    told = {name: value[0] for name, value in rounds.told.items()}
+    before = torch.full_like(rounds.actions[0, :, :1], len(human.domain.actions))
+    done = torch.cat([before, rounds.actions[0].clamp(min=0)], -1)
+    steps = [
+        Transition(
+            implants,
+            done[row, step],
+            at_step(observation, step),
+            {name: mask[row] for name, mask in messages_at(told, step).items()},
+            row,
+        )
+        for step in range(rounds.shape[2])
+    ]
+    return BeliefState.initial(human, number * count).through(steps)
