@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import torch
@@ -28,6 +29,7 @@ from mirror_ppl.inference.engine import Engine, Inferred, Job, narrowed, widened
 from mirror_ppl.inference.names import current_name
 from mirror_ppl.inference.population.pooling import POOLINGS, Pooling, Population
 from mirror_ppl.inference.workers import Workers, parts_of
+from mirror_ppl.likelihood.agreement import said_of_made_up_rounds
 from mirror_ppl.likelihood.combinations import require_unread
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.likelihood.screening import Screening
@@ -259,7 +261,9 @@ def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequen
     kinds = [kind for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
     source = [(kind.__qualname__, _source(kind)) for kind in kinds]
     weights = [fingerprint(human), None if network is None else fingerprint(network)]
-    description = [weights, source, __version__, [str(part) for part in what]]
+    # What it leans on elsewhere shows in what it says.
+    said = said_of_made_up_rounds(human)
+    description = [weights, source, said, __version__, [str(part) for part in what]]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 
@@ -268,4 +272,13 @@ def _source(kind: type) -> str:
     try:
         return Path(inspect.getfile(kind)).read_text()
     except (OSError, TypeError):  # a class made in a notebook has no file
-        return kind.__qualname__
+        return repr([(name, _code(member)) for name, member in sorted(vars(kind).items())])
+
+
+def _code(member: Any) -> Any:
+    """What a function of a notebook does."""
+    code = member if isinstance(member, CodeType) else getattr(member, "__code__", None)
+    if code is None:
+        return None
+    constants = [_code(one) or repr(one) for one in code.co_consts]
+    return code.co_code.hex(), code.co_names, constants

@@ -120,6 +120,13 @@ def log_densities(
     return torch.stack(found), together
 
 
+def said_of_made_up_rounds(human: HumanModel) -> list[str]:
+    """Log densities of made-up rounds to five digits: they tell a program from another one."""
+    rounds = made_up_rounds(human.domain, next(human.parameters()).device)
+    found, _ = log_densities(human, rounds, draw_prior(human, 1, DRAWS, SEED))
+    return [f"{value:.5g}" for value in found.tolist()]
+
+
 def _put_together(
     human: HumanModel,
     rounds: Demonstrations,

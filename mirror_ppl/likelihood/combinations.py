@@ -183,7 +183,8 @@ def log_priors(
         elif not is_observed(node) and len(node["fn"].batch_shape) > BATCH:
             raise HumanModelError(
                 f'the prior of "{name}" depends on a discrete site that perceive() reads; let that '
-                f'site depend on "{name}" instead'
+                f'site depend on "{name}" instead, or override model(), if only to call '
+                "super().model(rounds, world), for the engines svi and nuts"
             )
         else:  # scales and masks may depend on these sites where the density does not
             own = correction(node)

@@ -7,7 +7,7 @@ nothing that a method of a human model says is left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import pyro
@@ -96,6 +96,32 @@ def log_correction(
             check_plates(name, own, people)
             total = total + own
     return total.squeeze(-1)
+
+
+def whole_correction(
+    human: HumanModel, draws: Mapping[str, Tensor], people: int, without: Collection[str]
+) -> Tensor:
+    """All that ``prior`` adds to the density ``[S, P]`` by which draws ``[S, P, 1, ...]`` are made.
+
+    Args:
+        human: the model of people.
+        draws: of all sites.
+        people: number of people P.
+        without: names of sites whose own density does not count.
+    """
+    number = len(next(iter(draws.values())))
+    total = next(human.parameters()).new_zeros(number, people, 1)
+    for name, node in prior_nodes(human, draws, number, people).items():
+        own = None if name in without else correction(node)
+        if own is not None:
+            check_plates(name, own, people)
+            total = total + own
+    return total.squeeze(-1)
+
+
+def adds_to_prior(human: HumanModel) -> bool:
+    """Whether ``prior`` is more than what it samples."""
+    return any(correction(node) is not None for node in prior_nodes(human, {}, 1, 1).values())
 
 
 def prior_nodes(

@@ -34,32 +34,6 @@ def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]
 
 
 @torch.no_grad()
-def log_prior(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor]) -> Tensor:
-    """Log prior probability ``[P, M]`` of each combination of the table's discrete sites.
-
-    Args:
-        human: the model of people.
-        table: the recorded rounds.
-        policy: values of all other sites, ``[P, 1, ...]`` or ``[1, 1, ...]``, on which the prior
-            of the discrete ones may depend.
-    """
-    draws = {name: value[None] for name, value in policy.items()}
-    return log_priors(human, combination_values(human, table), draws, table.people)[0]
-
-
-@torch.no_grad()
-def log_joint(human: HumanModel, table: ViewTable, policy: Mapping[str, Tensor]) -> Tensor:
-    """Log prior and likelihood ``[P, M]`` of each combination, given the other sites.
-
-    Args:
-        human: the model of people.
-        table: the recorded rounds.
-        policy: values of all other sites, ``[P, 1, ...]`` or ``[1, 1, ...]``.
-    """
-    return log_joints(human, table, {name: value[None] for name, value in policy.items()})[0]
-
-
-@torch.no_grad()
 def log_joints(
     human: HumanModel,
     table: ViewTable,
@@ -67,10 +41,16 @@ def log_joints(
     combinations: Tensor | None = None,
     log_prior: Tensor | None = None,
 ) -> Tensor:
-    """As :func:`log_joint` for each of S draws ``[S, P, 1, ...]``: ``[S, P, M]``.
+    """Log prior and likelihood of each combination under S draws, ``[S, P, M]``.
 
-    Right for models in which :func:`acts_on_beliefs`. Of all combinations unless ``combinations``
-    ``[M]`` says of which, and with their prior unless there is another ``log_prior`` ``[M]``.
+    Right for models in which :func:`acts_on_beliefs`.
+
+    Args:
+        human: the model of people.
+        table: the recorded rounds.
+        draws: of all other sites, ``[S, P, 1, ...]`` or ``[S, 1, 1, ...]``.
+        combinations: which are asked about ``[M]``; all unless given.
+        log_prior: of these ``[M]`` in place of their own.
     """
     number = len(next(iter(draws.values()))) if draws else 1
     grid = {}
@@ -165,16 +145,6 @@ def require_acting_on_beliefs(human: HumanModel, sites: Iterable[str]) -> None:
             "act() reads a site that perceive() reads, too; only the engines svi and nuts can fit "
             "this"
         )
-
-
-def marginals(table: ViewTable, log_weights: Tensor) -> dict[str, Tensor]:
-    """Marginal probabilities ``[P, n]`` of each site, of log weights ``[P, M]``."""
-    joint = torch.softmax(log_weights, -1).unflatten(-1, table.sizes)
-    axes = range(1, joint.dim())
-    return {
-        site: joint.sum([other for other in axes if other != axis])
-        for axis, site in zip(axes, table.sites, strict=True)
-    }
 
 
 def draw_combinations(

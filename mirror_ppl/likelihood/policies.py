@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.likelihood.combinations import log_priors
-from mirror_ppl.likelihood.densities import correction, log_correction, prior_nodes
+from mirror_ppl.likelihood.densities import adds_to_prior, log_correction
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, draw_prior
 
@@ -59,11 +59,6 @@ def draw_policies(
         own = draw_prior(human, 1, size, seeds[draw // size])
         parts.append({name: value[draw % size, None] for name, value in own.items()})
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def adds_to_prior(human: HumanModel) -> bool:
-    """Whether ``prior`` is more than what it samples."""
-    return any(correction(node) is not None for node in prior_nodes(human, {}, 1, 1).values())
 
 
 def effective(log_weights: Tensor) -> float:

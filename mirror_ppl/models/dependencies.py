@@ -55,6 +55,7 @@ class Dependencies:
         latent: the sites of ``prior`` that are sampled.
         adds_to_actions: whether ``act`` says more than how probable actions are: by a factor, an
             observed site, a scale or a mask.
+        adds_to_latents: whether ``round_latents`` says more than what it samples.
     """
 
     prior: Mapping[str, Sites]
@@ -62,6 +63,7 @@ class Dependencies:
     actions: Sites
     latent: Sites
     adds_to_actions: bool
+    adds_to_latents: bool
 
 
 _found: WeakKeyDictionary[HumanModel, Dependencies] = WeakKeyDictionary()
@@ -105,6 +107,7 @@ def _run(human: HumanModel) -> Dependencies:
         actions | hidden,
         frozenset(sites),
         any(name != ACTION or _changed(node) for name, node in sample_nodes(act.trace).items()),
+        any(node["is_observed"] or _changed(node) for node in sample_nodes(latents.trace).values()),
     )
 
 

@@ -9,11 +9,12 @@ import pyro.distributions as dist
 import pytest
 import torch
 import xarray as xr
+from exact import log_joint
 from scipy.stats import beta, chi2, chisquare
 from torch import nn
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.errors import HumanModelError, UnknownNameError
 from mirror_ppl.inference.calibration import study as calibration
 from mirror_ppl.inference.calibration.study import (
     CalibrationOptions,
@@ -21,12 +22,14 @@ from mirror_ppl.inference.calibration.study import (
     calibrate,
     prior_people,
 )
-from mirror_ppl.likelihood.enumeration import draw_combinations, log_joint
+from mirror_ppl.likelihood.enumeration import draw_combinations
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import policy_implants
 from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.toy import ToyHuman
+from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DRIVING = get_domain("driving")
@@ -320,3 +323,25 @@ def test_the_package_s_own_human_model_runs(seed):
     table = result.table()
     assert table["p_value"].between(0, 1).all()
     assert table["sharpness"].between(0, 2).all()
+
+
+class Watched(ToyHuman):
+    def act(self, implants, belief, values):
+        pyro.sample("gaze", dist.Normal(implants["in_sight"], 0.5), obs=torch.tensor(1.0))
+        return super().act(implants, belief, values)
+
+
+class Moody(VARIANTS["per-item"]):
+    spans = VARIANTS["per-item"].spans
+
+    def round_latents(self, implants):
+        pyro.factor("mood", implants["consistency"])
+        return super().round_latents(implants)
+
+
+@pytest.mark.parametrize(("kind", "method"), [(Watched, "act"), (Moody, "round_latents")])
+def test_people_who_cannot_be_drawn_are_refused(kind, method):
+    human = kind(load_self_model(shipped_weights("driving"))[0])
+    options = CalibrationOptions(people=2, rounds=(1,), batch=2)
+    with pytest.raises(HumanModelError, match=f"{kind.__name__}.{method} has a factor"):
+        calibrate(human, lambda rounds, seed: None, options, "fog", 0)

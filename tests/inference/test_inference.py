@@ -8,6 +8,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from exact import log_joint, log_prior, marginals
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 from scipy.stats import chi2
 from test_views import Few, Sure, log_likelihoods_by_hand, policies, ragged
@@ -27,13 +28,7 @@ from mirror_ppl.inference.svi import (
 )
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
-from mirror_ppl.likelihood.enumeration import (
-    combination_values,
-    draw_combinations,
-    log_joint,
-    log_prior,
-    marginals,
-)
+from mirror_ppl.likelihood.enumeration import combination_values, draw_combinations
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import TableProgram, log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted

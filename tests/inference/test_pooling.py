@@ -4,6 +4,7 @@ import pyro
 import pytest
 import torch
 from pyro import poutine
+from pyro.distributions import OneHotCategorical
 from scipy import stats
 from torch.distributions import Beta, Normal
 
@@ -226,3 +227,33 @@ def test_scales_of_the_prior_count():
     density = sum(node["fn"].log_prob(node["value"]) for node in nodes.values())[..., 0]
     found = plain._log_prior(draws) - scaled._log_prior(draws)
     torch.testing.assert_close(found, 0.9 * density.T, rtol=1e-4, atol=1e-4)
+
+
+class Near(ToyHuman):
+    """A toy of whom the prior says more: nobody sees far. And of a kind, as one of three."""
+
+    def prior(self):
+        implants = super().prior()
+        pyro.factor("near", -50.0 * (implants["reach"] > 2))
+        kind = pyro.sample("kind", OneHotCategorical(torch.tensor([0.2, 0.3, 0.5])))
+        return implants | {"kind": kind}
+
+
+def test_newcomers_follow_what_the_prior_says_besides():
+    human = Near(load_self_model(shipped_weights("driving"))[0])
+    number = 2000
+    some = population(by_rate(0.5, -1.0), by_rate(0.7, 0.4), number)
+    new = Pooling(human).newcomers(some, 1, 0)
+    assert new["kind"].shape == (number, 1, 1, 3)
+    # Chances of 1, 2, 3 of 28; the others are as good as impossible.
+    counts = torch.bincount(new["reach"].flatten(), minlength=7).numpy()
+    assert counts[3:].sum() == 0
+    expected = number * torch.arange(1.0, 4).double().numpy() / 6
+    assert stats.chisquare(counts[:3], expected).pvalue > 1e-5
+
+
+def test_a_population_of_people_with_sites_of_several_numbers():
+    human = Near(load_self_model(shipped_weights("driving"))[0])
+    pooling = Pooling(human)
+    assert list(pooling.supports) == ["reach"]  # the other site keeps its prior
+    pooling.read(draw_prior(human, 2, 5, 0))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pyro
 import pytest
 import torch
+from exact import log_joint
 from example_course import beliefs_of, perceived
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 
@@ -17,7 +18,6 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.svi import SVIOptions, continuous_guide, fit_implants
 from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.contract import check_contract
-from mirror_ppl.likelihood.enumeration import log_joint
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table

@@ -34,6 +34,7 @@ from mirror_ppl.inference.calibration.ranks import Calibration, collect, join_ro
 from mirror_ppl.inference.engines import Inferred
 from mirror_ppl.jobs import DatasetFormat, Runner
 from mirror_ppl.likelihood.densities import correction, prior_nodes
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.simulation import play_rounds
@@ -141,10 +142,10 @@ def calibrate(
     Raises:
         UnknownNameError: there is no such setting.
         ValueError: ``infer`` or a summary returned something else than it should.
-        HumanModelError: the prior has a factor, an observed site, a scale or a mask.
+        HumanModelError: a method has a factor, an observed site, a scale or a mask.
     """
     require_known(setting, "setting", human.domain.settings, human.domain.name)
-    _require_plain_prior(human)
+    _require_plain_program(human)
     trial = _Trial(human, options, setting, seed)
     batches = [
         Batch(first, min(options.batch, options.people - first))
@@ -165,14 +166,21 @@ def calibrate(
     return collect(judged, trial.prior, trial.discrete, attributes)
 
 
-def _require_plain_prior(human: HumanModel) -> None:
-    """Refuse human models whose prior is more than what it samples: people are drawn from that."""
+def _require_plain_program(human: HumanModel) -> None:
+    """Refuse human models that are more than what they sample: people are drawn from that."""
+    kind = type(human).__name__
     for name, node in prior_nodes(human, {}, 1, 1).items():
         if correction(node) is not None:
             raise HumanModelError(
-                f'"{name}" of {type(human).__name__}.prior is a factor, observed, scaled or '
-                "masked: people who are drawn from the prior do not follow it; calibrate a model "
-                "without it"
+                f'"{name}" of {kind}.prior is a factor, observed, scaled or masked: people who are '
+                "drawn from the prior do not follow it; calibrate a model without it"
+            )
+    found = dependencies(human)
+    for method, adds in (("act", found.adds_to_actions), ("round_latents", found.adds_to_latents)):
+        if adds:
+            raise HumanModelError(
+                f"{kind}.{method} has a factor, an observed site, a scale or a mask: people who "
+                "are simulated do not follow it; calibrate a model without it"
             )
 
 

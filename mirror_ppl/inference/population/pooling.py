@@ -39,7 +39,7 @@ from mirror_ppl.inference.population.sampler import (
     PeoplesDraws,
     sample_population,
 )
-from mirror_ppl.likelihood.densities import log_prob
+from mirror_ppl.likelihood.densities import adds_to_prior, log_prob, whole_correction
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
@@ -58,6 +58,9 @@ CONCENTRATION_WIDTH = 1.0
 SPREAD, SPREAD_WIDTH = 0.5, 0.5
 """How much people differ before anybody is seen: its median, in widths of the human model's prior,
 and the standard deviation of its logarithm."""
+
+CANDIDATES = 64
+"""People of whom one is taken as the newcomer, where the program makes some more probable."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ class Pooling:
         self.centre, self.width = drawn.mean(0), drawn.std(0)
         self.supports, self.prior_chances = {}, {}
         for name, node in nodes.items():
-            if node["fn"].has_enumerate_support:
+            if node["fn"].has_enumerate_support and not node["fn"].event_dim:
                 values = node["fn"].enumerate_support()
                 chances = node["fn"].log_prob(values).exp().flatten(1).mean(1)
                 possible = chances > LEAST_CHANCE  # what the prior rules out stays ruled out
@@ -253,15 +256,28 @@ class Pooling:
 
     @torch.no_grad()
     def newcomers(self, population: Population, people: int, seed: int) -> Draws:
-        """Draws ``[S, P, 1, ...]`` of people of whom nothing is known but where they are from."""
-        number = len(population)
+        """Draws ``[S, P, 1, ...]`` of people of whom nothing is known but where they are from.
+
+        Where ``prior`` is more than what it samples, one of several is taken, by how probable it
+        makes each of them.
+        """
+        number, tries = len(population), CANDIDATES if adds_to_prior(self.human) else 1
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             given: Draws = {}
             for name, support in self.supports.items():
-                chances = population.chances[name][:, None].expand(-1, people, -1)
+                chances = population.chances[name][:, None].expand(-1, people * tries, -1)
                 given[name] = support[dist.Categorical(chances).sample()][..., None]
             for name, site in self.sites.items():
                 normal = dist.Normal(population.mean[name], population.spread[name])
-                given[name] = site(normal.sample(torch.Size([people])).T)[..., None]
-            return values_of(sample_sites(self.human, people, number, given))
+                given[name] = site(normal.sample(torch.Size([people * tries])).T)[..., None]
+            drawn = values_of(sample_sites(self.human, people * tries, number, given))
+            if tries == 1:
+                return drawn
+            # Of these sites the population takes the place of what the prior says.
+            said = whole_correction(self.human, drawn, people * tries, given)
+            weights = torch.softmax(said.view(number * people, tries), -1)
+            chosen = torch.multinomial(weights, 1).view(number, people)
+        rows = torch.arange(people, device=chosen.device) * tries + chosen
+        draw = torch.arange(number, device=chosen.device)[:, None]
+        return {name: value[draw, rows] for name, value in drawn.items()}
