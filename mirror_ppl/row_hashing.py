@@ -48,10 +48,16 @@ def uniform_of(seed: int, *names: Tensor) -> Tensor:
     as anybody can tell: Steele, Lea and Flood's mixing of bits (SplitMix64, 2014).
     """
     device = names[0].device
-    bits = _mixed(torch.tensor(seed, dtype=torch.long, device=device))
-    for name in names:
-        bits = _mixed(bits + name.long())
+    bits = mixed(torch.tensor(seed, dtype=torch.long, device=device), *names)
     return ((bits >> 40) & (2**24 - 1)).to(torch.float32) / 2**24
+
+
+def mixed(*names: Tensor) -> Tensor:
+    """Whole numbers ``[...]`` that are a function of others; sums of them tell sets apart."""
+    bits = _mixed(names[0].long())
+    for name in names[1:]:
+        bits = _mixed(bits + name.long())
+    return bits
 
 
 def _mixed(bits: Tensor) -> Tensor:

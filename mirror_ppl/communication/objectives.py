@@ -18,12 +18,13 @@ from mirror_ppl.checks import require_methods, whole_number
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import PlanningContext
 from mirror_ppl.communication.rollouts import RolloutTree, World, robot_belief
+from mirror_ppl.domains.base import Observation
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
-from mirror_ppl.row_hashing import uniform_of
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, mixed, uniform_of
 
 
 @dataclass(frozen=True)
@@ -106,51 +107,40 @@ class ExpectedUtility:
         device = past.actions.device
         generator = torch.Generator(device).manual_seed(seed)
         rollouts = self.world.rollouts(past, horizon, generator)
-        domain = person.human.domain
-        number, channels = len(domain.actions), Channels(domain)
+        channels = Channels(person.human.domain)
         ends = steps_left <= horizon
         discounts = self.discount ** torch.arange(horizon, device=device)
 
         @torch.no_grad()
         def value(candidates: Tensor) -> Valued:
             tree = _Tree(context, candidates, self.world.draws)
-            count = len(candidates)
-            utility = torch.zeros(count * person.number, device=device)
+            utility = torch.zeros(len(candidates), person.number, device=device)
             if self.terminal_value:
                 world = torch.arange(person.number, device=device) % self.world.draws
-                utility += rollouts.values(0)[world, 0].repeat(count)
-            predicted = torch.zeros(count, horizon, number, device=device)
+                utility += rollouts.values(0)[world, 0]
+            predicted = []
             for step in range(horizon):
                 observation = {
                     name: part.flatten(0, 1) for name, part in rollouts.observation(step).items()
                 }
-                told = candidates[:, step] if step < candidates.shape[1] else None
-                chances = tree.act(observation, told, channels)
+                chances = tree.act(observation, step, channels)
                 gains = (
                     rollouts.advantages(step, self.discount)
                     if self.terminal_value
                     else rollouts.rewards(step)
                 )
                 gained = gains[tree.draw_of_world(), tree.path]
-                utility.index_add_(
-                    0,
-                    tree.candidate * person.number + tree.draw,
-                    discounts[step] * (chances * gained).sum(-1),
-                )
-                predicted[:, step].index_add_(0, tree.candidate, chances / person.number)
+                utility += tree.of_each(discounts[step] * (chances * gained).sum(-1))
+                predicted.append(tree.of_each(chances).mean(1))
                 if step < horizon - 1 or (self.terminal_value and ends):
                     tree.branch(chances, rollouts, step, self.enumerate_above, seed)
             if self.terminal_value and ends:
                 # What could be gained is lost where the round ends.
                 left = rollouts.values(horizon)[tree.draw_of_world(), tree.path]
-                utility.index_add_(
-                    0,
-                    tree.candidate * person.number + tree.draw,
-                    -(self.discount**horizon) * tree.weight * left,
-                )
+                utility -= tree.of_each((self.discount**horizon) * tree.weight * left)
             steps = min(candidates.shape[1], horizon)
             cost = (channels.cost(candidates)[:, :steps] * discounts[:steps]).sum(1)
-            return Valued(utility.view(count, person.number) - cost[:, None], predicted)
+            return Valued(utility - cost[:, None], torch.stack(predicted, 1))
 
         return value
 
@@ -158,20 +148,27 @@ class ExpectedUtility:
 class _Tree:
     """Courses of actions of each candidate and draw, sorted by draw; E courses in all.
 
+    Candidates that have led a draw to the same beliefs on the same paths, and go on with the same
+    messages, have the same courses from there on: they are a *group*, and count once.
+
     Attributes:
-        candidate, draw, path, weight: of each course ``[E]``.
+        draw, path, weight, group: of each course ``[E]``.
         belief: what the person believes and knows on it ``[E]``, an index into ``state``.
         state: after the last step that was looked at.
+        candidate: one of each group, ``[G]``.
+        group_of: of each candidate and draw, ``[C, S]``.
     """
 
     def __init__(self, context: PlanningContext, candidates: Tensor, worlds: int) -> None:
         device = candidates.device
         person = self.person = context.person
-        self.worlds = worlds
+        self.candidates, self.worlds = candidates, worlds
         self.actions = len(person.human.domain.actions)
         count = len(candidates)
         self.draw = torch.arange(person.number, device=device).repeat_interleave(count)
         self.candidate = torch.arange(count, device=device).repeat(person.number)
+        self.group = torch.arange(len(self.draw), device=device)
+        self.group_of = self.group.view(person.number, count).T
         self.path = torch.zeros_like(self.draw)
         self.weight = torch.ones(len(self.draw), device=device)
         self.state = context.before
@@ -182,18 +179,26 @@ class _Tree:
         """Which draw of the world each course is in, ``[E]``."""
         return self.draw % self.worlds
 
-    def act(self, observation, told: Tensor | None, channels: Channels) -> Tensor:
+    def of_each(self, values: Tensor) -> Tensor:
+        """Sums of values ``[E, ...]`` of the courses of each candidate and draw, ``[C, S, ...]``."""
+        total = values.new_zeros(len(self.candidate), *values.shape[1:])
+        return total.index_add_(0, self.group, values)[self.group_of]
+
+    def act(self, observation: Observation, step: int, channels: Channels) -> Tensor:
         """Look at the world and choose: weights ``[E, A]`` of each course and its next action."""
         paths = len(observation["ego"]) // self.worlds
         row = self.draw_of_world() * paths + self.path
         percept = self.person.percept[self.draw]
-        message = self.candidate if told is not None else torch.zeros_like(self.candidate)
-        key = (self.belief * self.person.percept_count + percept) * (int(row.max()) + 1) + row
-        key = key * (int(self.candidate.max()) + 1) + message
-        _, look = torch.unique(key, return_inverse=True)
-        first = torch.full((int(look.max()) + 1,), len(key), device=key.device)
-        first.scatter_reduce_(0, look, torch.arange(len(key), device=key.device), "amin")
-        if told is None:
+        told = self.candidates[:, step] if step < self.candidates.shape[1] else None
+        key = (self.belief * self.person.percept_count + percept) * (self.worlds * paths) + row
+        message = None
+        if told is not None:
+            one, which = distinct_rows(told.long())
+            message = which[self.candidate[self.group]]
+            key = key * len(one) + message
+            told = told[one]
+        first, look = distinct_rows(key[:, None])
+        if told is None or message is None:
             flags = torch.zeros(len(first), len(channels), dtype=torch.bool, device=key.device)
         else:
             # What is no longer there to be told cannot be told later, whatever the plan says.
@@ -205,6 +210,8 @@ class _Tree:
         before = self.state.at(self.belief[first])
         self.state, index = before.after(transition).distinct()
         self.belief = index[look]
+        if told is not None:
+            self._merge(self.candidates[:, step + 1 :])
         beliefs = self.state.mean
         values = self.person.human.action_values(beliefs)
         # Courses of a draw share its policy implants: one row a draw, padded to the longest.
@@ -215,6 +222,25 @@ class _Tree:
         padded[self.draw, place] = self.state.belief[self.belief]
         log_chances = self.person.act(beliefs[padded], values[padded])[self.draw, place]
         return self.weight[:, None] * log_chances.exp()
+
+    def _merge(self, rest: Tensor) -> None:
+        """Make one of those groups that have the same courses and the same ``rest`` ``[C, l, N]``."""
+        own = mixed(self.path, self.belief, as_whole_numbers(self.weight), self.draw)
+        courses = own.new_zeros(len(self.candidate)).index_add_(0, self.group, own)
+        _, following = distinct_rows(rest.flatten(1).long())
+        first, which = distinct_rows(torch.stack([courses, following[self.candidate]], -1))
+        kept = torch.zeros_like(self.candidate, dtype=torch.bool).index_fill_(0, first, True)
+        course = kept[self.group].nonzero().squeeze(-1)
+        self.candidate, self.group_of = self.candidate[first], which[self.group_of]
+        self._keep(course)
+        self.weight, self.path = self.weight[course], self.path[course]
+        self.last = self.last[course]
+        self.group = which[self.group]
+
+    def _keep(self, course: Tensor) -> None:
+        """Only these courses go on, some of them perhaps more than once."""
+        self.draw, self.group = self.draw[course], self.group[course]
+        self.belief = self.belief[course]
 
     def branch(
         self, chances: Tensor, rollouts: RolloutTree, step: int, threshold: float, seed: int
@@ -244,8 +270,7 @@ class _Tree:
         self.weight = weight[course, action]
         self.path = rollouts.follow(step, self.path[course], action)
         self.last = action
-        self.candidate, self.draw = self.candidate[course], self.draw[course]
-        self.belief = self.belief[course]
+        self._keep(course)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from mirror_ppl.row_hashing import distinct_rows
 
 MOST_CANDIDATES = 4096
 """How many candidates are valued one by one; beyond that they are searched."""
+FEW_MESSAGES = 4
+"""Up to how many messages all plans are valued at once."""
 CHUNK = 512
 """Candidates that are valued at once; bounds memory."""
 
@@ -56,12 +58,13 @@ class Exhaustive:
 
 @dataclass(frozen=True)
 class Patient:
-    """Every message for now; then, of the best ones, whether they can wait or be split.
+    """Every message for now; and, of the best or of a few, whether they can wait or be split.
 
     A message that is compared with silence for good is said as soon as it helps. Much of what would
     help now helps as well a step later, or turns out not to be needed, and items told one by one
     cost less than together. So the best messages are also valued as plans: the same message 1 to
-    ``steps - 1`` steps later, and each of its items now with the rest in the next step.
+    ``steps - 1`` steps later, and each of its items now with the rest in the next step. If there
+    are few messages, plans of all of them are valued at once, which is quicker.
 
     Attributes:
         steps: length L of the plans.
@@ -79,26 +82,42 @@ class Patient:
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """See :class:`Search`; the seed is not used."""
+        if self.steps > 1 and count_messages(allowed, self.items) <= FEW_MESSAGES:
+            messages = every_message(allowed, self.items)
+            plans = [_at_once(messages, self.steps), *self._plans(messages[1:])]
+            candidates = torch.cat(plans)
+            return Found(candidates, in_chunks(value, candidates))
         first = Exhaustive(self.items)(value, allowed, seed)
         mean = first.valued.utility.mean(-1)
         better = (mean > mean[0]).nonzero().squeeze(-1)
         if self.steps == 1 or not len(better):
             return first
         better = better[mean[better].argsort(descending=True, stable=True)][: self.best]
+        now = _at_once(first.candidates[:, 0], self.steps)
+        plans = torch.cat(self._plans(first.candidates[better, 0]))
+        return joined(Found(now, first.valued), plans, value)[0]
+
+    def _plans(self, messages: Tensor) -> list[Tensor]:
+        """What else can become of messages ``[M, N]``: plans ``[C, L, N]``, in parts."""
         plans = []
-        for message in first.candidates[better, 0]:
+        for message in messages:
+            later = message.new_zeros(self.steps - 1, self.steps, len(message))
             for delay in range(1, self.steps):
-                plan = allowed.new_zeros(self.steps, len(allowed))
-                plan[delay] = message
-                plans.append(plan)
+                later[delay - 1, delay] = message
+            plans.append(later)
             items = message.nonzero().squeeze(-1)
-            for item in items if len(items) > 1 else ():
-                plan = allowed.new_zeros(self.steps, len(allowed))
-                plan[1] = message
-                plan[0, item], plan[1, item] = True, False
-                plans.append(plan)
-        now = torch.nn.functional.pad(first.candidates, [0, 0, 0, self.steps - 1])
-        return joined(Found(now, first.valued), torch.stack(plans), value)[0]
+            if len(items) > 1:
+                split = message.new_zeros(len(items), self.steps, len(message))
+                every = torch.arange(len(items), device=message.device)
+                split[:, 1] = message
+                split[every, 0, items], split[every, 1, items] = True, False
+                plans.append(split)
+        return plans
+
+
+def _at_once(messages: Tensor, steps: int) -> Tensor:
+    """Plans ``[M, L, N]`` of messages ``[M, N]`` for now."""
+    return torch.nn.functional.pad(messages[:, None], [0, 0, 0, steps - 1])
 
 
 @dataclass(frozen=True)

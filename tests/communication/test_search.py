@@ -188,10 +188,27 @@ def test_plans_are_made_of_the_best_messages_only():
 
 def test_without_a_message_that_helps_there_are_no_plans():
     value = HandSet(lambda steps: -len(steps))
-    found = Patient(3)(value, only(0, 1), 0)
-    assert found.candidates.shape == (4, 1, NUMBER)
+    found = Patient(3)(value, only(0, 1, 2), 0)
+    assert found.candidates.shape == (8, 1, NUMBER)
     assert best_of(found) == ()
-    assert value.asked == [4]
+    assert value.asked == [8]
+
+
+def test_of_few_messages_all_plans_are_valued_at_once():
+    value = HandSet(lambda steps: -len(steps))
+    found = Patient(3)(value, only(0, 1), 0)
+    assert {str(steps_of(each)) for each in found.candidates} == {
+        str(one)
+        for one in (
+            plan(),
+            *(plan(*({} for _ in range(delay)), who) for delay in range(3) for who in ({0}, {1})),
+            *(plan(*({} for _ in range(delay)), {0, 1}) for delay in range(3)),
+            plan({0}, {1}),
+            plan({1}, {0}),
+        )
+    }
+    assert best_of(found) == ()
+    assert value.asked == [12]
 
 
 @pytest.mark.parametrize("search_", [Patient, CrossEntropy])
