@@ -180,7 +180,7 @@ class _Tree:
         return self.draw % self.worlds
 
     def of_each(self, values: Tensor) -> Tensor:
-        """Sums of values ``[E, ...]`` of the courses of each candidate and draw, ``[C, S, ...]``."""
+        """Sums of values ``[E, ...]`` of courses, of each candidate and draw ``[C, S, ...]``."""
         total = values.new_zeros(len(self.candidate), *values.shape[1:])
         return total.index_add_(0, self.group, values)[self.group_of]
 
@@ -224,7 +224,7 @@ class _Tree:
         return self.weight[:, None] * log_chances.exp()
 
     def _merge(self, rest: Tensor) -> None:
-        """Make one of those groups that have the same courses and the same ``rest`` ``[C, l, N]``."""
+        """Join groups that have the same courses and the same ``rest`` ``[C, l, N]``."""
         own = mixed(self.path, self.belief, as_whole_numbers(self.weight), self.draw)
         courses = own.new_zeros(len(self.candidate)).index_add_(0, self.group, own)
         _, following = distinct_rows(rest.flatten(1).long())
