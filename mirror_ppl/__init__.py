@@ -4,7 +4,8 @@
 
     fit = mirror_ppl.infer("recordings.nc")
     fit.plot.sight()
-    decision = mirror_ppl.Communicator(fit, "person-01").plan(round_so_far)
+    moment = mirror_ppl.RoundSoFar.of(recordings, "person-01", number=3, step=5)
+    decision = mirror_ppl.Communicator(fit, "person-01").plan(moment)
 
 The models are in `mirror_ppl.models`, the ways to fit them in `mirror_ppl.inference`, the worlds in
 `mirror_ppl.domains`. Nothing of it is imported before it is used, so that `import mirror_ppl` stays
@@ -19,9 +20,17 @@ from gymnasium import register as _register
 from mirror_ppl.version import __version__ as __version__
 
 if _TYPE_CHECKING:
-    from mirror_ppl.face import Communicator, Fit, HumanModel, infer, load_recordings, worlds
+    from mirror_ppl.face import (
+        Communicator,
+        Fit,
+        HumanModel,
+        RoundSoFar,
+        infer,
+        load_recordings,
+        worlds,
+    )
 
-__all__ = ["Communicator", "Fit", "HumanModel", "infer", "load_recordings", "worlds"]
+__all__ = ["Communicator", "Fit", "HumanModel", "RoundSoFar", "infer", "load_recordings", "worlds"]
 
 _register("mirror_ppl/Driving-v0", "mirror_ppl.domains.driving_environment:DrivingEnv")
 _register("mirror_ppl/SearchRescue-v0", "mirror_ppl.domains.rescue_environment:SearchRescueEnv")

@@ -130,3 +130,7 @@ class CheckpointError(MirrorError):
 
     It is damaged, or it belongs to a run with other options.
     """
+
+
+class UnreliableWeights(UserWarning):
+    """Importance weights of somebody are not to be relied on."""

@@ -6,6 +6,8 @@ The names here are those of the package itself, as in ``mirror_ppl.infer``. Comm
 from __future__ import annotations
 
 import sys
+import warnings
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -16,13 +18,14 @@ from mirror_ppl.checks import require_kind, seed_number, whole_number
 from mirror_ppl.communication.communicator import Communicator as PlannedCommunicator
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
+from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.console import usable_device
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import DOMAINS as worlds
 from mirror_ppl.domains import get_domain, require_known
-from mirror_ppl.errors import InputError
+from mirror_ppl.errors import InputError, UnreliableWeights
 from mirror_ppl.files import json_text, write_together
-from mirror_ppl.inference.engines import ENGINES, InferenceOptions
+from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.results.export import netcdf_content
@@ -44,10 +47,12 @@ from mirror_ppl.training.guide_file import network_for
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Communicator", "Fit", "HumanModel", "infer", "load_recordings", "worlds"]
+__all__ = ["Communicator", "Fit", "HumanModel", "RoundSoFar", "infer", "load_recordings", "worlds"]
 
 KEPT = ("means", "draws")
 """What may be kept of predictions."""
+SHIPPED = "the people that ship"
+"""Recordings of :func:`infer` unless others are given."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
 """Names of all files that a fit may write."""
 
@@ -67,11 +72,7 @@ class Fit(fitting.Fit):
 
     def __repr__(self) -> str:
         told = self.summary
-        doubtful = [
-            person["id"]
-            for person in told["people"]
-            if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
-        ]
+        doubtful = _doubtful(told)
         warning = f"; weights not to be relied on: {', '.join(doubtful)}" if doubtful else ""
         return (
             f"Fit({told['domain']}, {told['setting']}: {len(self.people)} people, "
@@ -149,7 +150,9 @@ class FittedPerson:
     name: str
 
     def __repr__(self) -> str:
-        return f"FittedPerson({self.name}: {self.summary['rounds']} rounds)"
+        doubtful = self.name in _doubtful(self.fit.summary)
+        warning = "; weights not to be relied on" if doubtful else ""
+        return f"FittedPerson({self.name}: {self.summary['rounds']} rounds{warning})"
 
     @property
     def number(self) -> int:
@@ -260,7 +263,7 @@ def load_recordings(
 
 
 def infer(  # noqa: PLR0913 - everything a fit can depend on
-    recordings: Demonstrations | str | Path | None = None,
+    recordings: Demonstrations | str | Path = SHIPPED,
     *,
     human: HumanModel | type[HumanModel] | str | None = None,
     engine: str = "auto",
@@ -285,7 +288,8 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     """Infer what people see and how they decide.
 
     Args:
-        recordings: rounds of P people, or a file of them; simulated people that ship unless given.
+        recordings: rounds of P people, or a file of them; simulated people that ship unless given
+            (people are chosen by ``recordings.select_people``).
         human: the human model: an object or a class, one of the package's names (such as
             ``one-radius``) or ``path/to/file.py:Class``; the package's own for the domain unless
             given.
@@ -297,7 +301,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         draws: posterior draws S of each person.
         train_rounds: how many rounds of each person to learn from; see
             :func:`mirror_ppl.inference.results.fitting.split_rounds`.
-        settings: of the engine; its own unless given.
+        settings: of the engine, such as ``{"steps": 500}``; its own unless given.
         refine: gradient steps on each person's rounds that refine what a network proposes.
         explore: rounds that the model plays in each scenario, to find the most informative one; 0
             leaves it out.
@@ -316,14 +320,26 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         report: told of progress; shown on stderr if that is a terminal unless given.
         checkpoint: file to continue from; written on the way, and kept.
 
+    Warns:
+        UnreliableWeights: importance weights of somebody are not to be relied on.
+
     Raises:
         InputError: an argument of another kind.
         MirrorError: what was asked for cannot be done; its kinds are those of
             :func:`mirror_ppl.inference.results.fitting.fit_people`.
     """
+    if recordings is None:
+        raise InputError("recordings are None; leave them out to fit the people that ship")
     if not isinstance(recordings, Demonstrations):
-        recordings = load_recordings(recordings)
+        recordings = load_recordings(None if recordings == SHIPPED else recordings)
     where = usable_device(device)
+    engine = engine_name(engine)
+    if isinstance(settings, Mapping):
+        kind = ENGINES[engine].settings
+        known = [field.name for field in fields(kind)]
+        settings = kind(
+            **{require_known(name, "setting", known): settings[name] for name in settings}
+        )
     options = InferenceOptions(
         engine,
         draws,
@@ -362,7 +378,23 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         )
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)
+    if doubtful := _doubtful(found.summary):
+        warnings.warn(
+            f"importance weights of {', '.join(doubtful)} are not to be relied on (Pareto k above "
+            f"{HIGH_PARETO_K}): use more proposals, or another engine",
+            UnreliableWeights,
+            stacklevel=2,
+        )
     return Fit(**vars(found))
+
+
+def _doubtful(summary: Mapping[str, Any]) -> list[str]:
+    """Ids of people whose importance weights are not to be relied on."""
+    return [
+        person["id"]
+        for person in summary["people"]
+        if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
+    ]
 
 
 def _human(

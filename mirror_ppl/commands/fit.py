@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
 
-from mirror_ppl.errors import OptionError
+from mirror_ppl.errors import OptionError, UnreliableWeights
 from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers, require_memory, share
 from mirror_ppl.progress import Stages
@@ -44,6 +45,8 @@ class Options:
     population: str | None = None
     """The people of the shipped recordings: paper (unless given; sight limited by the setting
     alone, in bomb_defusal as quick at every terminal) or diverse (each their own sight)."""
+    people: tuple[str, ...] = ()
+    """Ids of some of the people, whom to fit; all unless given."""
     out: Path = Path("runs/fit")
     """Folder for the results; made if it is not there."""
     train_rounds: int | None = None
@@ -122,7 +125,8 @@ def main(options: Options) -> None:
     allowed = share(options.allow_contradictions, "--allow-contradictions")
     _require_memory(recordings, options)
     results = output_folder(options.out, (*RESULTS, CHECKPOINT), parts=[f"{CHECKPOINT}.parts"])
-    with results as folder, Stages() as stages:
+    with results as folder, Stages() as stages, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnreliableWeights)  # the report says it
         fit = infer(
             recordings,
             human=options.human_model,
@@ -174,6 +178,11 @@ def _require_memory(demonstrations: Demonstrations, options: Options) -> None:
 
 
 def _recordings(options: Options) -> Demonstrations:
+    found = _all_recordings(options)
+    return found.select_people(list(options.people)) if options.people else found
+
+
+def _all_recordings(options: Options) -> Demonstrations:
     from mirror_ppl.face import load_recordings
 
     given = {name: getattr(options, name) for name in ("domain", "setting", "population")}

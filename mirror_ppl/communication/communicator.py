@@ -23,6 +23,7 @@ from mirror_ppl.communication.objectives import Objective, Value, Valued
 from mirror_ppl.communication.person import Person, PlanningContext
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
+from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.world_knowledge import planning_domain
@@ -65,7 +66,7 @@ class Gain:
         return f"{self.mean:+.2f} [{low:+.2f}, {high:+.2f}]"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Decision:
     """A message, and why it was chosen.
 
@@ -90,6 +91,9 @@ class Decision:
     chosen: int
     world: Domain
     over: bool = False
+
+    def __repr__(self) -> str:
+        return f"Decision({self.why()})"
 
     @property
     def told(self) -> Visibility:
@@ -243,7 +247,7 @@ class Decision:
         return ", and ".join(dict.fromkeys(about))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Communicator:
     """Plans messages for one person.
 
@@ -278,6 +282,9 @@ class Communicator:
         object.__setattr__(self, name, real_number(self.min_standard_errors, name, 0.0))
         object.__setattr__(self, "seed", seed_number(self.seed))
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({type(self.objective).__name__}, {self.person.number} draws)"
+
     @torch.no_grad()
     def plan(self, past: RoundSoFar) -> Decision:
         """What to communicate now.
@@ -290,6 +297,11 @@ class Communicator:
                 the domain have, or goes on after all was done.
         """
         domain = self.person.human.domain
+        if isinstance(past, Demonstrations):
+            raise InputError(
+                "the round so far must be a RoundSoFar, not recordings: RoundSoFar.of(recordings, "
+                "person, number, step) is that of a recorded round, RoundSoFar.begin a new one"
+            )
         past = require_kind(past, RoundSoFar, "the round so far").to(self.person.device)
         past.check(domain)
         channels = Channels(domain)

@@ -13,10 +13,14 @@ from mirror_ppl.checks import (
     flags,
     numbers,
     require_keys,
+    require_kind,
     require_methods,
     require_shape,
+    whole_number,
     whole_numbers,
 )
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains import require_known
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.errors import InputError, shown
 
@@ -90,6 +94,41 @@ class RoundSoFar:
         )
         past.check(domain)
         return past
+
+    @classmethod
+    def of(
+        cls, recordings: Demonstrations, person: str | None = None, number: int = 0, step: int = 0
+    ) -> RoundSoFar:
+        """A recorded round up to one of its steps.
+
+        Args:
+            recordings: of rounds.
+            person: id; the only one unless named.
+            number: of the round, from 0.
+            step: the one at which the person is about to act, from 0.
+
+        Raises:
+            InputError: there is no such round or step, or several people and none is named.
+            UnknownNameError: there is nobody of that id.
+        """
+        people = require_kind(recordings, Demonstrations, "recordings").people
+        if person is None and len(people) > 1:
+            raise InputError(f"the recordings are of {len(people)} people: name one of them")
+        name = require_known(next(iter(people)) if person is None else person, "person", people)
+        who = people.index(name)
+        rounds = int(recordings.round_counts[who])
+        number = whole_number(number, "number", 0)
+        if number >= rounds:
+            raise InputError(f"{name} has rounds 0 to {rounds - 1}, not {number}")
+        steps, step = int(recordings.lengths[who, number]), whole_number(step, "step", 0)
+        if step > steps:
+            raise InputError(f"round {number} of {name} has steps 0 to {steps}, not {step}")
+        seen = recordings.observation().items()
+        return cls(
+            {key: value[who, number, : step + 1] for key, value in seen},
+            recordings.actions[who, number, :step],
+            {key: mask[who, number, :step] for key, mask in recordings.told.items()},
+        )
 
     def then(self, told: Visibility, action: int | Tensor, observation: Observation) -> RoundSoFar:
         """The round one step later.

@@ -13,7 +13,7 @@ from mirror_ppl.jobs import Runner, TensorFormat
 from mirror_ppl.progress import Report, Reported, silent
 
 PART = 4
-"""People of a part: few, so that processes end at about the same time and little is lost when they
+"""People of a part, at most: few, so that processes end at about the same time and little is lost when they
 are stopped."""
 PEOPLE_OF_A_PROCESS = 10
 """People that are worth the seconds in which a further process starts."""
@@ -87,13 +87,15 @@ class Workers:
         Returns:
             Results of the parts, in order.
         """
-        cells = [People(first, min(first + PART, people)) for first in range(0, people, PART)]
+        processes = self._processes(people)
+        size = PART if self.scheduler else min(PART, math.ceil(people / max(processes, 1)))
+        cells = [People(first, min(first + size, people)) for first in range(0, people, size)]
         runner = Runner(
             self.folder,
             lambda cell: f"{name} {identity}",
-            self._processes(people),
+            processes,
             self.scheduler,
-            progress=Reported(name, people, PART, self.report),
+            progress=Reported(name, people, size, self.report),
         )
         outcomes = runner.run(cells, work, TensorFormat(), given)
         found = [outcome.result for outcome in outcomes]

@@ -1,6 +1,7 @@
 """A trial that what engines compute of a human model is its program, number by number.
 
-Made-up rounds have a density under the program, run as it is for one draw at a time, and another
+Every site of ``prior`` and ``act`` has the same density for a person whoever else there is. And
+made-up rounds have a density under the program, run as it is for one draw at a time, and another
 one that is put together as engines do it, for all draws at once. Both are the same unless a method
 says something that the parts leave out, count twice, or take from somebody else.
 """
@@ -19,16 +20,27 @@ from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combination_sets import fixed_prior
 from mirror_ppl.likelihood.combinations import log_priors, perceived_sites
-from mirror_ppl.likelihood.densities import Given, choices, log_correction, log_latents, prior_nodes
+from mirror_ppl.likelihood.densities import (
+    Given,
+    choices,
+    log_correction,
+    log_latents,
+    log_prob,
+    prior_nodes,
+)
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, at_step, messages_at, recorded_covariates
 from mirror_ppl.models.prior import Draws, draw_prior
-from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.models.sites import latent_sites, sample_nodes
 
-DRAWS, ROUNDS, STEPS = 3, 2, 4
+DRAWS, ROUNDS, STEPS = 6, 2, 4
 SEED = 0
 TOLERANCE = 1e-3
 """In nats, and of what the density is; both are sums of the same numbers in 32 bits."""
+COMPARED = 16
+"""Draws of two people, of whom each is compared with all of them."""
+OF_A_SITE = 2e-5
+"""As TOLERANCE, of one site."""
 
 
 @torch.no_grad()
@@ -38,6 +50,7 @@ def check_agreement(human: HumanModel) -> None:
     Raises:
         HumanModelError: they differ.
     """
+    _check_each_alone(human)
     rounds = made_up_rounds(human.domain, next(human.parameters()).device)
     draws = draw_prior(human, 1, DRAWS, SEED)
     expected, latents = log_densities(human, rounds, draws)
@@ -48,13 +61,77 @@ def check_agreement(human: HumanModel) -> None:
     draw = int((~close).nonzero()[0])
     kind = type(human).__name__
     raise HumanModelError(
-        f"{kind} says something that is not of one person or not seen by the engines: of made-up "
-        f"rounds they would compute a log density of {float(found[draw]):.6g}, and its program "
-        f"has {float(expected[draw]):.6g}. A sum over all dimensions, as in factor(x.sum()), mixes "
-        "people; Python's `if` on values decides for all of them; values that are changed in place "
-        "are not followed. Or override model(), if only to call super().model(rounds, world), "
-        "which the engines svi and nuts then run as it is, slowly"
+        f"{kind} says something that engines do not see, or take from others: of made-up rounds "
+        f"they would compute a log density of {float(found[draw]):.6g}, and its program has "
+        f"{float(expected[draw]):.6g}. Python's `if` on values decides for all people at once, and "
+        "values that are changed in place are not followed; see docs/extending.md"
     )
+
+
+def _check_each_alone(human: HumanModel) -> None:
+    """Compare every site of ``prior`` and ``act`` of each of some people with that of all."""
+    draws = draw_prior(human, 2, COMPARED, SEED)
+    together, again = (_said_by_site(human, draws, COMPARED, 2, seed) for seed in range(2))
+    for (method, name), value in together.items():
+        if not torch.equal(value, again[method, name]):
+            raise HumanModelError(
+                f'{method} says something else of "{name}" when it is run again: whatever is '
+                "random has to be sampled by pyro.sample"
+            )
+    for draw in range(COMPARED):
+        for person in range(2):
+            own = {
+                name: value[draw : draw + 1, person : person + 1] for name, value in draws.items()
+            }
+            alone = _said_by_site(human, own, 1, 1)
+            for method, name in together.keys() ^ alone.keys():
+                raise HumanModelError(
+                    f'{method} has "{name}" of some people only, and others decide of whom: write '
+                    "torch.where or poutine.mask in place of Python's `if` on values"
+                )
+            for (method, name), value in alone.items():
+                found = together[method, name][draw, person]
+                if not torch.allclose(found, value[0, 0], OF_A_SITE, OF_A_SITE, equal_nan=True):
+                    raise HumanModelError(
+                        f'the log density of "{name}" in {method} is '
+                        f"{float(value.flatten()[0]):.6g} of one person alone and "
+                        f"{float(found.flatten()[0]):.6g} among others: a sum over all dimensions, "
+                        "as in factor(x.sum()), adds them up (sum over event dimensions alone), "
+                        "and Python's `if` on values decides for all of them"
+                    )
+
+
+def _said_by_site(
+    human: HumanModel, draws: Mapping[str, Tensor], number: int, people: int, seed: int = 0
+) -> dict[tuple[str, str], Tensor]:
+    """Log densities ``[S, P, B]`` by method and site, of draws ``[S, P, 1, ...]`` and one belief.
+
+    Of an action, that of the first one.
+    """
+    generator = torch.Generator().manual_seed(SEED)
+    like = next(human.parameters())
+    belief = torch.randn(1, 1, human.belief_size, generator=generator).to(like)
+    belief = belief.expand(people, 1, -1)
+    values = human.action_values(belief)
+    done = torch.zeros(people, 1, dtype=torch.long, device=like.device)
+    with (
+        torch.random.fork_rng(devices=[]),
+        poutine.block(),
+        Given(dict(draws)),
+        pyro.plate("draw", number, dim=-3),
+        pyro.plate("person", people, dim=-2),
+    ):
+        torch.manual_seed(seed)
+        with poutine.trace() as prior:
+            implants = human.prior()
+        with poutine.trace() as act, pyro.plate("round", 1, dim=-1):
+            human.choose(implants, belief, values, done)
+        traces = {"prior": prior.trace, "act": act.trace}
+    return {
+        (method, name): log_prob(node).expand(number, people, 1)
+        for method, trace in traces.items()
+        for name, node in sample_nodes(trace).items()
+    }
 
 
 def made_up_rounds(domain: Domain, device: torch.device) -> Demonstrations:

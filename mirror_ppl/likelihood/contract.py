@@ -125,10 +125,15 @@ def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
         found = human.act(implants, belief, values)
     for name in latent_sites(trace.trace):
-        raise HumanModelError(f'act samples "{name}" at every step; sample it in prior')
+        raise HumanModelError(
+            f'act samples "{name}" at every step; sample it in prior if it is one of a person, '
+            "else sum it out in what act returns, by torch.logaddexp"
+        )
     _refuse_parameters(trace.trace)
     _refuse_plates(trace.trace)
     expected = (len(belief), 1, len(human.domain.actions))
+    if not torch.is_tensor(found):
+        raise HumanModelError(f"act returned {type(found).__name__}, expected log-probabilities")
     if tuple(found.shape[-3:]) != expected:
         raise HumanModelError(
             f"act returned shape {tuple(found.shape)}, expected {expected} for (people, rounds, "

@@ -150,7 +150,8 @@ def check_plates(name: str, found: Tensor, people: int, rounds: int = 1) -> None
     if shape[0] not in (1, people) or shape[1] not in (1, rounds):
         raise HumanModelError(
             f'"{name}" has a log density of shape {tuple(found.shape)}, expected one number for '
-            f"each of {people} people and {rounds} rounds in its last two dimensions"
+            f"each of {people} people and {rounds} rounds in its last two dimensions; what was "
+            "measured of each person comes with the recordings, as their measurements"
         )
 
 

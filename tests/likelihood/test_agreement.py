@@ -62,6 +62,43 @@ class SumOfPeople(ToyHuman):
         return implants
 
 
+class SmallSum(ToyHuman):
+    def prior(self):
+        implants = super().prior()
+        pyro.factor("q", 0.001 * implants["in_sight"].sum())
+        return implants
+
+
+class AllOrNobody(ToyHuman):
+    def prior(self):
+        implants = super().prior()
+        if (implants["in_sight"] > 0.3).all():
+            pyro.factor("q", implants["in_sight"])
+        return implants
+
+
+class SomebodyInAct(ToyHuman):
+    def act(self, implants, belief, values):
+        found = super().act(implants, belief, values)
+        return found if bool((implants["in_sight"] < 0.5).all()) else found.flip(-1)
+
+
+class Wavering(ToyHuman):
+    def act(self, implants, belief, values):
+        either = 0.1 * torch.randn(()) * torch.tensor([1.0, -1.0])
+        return (super().act(implants, belief, values) + either).log_softmax(-1)
+
+
+class SomebodySeesAll(ToyHuman):
+    """If anybody sees far, everybody sees everything."""
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        view, knowledge = super().perceive(implants, knowledge, observation, told, step)
+        if bool((implants["reach"] > 3).any()):
+            view = view.map(torch.ones_like)
+        return view, knowledge
+
+
 class SmallWeights(HumanModel):
     def prior(self):
         implants = super().prior()
@@ -123,9 +160,14 @@ class Within(ToyHuman):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (SumOfPeople, "SumOfPeople says something that is not of one person"),
-        (SmallWeights, "SmallWeights says something that is not of one person"),
-        (SumOfPeopleInAct, "SumOfPeopleInAct says something that is not of one person"),
+        (SumOfPeople, 'the log density of "q" in prior is .* of one person alone and'),
+        (SmallSum, 'the log density of "q" in prior is .* of one person alone and'),
+        (SmallWeights, 'the log density of "small" in prior is .* of one person alone and'),
+        (SumOfPeopleInAct, 'the log density of "q" in act is .* of one person alone and'),
+        (AllOrNobody, 'prior has "q" of some people only'),
+        (SomebodyInAct, 'the log density of "action" in act is .* of one person alone and'),
+        (Wavering, 'act says something else of "action" when it is run again'),
+        (SomebodySeesAll, "SomebodySeesAll says something that engines do not see"),
         (Clamped, 'prior returns other values of "reach" than those that it sampled'),
         (NoticesAtOnce, 'round_latents returns other values of "noticed_'),
         (Assuming, 'perceive.. reads "assumes_clear", which is not a discrete site'),
