@@ -58,7 +58,7 @@ def folder(some, tmp_path_factory):
 
 def short_fit(folder, out, steps=4):
     some = "--demos", folder / "some.nc", "--out", folder / out
-    return *some, "--guide", "svi", "--steps", steps, "--draws", 10
+    return *some, "--guide", "svi", "--steps", steps, "--draws", 10, "--explore", 2
 
 
 def summary_of(folder):

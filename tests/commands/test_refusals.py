@@ -35,11 +35,11 @@ def test_nothing_is_simulated_for_a_file_that_cannot_be_written(tmp_path, monkey
 
 
 def test_what_was_told_is_in_the_posterior_file(tmp_path):
-    options = fit.Options(out=tmp_path, train_rounds=1, steps=2, draws=4)
+    options = fit.Options(out=tmp_path, people=("person-01",), train_rounds=1, draws=4, explore=0)
     fit.main(options)
     with xr.open_dataset(tmp_path / "posterior.nc", group="constant_data") as constants:
         assert constants["told_visual"].dims[:3] == ("person", "round", "step")
-        assert constants["told_verbal"].shape == (10, 1, 15, 4)
+        assert constants["told_verbal"].shape == (1, 1, 15, 4)
         assert not constants["told_verbal"].any()
 
 

@@ -678,7 +678,7 @@ def fits(tmp_path_factory):
     some = every.select_people([0, 1]).select_rounds(range(4))
     save_demonstrations(folder / "some.nc", some)
     for seed in (0, 1):
-        options = fit.Options(folder / "some.nc", out=folder / f"{seed}", steps=3, draws=12)
+        options = fit.Options(folder / "some.nc", out=folder / f"{seed}", draws=12, explore=0)
         fit.main(fit.Options(**{**vars(options), "seed": seed}))
     return folder
 

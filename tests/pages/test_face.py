@@ -16,7 +16,12 @@ from mirror_ppl.arviz import az
 from mirror_ppl.commands import fit as fit_command
 from mirror_ppl.communication import RoundSoFar
 from mirror_ppl.data import save_demonstrations
-from mirror_ppl.errors import DemonstrationsError, InputError, UnknownNameError
+from mirror_ppl.errors import (
+    DemonstrationsError,
+    InputError,
+    UnknownNameError,
+    UnreliableWeights,
+)
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.people import simulate
 
@@ -206,3 +211,69 @@ def test_worlds_without_a_picture_say_so():
         with pytest.raises(InputError):
             draw()
     assert fit.plot.implants("person-01").content()
+
+
+def test_settings_may_be_given_by_name(recordings):
+    some = recordings.select_people(["person-01"])
+    fit = mirror_ppl.infer(
+        some, engine="svi", settings={"steps": 3}, draws=5, train_rounds=1, explore=0
+    )
+    assert len(fit.posterior.losses) == 3
+    with pytest.raises(UnknownNameError, match='unknown setting "stpes"; .* meant "steps"'):
+        mirror_ppl.infer(some, engine="svi", settings={"stpes": 3})
+
+
+def test_nothing_is_no_recordings():
+    with pytest.raises(InputError, match="recordings are None; leave them out"):
+        mirror_ppl.infer(None)
+
+
+def test_weights_that_cannot_be_relied_on_are_told(fit, recordings, monkeypatch):
+    monkeypatch.setattr("mirror_ppl.face.HIGH_PARETO_K", -9.0)
+    with pytest.warns(UnreliableWeights, match="weights of person-01 are not to be relied on"):
+        found = mirror_ppl.infer(
+            recordings.select_people(["person-01"]), draws=5, train_rounds=3, explore=0
+        )
+    assert "not to be relied on: person-01" in repr(found)
+    assert repr(found.person()) == "FittedPerson(person-01: 3 rounds; weights not to be relied on)"
+
+
+def test_some_people_are_fitted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    options = ("--train-rounds", 1, "--draws", 5, "--explore", 0, "--out", "one")
+    assert command(fit_command, "--people", "person-03", *options) == 0
+    summary = json.loads((tmp_path / "one" / "summary.json").read_text())
+    assert [person["id"] for person in summary["people"]] == ["person-03"]
+    capsys.readouterr()
+    assert command(fit_command, "--people", "person-3", *options) == 2
+    assert "person-3" in capsys.readouterr().err
+
+
+def test_moments_of_recordings(fit, recordings):
+    past = RoundSoFar.of(recordings, "person-04", 7, 5)
+    assert torch.equal(past.actions, recordings.actions[1, 7, :5])
+    now = recordings.observation()["visual"][1, 7, 5]
+    assert torch.equal(past.now["visual"], now)
+    communicator = mirror_ppl.Communicator(fit, "person-04")
+    decision = communicator.plan(past)
+    assert repr(decision) == f"Decision({decision.why()})"
+    assert repr(communicator) == "Communicator(ExpectedUtility, 30 draws)"
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({}, "the recordings are of 2 people: name one of them"),
+        ({"person": "person-05"}, 'unknown person "person-05"'),
+        ({"person": "person-01", "number": 40}, "person-01 has rounds 0 to 39, not 40"),
+        ({"person": "person-01", "step": 16}, "round 0 of person-01 has steps 0 to 15, not 16"),
+    ],
+)
+def test_moments_that_are_not_recorded_are_refused(recordings, asked, message):
+    with pytest.raises((InputError, UnknownNameError), match=message):
+        RoundSoFar.of(recordings, **asked)
+
+
+def test_recordings_are_no_moment(fit, recordings):
+    with pytest.raises(InputError, match=r"must be a RoundSoFar, not recordings: RoundSoFar.of"):
+        mirror_ppl.Communicator(fit, "person-01").plan(recordings)
