@@ -5,9 +5,10 @@
 The other revision is checked out into a temporary folder. Every measurement is made by both in
 turn, in processes of their own, so that whatever else the machine does weighs on both. The table
 holds the median of each and their ratio, with the smallest and the largest ratio of a turn; below 1
-this version is the quicker one. Measured are `fit` of the recordings that ship (all of the command,
-by importance), a decision of the communicator with default settings, and a round that is added to a
-person's posterior.
+this version is the quicker one. Measured are `fit` of the recordings that ship and of 40 simulated
+people (all of the command, by importance, as it shares the cores; with its largest memory, of all
+its processes together), a decision of the communicator with default settings, a round that is added
+to a person's posterior, and simulation. Threads are one but in fits.
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from time import perf_counter
+from time import perf_counter, sleep
 
+import psutil
 import tyro
 
 from benchmarks._state import ROOT
@@ -70,8 +73,9 @@ def main(options: Options) -> None:
 def all_measurements() -> dict[str, Measure]:
     """The measurements by name."""
     found: dict[str, Measure] = {
-        f"fit {domain}": lambda tree, d=domain: fit(tree, d) for domain, _ in WORLDS
+        f"fit {domain}": lambda tree, d=domain: fit(tree, "--domain", d) for domain, _ in WORLDS
     }
+    found["fit 40 people"] = fit_many
     found["plan driving"] = lambda tree: work(tree, "plan")
     for domain, setting in WORLDS:
         found[f"add {domain}"] = lambda tree, d=domain, s=setting: work(tree, "add", d, s, "none")
@@ -99,13 +103,42 @@ def compare(name: str, call: Measure, other: Path, repeats: int) -> list[dict[st
     return rows
 
 
-def fit(tree: Path, domain: str) -> dict[str, float]:
-    """Seconds of `fit` of the ten people that ship, by importance."""
+def fit(tree: Path, *arguments: str) -> dict[str, float]:
+    """Seconds and megabytes of `fit` by importance."""
     with tempfile.TemporaryDirectory() as out:
-        began = perf_counter()
         # The engine's name in version 0.1.0, which this version still takes.
-        run(tree, "-m", "mirror_ppl.fit", "--domain", domain, "--guide", "exact", "--out", out)
-        return {"seconds": perf_counter() - began}
+        command = ["-m", "mirror_ppl.fit", *arguments, "--guide", "exact", "--out", out]
+        began, watch = perf_counter(), Memory()
+        run(tree, *command, threads=None, watch=watch)
+        return {"seconds": perf_counter() - began, "megabytes": watch.most}
+
+
+def fit_many(tree: Path) -> dict[str, float]:
+    """Of 40 simulated people who drive in fog, without looking for the most informative round."""
+    with tempfile.TemporaryDirectory() as folder:
+        rounds = str(Path(folder) / "many.nc")
+        people = ("--people", "40", "--rounds", "40", "--setting", "fog", "--seed", "100")
+        run(ROOT, "-m", "mirror_ppl.simulate", *people, "--out", rounds)
+        return fit(tree, "--demos", rounds, "--explore", "0")
+
+
+class Memory:
+    """The largest memory of a process and all that it starts, looked at now and then.
+
+    Attributes:
+        most: in megabytes; pages that several share count once.
+    """
+
+    def __init__(self) -> None:
+        self.most = 0.0
+
+    def look(self, process: psutil.Process) -> None:
+        """Look once."""
+        total = 0
+        for one in (process, *process.children(recursive=True)):
+            with suppress(psutil.Error):
+                total += one.memory_full_info().pss
+        self.most = max(self.most, total / 2**20)
 
 
 def work(tree: Path, *arguments: str) -> dict[str, float]:
@@ -113,21 +146,24 @@ def work(tree: Path, *arguments: str) -> dict[str, float]:
     return json.loads(run(tree, str(WORK), *arguments).splitlines()[-1])
 
 
-def run(tree: Path, *arguments: str) -> str:
+def run(tree: Path, *arguments: str, threads: int | None = 1, watch: Memory | None = None) -> str:
     """Output of Python with the package of that folder."""
-    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    environment["PYTHONWARNINGS"] = "ignore"
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=tree,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise SystemExit(f"{' '.join(arguments)} in {tree.name}:\n{done.stderr}")
-    return done.stdout
+    environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONWARNINGS": "ignore"}
+    if threads is not None:
+        environment["OMP_NUM_THREADS"] = str(threads)
+    with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as wrong:
+        process = psutil.Popen(
+            [sys.executable, *arguments], cwd=tree, env=environment, stdout=said, stderr=wrong
+        )
+        while process.poll() is None:
+            if watch is not None:
+                watch.look(process)
+            sleep(0.1)
+        said.seek(0)
+        wrong.seek(0)
+        if process.returncode:
+            raise SystemExit(f"{' '.join(arguments)} in {tree.name}:\n{wrong.read()}")
+        return said.read()
 
 
 def git(*arguments: str) -> None:
