@@ -79,7 +79,7 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
                 found, own = model_name(str(found)), model_name(own)
             raise AssetError(
                 f"{path}: is for {name.replace('_', ' ')} {found}, not {own}; "
-                "train a guide for it, or use --guide importance"
+                "train a guide for it, or use the engine importance"
             )
     try:
         card = json.loads(metadata["card"])
