@@ -87,15 +87,14 @@ class Workers:
         Returns:
             Results of the parts, in order.
         """
-        processes = self._processes(people)
-        size = PART if self.scheduler else min(PART, math.ceil(people / max(processes, 1)))
-        cells = [People(first, min(first + size, people)) for first in range(0, people, size)]
+        # Of one size whoever does the work: what is computed together may differ in its last digit.
+        cells = [People(first, min(first + PART, people)) for first in range(0, people, PART)]
         runner = Runner(
             self.folder,
             lambda cell: f"{name} {identity}",
-            processes,
+            self._processes(people),
             self.scheduler,
-            progress=Reported(name, people, size, self.report),
+            progress=Reported(name, people, PART, self.report),
         )
         outcomes = runner.run(cells, work, TensorFormat(), given)
         found = [outcome.result for outcome in outcomes]

@@ -116,7 +116,7 @@ class Fails(ToyHuman):
     def act(self, implants, belief, values):
         global calls
         calls += 1
-        if calls > 3:
+        if implants["in_sight"].shape[-2] > 2:
             raise RuntimeError("later")
         return super().act(implants, belief, values)
 """

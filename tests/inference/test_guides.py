@@ -253,8 +253,7 @@ def test_a_prior_that_depends_on_what_is_seen_is_refused(toy, recordings):
         def prior(self):
             implants = super().prior()
             far = (implants["reach"] > 2).float()
-            implants["in_sight"] = pyro.sample("depends", dist.Beta(1 + far, 2 - far))
-            return implants
+            return implants | {"depends": pyro.sample("depends", dist.Beta(1 + far, 2 - far))}
 
     human = Hierarchical(toy.self_model)
     for guide in ("importance", "svi"):
