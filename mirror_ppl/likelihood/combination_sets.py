@@ -19,9 +19,9 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import distinct_rows
 
-TRIED = 32
+TRIED = 8
 """Draws of other implants under which priors of combinations are compared,"""
-COMPARED = 2048
+COMPARED = 256
 """of so many combinations, some of all."""
 
 
