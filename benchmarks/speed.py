@@ -7,8 +7,8 @@ turn, in processes of their own, so that whatever else the machine does weighs o
 holds the median of each and their ratio, with the smallest and the largest ratio of a turn; below 1
 this version is the quicker one. Measured are `fit` of the recordings that ship and of 40 simulated
 people (all of the command, by importance, as it shares the cores; with its largest memory, of all
-its processes together), a decision of the communicator with default settings, a round that is added
-to a person's posterior, and simulation. Threads are one but in fits.
+its processes together), a decision of the communicator with default settings, and a round that is
+added to a person's posterior. Threads are one but in fits.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
     import mirror_ppl
 
-    fit = mirror_ppl.infer("recordings.nc")
+    recordings = mirror_ppl.load_recordings("recordings.nc")
+    fit = mirror_ppl.infer(recordings)
     fit.plot.sight()
     moment = mirror_ppl.RoundSoFar.of(recordings, "person-01", number=3, step=5)
     decision = mirror_ppl.Communicator(fit, "person-01").plan(moment)

@@ -13,8 +13,8 @@ from mirror_ppl.jobs import Runner, TensorFormat
 from mirror_ppl.progress import Report, Reported, silent
 
 PART = 4
-"""People of a part, at most: few, so that processes end at about the same time and little is lost
-when they are stopped."""
+"""People of a part: few, so that processes end at about the same time and little is lost when they
+are stopped."""
 PEOPLE_OF_A_PROCESS = 10
 """People that are worth the seconds in which a further process starts."""
 
