@@ -375,6 +375,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             workers,
             explore,
             require_known(keep, "keep", KEPT) == "draws",
+            checked=True,
         )
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)

@@ -55,15 +55,19 @@ ENGINES: Mapping[str, Engine] = {
 """The registry; a new engine is a file of its own and its name here."""
 
 
-def engine_name(name: str) -> str:
+def engine_name(name: str, frames: int = 1) -> str:
     """The name of an engine, also where it is given as it was called formerly.
+
+    Args:
+        name: as given.
+        frames: calls between whoever gave it and this function, whom a note is about.
 
     Raises:
         UnknownNameError: there is no such engine.
     """
     name, note = current_name(name)
     if note is not None:
-        warnings.warn(f"the engine {note}", FutureWarning, stacklevel=4)
+        warnings.warn(f"the engine {note}", FutureWarning, stacklevel=2 + frames)
     if name not in ENGINES:
         raise UnknownNameError.of("engine", name, ENGINES)
     return name
@@ -95,7 +99,7 @@ class InferenceOptions:
     allow_contradictions: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "engine", engine_name(self.engine))
+        object.__setattr__(self, "engine", engine_name(self.engine, 2))
         engine = ENGINES[self.engine]
         if self.settings is None:
             object.__setattr__(self, "settings", engine.settings())
@@ -123,6 +127,7 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
     checkpoint: tuple[Path, str] | None = None,
     population: Population | None = None,
     workers: Workers = Workers(),  # noqa: B008 - frozen
+    checked: bool = False,
 ) -> Inferred:
     """Posterior draws of the implants of P people.
 
@@ -139,6 +144,7 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
             themselves keep parts of the people in a folder, and leave those of other runs alone.
         population: that the people are from, if it is known from others: their prior, then.
         workers: who does it, of engines that infer each person by themselves.
+        checked: that :func:`check_contract` was called already.
 
     Raises:
         HumanModelError: the human model breaks its contract, or cannot be fitted by this engine.
@@ -148,7 +154,8 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         DemonstrationsError: the rounds cannot be in the domain's world.
     """
     check_rounds(human, demonstrations)
-    check_contract(human)
+    if not checked:
+        check_contract(human)
     require_kind(options, InferenceOptions, "options")
     if options.allow_contradictions < 1:
         check_world(demonstrations, options.allow_contradictions)
@@ -261,8 +268,9 @@ def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequen
     kinds = [kind for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
     source = [(kind.__qualname__, _source(kind)) for kind in kinds]
     weights = [fingerprint(human), None if network is None else fingerprint(network)]
-    # What it leans on elsewhere shows in what it says.
-    said = said_of_made_up_rounds(human)
+    # What it leans on elsewhere shows in what it says; a program of one's own may need more than
+    # made-up rounds have.
+    said = [] if has_own_program(human) else said_of_made_up_rounds(human)
     description = [weights, source, said, __version__, [str(part) for part in what]]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 

@@ -33,10 +33,9 @@ from mirror_ppl.likelihood.enumeration import (
     log_joints,
     require_acting_on_beliefs,
 )
-from mirror_ppl.likelihood.policies import ENOUGH, effective
+from mirror_ppl.likelihood.policies import ENOUGH, effective, within
 from mirror_ppl.likelihood.tables import restricted
 from mirror_ppl.likelihood.view_table import ViewTable
-from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
 
@@ -233,10 +232,7 @@ class Sampler:
         joint, said = torch.cat(self._joints), torch.cat(self._corrections)
         if float(said.max() - said.min()) > 0 and effective(said) < min(ENOUGH, len(said) / 2):
             return
-        best = joint + said[:, None]
-        if dependencies(self.human).adds_to_actions:  # as in ViewTableBuilder
-            best = best - best.amax(-1, keepdim=True)
-        keep = (best - best.max()).amax(0) >= -margin
+        keep = within(self.human, joint + said[:, None], margin)
         self.combinations = self.combinations.kept(keep)
         self._joints = [joint[:, keep] for joint in self._joints]
         if self.table.real.any():

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.densities import adds_to_prior, log_correction
+from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, draw_prior
 
@@ -64,6 +65,22 @@ def draw_policies(
 def effective(log_weights: Tensor) -> float:
     """Effective number of draws of log weights ``[S]``."""
     return float(1 / torch.softmax(log_weights.double(), 0).square().sum())
+
+
+def within(human: HumanModel, log_joint: Tensor, margin: float) -> Tensor:
+    """Which combinations ``[M]`` are worth keeping.
+
+    Args:
+        human: the model of people.
+        log_joint: of each combination and what was recorded, under each policy ``[S, M]``.
+        margin: nats by which one may fall behind the best, each under the policy that suits it
+            best.
+    """
+    if dependencies(human).adds_to_actions:
+        # What is recorded besides actions may tell of somebody whom no policy is like.
+        log_joint = log_joint - log_joint.amax(-1, keepdim=True)
+    best = log_joint.amax(0)
+    return best >= best.max() - margin
 
 
 def _said(human: HumanModel, grid: Mapping[str, Tensor], draws: Draws) -> Tensor:

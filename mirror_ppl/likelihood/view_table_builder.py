@@ -34,7 +34,7 @@ from mirror_ppl.likelihood.densities import (
     log_weighted_latents,
     require_compilable,
 )
-from mirror_ppl.likelihood.policies import draw_policies
+from mirror_ppl.likelihood.policies import draw_policies, within
 from mirror_ppl.likelihood.round_views import (
     ManyViews,
     Rounds,
@@ -46,7 +46,6 @@ from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.belief_tracking import CHUNK
-from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
@@ -246,11 +245,7 @@ class ViewTableBuilder:
         self.score[:, alive] = score
         # With their prior: what it says, by a factor or an observed site too, may decide.
         joint = score + self.log_prior[:, alive]
-        if dependencies(self.human).adds_to_actions:
-            # What is recorded besides actions may tell of somebody whom no policy is like.
-            joint = joint - joint.amax(-1, keepdim=True)
-        best = joint.amax(0)
-        self.alive = alive[best >= best.max() - screening.margin]
+        self.alive = alive[within(self.human, joint, screening.margin)]
 
     def table(self) -> ViewTable:
         """The views that are left, as a table of one person; there was at least one round."""

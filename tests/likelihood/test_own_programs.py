@@ -13,11 +13,12 @@ from pyro.infer import SVI, Trace_ELBO
 from pyro.infer.autoguide import AutoNormal
 from test_one_program import recordings
 
+import mirror_ppl
 from benchmarks.one_program import exact_mean, own_program, toy
 from mirror_ppl.communication.person import Person
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference import batches
-from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.nuts import NUTSOptions
 from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
@@ -229,6 +230,18 @@ def test_what_is_wrong_with_it_is_said(kind, message, engine, recordings):
         infer(kind(self_model()), recordings, InferenceOptions(engine, 10), 0)
 
 
-def test_the_former_name_of_importance():
-    with pytest.warns(FutureWarning, match='"exact" is called "importance" now'):
+def test_the_former_name_of_importance(recordings):
+    with pytest.warns(FutureWarning, match='"exact" is called "importance" now') as told:
         assert InferenceOptions("exact").engine == "importance"
+        with pytest.raises(InputError, match="explore"):
+            mirror_ppl.infer(recordings, engine="exact", explore=-1)
+    assert [one.filename for one in told] == [__file__] * 2  # of whoever gave it
+
+
+def test_its_runs_are_told_apart_without_running_it():
+    class Particular(ToyHuman):
+        def model(self, rounds, world=False):
+            raise RuntimeError("of nobody but the recorded")
+
+    human = Particular(self_model())
+    assert run_identity(human, None, ["x"]) != run_identity(human, None, ["y"])

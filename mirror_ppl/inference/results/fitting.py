@@ -19,6 +19,7 @@ from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.results.description import Description, describe
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.workers import Workers, parts_of
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
@@ -103,6 +104,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     workers: Workers = Workers(),  # noqa: B008 - frozen
     explore: int = 0,
     every_draw: bool = False,
+    checked: bool = False,
 ) -> Fit:
     """Infer the implants of everybody in recordings, and predict their held-out actions.
 
@@ -120,6 +122,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         workers: who does the work; report and folder are the others' here.
         explore: rounds that the model plays in each scenario, to find the most informative one.
         every_draw: keep predictions of held-out actions under every draw, and all of the prior.
+        checked: that :func:`check_contract` was called already.
 
     Raises:
         InputError: an argument of another kind, or rounds of another domain.
@@ -129,6 +132,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         CheckpointError: the checkpoint is damaged or of another run.
     """
     check_rounds(human, demonstrations)
+    if not checked:
+        check_contract(human)
     require_kind(options, InferenceOptions, "options")
     contradictions = check_world(demonstrations, options.allow_contradictions)
     seed = seed_number(seed)
@@ -142,8 +147,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         identity = run_identity(human, network, which)
         run = checkpoint, identity
     # All rounds were checked together.
-    checked = replace(options, allow_contradictions=1.0)
-    posterior = infer(human, train, checked, seed, network, report, run, population, workers)
+    anyway = replace(options, allow_contradictions=1.0)
+    posterior = infer(human, train, anyway, seed, network, report, run, population, workers, True)
     how = Description(human, seed, explore, posterior.population, every_draw)
     if checkpoint is not None and test is not None:
         identity += f"{_recorded(test)} {explore} {every_draw}"
