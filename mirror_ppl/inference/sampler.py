@@ -18,11 +18,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from mirror_ppl.inference.pareto import pareto_smoothed
 from mirror_ppl.inference.residual_proposal import SITE, ResidualProposal
 from mirror_ppl.likelihood.combination_sets import EquivalentCombinations, fixed_prior
 from mirror_ppl.likelihood.combinations import discrete_sites
@@ -357,7 +357,7 @@ class Sampler:
         mixture = torch.logsumexp(torch.stack(parts), 0)
         target = joint.logsumexp(-1) + of_scalars + of_discrete + prior
         target = target + torch.cat(self._corrections)
-        log_weights, pareto_k = _smoothed(target - mixture)
+        log_weights, pareto_k = pareto_smoothed((target - mixture).double())
         return Weighted(
             policy, self.combinations, joint, log_weights, pareto_k, self.proposes_residual
         )
@@ -411,15 +411,3 @@ def _log_abs_det(sites: Mapping[str, Any], place: Tensor) -> Tensor:
     for column, site in enumerate(sites.values()):
         total = total + site.log_abs_det_jacobian(place[:, column], site(place[:, column]))
     return total
-
-
-def _smoothed(raw: Tensor) -> tuple[Tensor, float]:
-    """Normalized, Pareto-smoothed log weights ``[S]`` and their Pareto k."""
-    raw = raw.double()
-    if float(raw.max() - raw.min()) < 1e-9:
-        return torch.log_softmax(raw, 0), -math.inf
-    from mirror_ppl.arviz import az
-
-    with np.errstate(over="ignore"):  # of tails that end
-        smooth, pareto_k = az.psislw(raw.cpu().numpy())
-    return torch.log_softmax(torch.as_tensor(smooth, device=raw.device), 0), float(pareto_k)

@@ -12,10 +12,10 @@ from mirror_ppl.errors import InputError
 from mirror_ppl.jobs import Runner, TensorFormat
 from mirror_ppl.progress import Report, Reported, silent
 
-PART = 4
+PART = 2
 """People of a part: few, so that processes end at about the same time and little is lost when they
 are stopped."""
-PEOPLE_OF_A_PROCESS = 10
+PEOPLE_OF_A_PROCESS = 4
 """People that are worth the seconds in which a further process starts."""
 
 

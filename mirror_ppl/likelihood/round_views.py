@@ -42,7 +42,10 @@ class Rounds:
 
     def at(self, first: int, last: int) -> Rounds:
         """From the first one to that before the last."""
-        some = slice(first, last)
+        return self.chosen(slice(first, last))
+
+    def chosen(self, some: slice | list[int]) -> Rounds:
+        """Some of them, in this order."""
         return Rounds(
             {name: value[some] for name, value in self.observation.items()},
             {name: mask[some] for name, mask in self.told.items()},

@@ -44,6 +44,7 @@ from mirror_ppl.likelihood.round_views import (
 )
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.sums import Sums
+from mirror_ppl.likelihood.telling import some_of, telling_first
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.belief_tracking import CHUNK
 from mirror_ppl.models.human import HumanModel
@@ -55,6 +56,8 @@ SCREENED_ROWS, MOST_ROWS = 4096, 32768
 about as many as take as long as the calls themselves, since in later rounds fewer are left."""
 CHAINED_ROUNDS = 32
 """Rounds that are gone through at once where attention is summed out exactly."""
+FEW_ROUNDS = 2
+"""So many rounds are gone through as they come."""
 GROWTH = 3
 """With screening, so many times the rounds before are gone through at once, at most."""
 PROPOSING_POLICIES = 64
@@ -129,7 +132,8 @@ class ViewTableBuilder:
     @torch.no_grad()
     def add(self, rounds: Rounds) -> None:
         """Go through more rounds, as many at once as there is little to go through."""
-        first = 0
+        order, before, first = self._order(rounds), len(self._rounds), 0
+        rounds = rounds.chosen(order)
         while first < len(rounds):
             some = rounds.at(first, first + self._at_once())
             if self.human.chained:
@@ -137,6 +141,25 @@ class ViewTableBuilder:
             else:
                 self._add_together(some)
             first += len(some)
+        place = torch.tensor(order).argsort().tolist()
+        for parts in (self._rounds, self._seen, self._recorded):
+            parts[before:] = [parts[before + one] for one in place]
+
+    def _order(self, rounds: Rounds) -> list[int]:
+        """The order in which rounds are gone through: those first that tell most of combinations.
+
+        As they are where few are to be given up, or attention is proposed by the rounds before.
+        """
+        some, number = some_of(self.alive), len(rounds)
+        in_order = self.human.has_round_latents or len(self.alive) < 4 * len(some)
+        if self.screening is None or in_order or number <= FEW_ROUNDS:
+            return list(range(number))
+        candidates = {name: axis[some].repeat(number) for name, axis in self.grid.items()}
+        row = torch.arange(number, device=some.device).repeat_interleave(len(some))
+        views, which = views_of_rounds(self.human, candidates, row, rounds)
+        found = self._log_likelihoods(views)[:, which].unflatten(-1, (number, -1))
+        prior = (self.score + self.log_prior)[:, some]
+        return telling_first(found, prior, self.screening.margin)
 
     def _at_once(self) -> int:
         """How many rounds are gone through before combinations are given up."""

@@ -41,7 +41,8 @@ def of_person(data: az.InferenceData, group: str, person: str) -> xr.Dataset:
 
 def draws(values: xr.DataArray) -> np.ndarray:
     """Draws of a variable, chains one after the other, ``[S, ...]``."""
-    return values.stack(sample=SAMPLE).transpose("sample", ...).values
+    ordered = values.transpose(*SAMPLE, ...).values
+    return ordered.reshape(-1, *ordered.shape[len(SAMPLE) :])
 
 
 def truth(data: az.InferenceData, name: str, person: str) -> float | None:

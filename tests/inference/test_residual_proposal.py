@@ -177,7 +177,7 @@ def test_the_residual_is_proposed_only_where_scalars_are_not_enough(human, table
 
 def test_residuals_count_as_they_were_drawn(human, table, monkeypatch):
     """From the prior until it was learned where to look, and a tenth of them afterwards."""
-    monkeypatch.setattr(sampler_module, "_smoothed", lambda raw: (raw, 0.0))
+    monkeypatch.setattr(sampler_module, "pareto_smoothed", lambda raw: (raw, 0.0))
     torch.manual_seed(0)
     sampler = Sampler(human, table)
     sampler.draw(100)

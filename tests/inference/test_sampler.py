@@ -322,7 +322,7 @@ def test_discrete_sites_alone_are_proposed_too(toy, table):
 
 def test_discrete_sites_count_as_they_were_drawn(toy, table, monkeypatch):
     """From the prior until it was learned how probable they are."""
-    monkeypatch.setattr(sampler_module, "_smoothed", lambda raw: (raw, 0.0))
+    monkeypatch.setattr(sampler_module, "pareto_smoothed", lambda raw: (raw, 0.0))
     torch.manual_seed(0)
     sampler = Sampler(toy, table)
     sampler.draw(100)

@@ -1,0 +1,36 @@
+"""Pareto-smoothed weights beside those of ArviZ, which are too slow to import in every process."""
+
+import math
+
+import arviz as az
+import pytest
+import torch
+
+from mirror_ppl.inference.pareto import pareto_smoothed
+
+
+@pytest.mark.parametrize("number", [5, 20, 100, 512, 4608])
+@pytest.mark.parametrize("spread", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("tailed", [False, True])
+def test_they_are_those_of_arviz(number, spread, tailed):
+    generator = torch.Generator().manual_seed(number)
+    raw = spread * torch.randn(number, generator=generator).double()
+    if tailed:  # a Student t distribution of two degrees of freedom
+        raw = raw / torch.empty(number).double().exponential_(generator=generator).sqrt()
+    raw[::7] = -torch.inf
+    expected, pareto_k = az.psislw(raw.numpy().copy())
+    found, own = pareto_smoothed(raw)
+    assert own == pytest.approx(float(pareto_k), abs=1e-6)
+    torch.testing.assert_close(found.exp(), torch.as_tensor(expected).exp(), rtol=0, atol=1e-9)
+
+
+def test_equal_weights_stay_as_they_are():
+    found, own = pareto_smoothed(torch.full((8,), -3.0).double())
+    assert own == -math.inf
+    torch.testing.assert_close(found, torch.full((8,), 1 / 8).double().log())
+
+
+def test_a_tail_too_short_has_no_finite_k():
+    found, own = pareto_smoothed(torch.tensor([0.0, 1.0, 2.0]).double())
+    assert own == math.inf
+    torch.testing.assert_close(found.exp().sum(), torch.ones(()).double())
