@@ -113,29 +113,32 @@ def _mode(
     number, _, size = features.shape
     actions = without.shape[-1]
     # Moments last: operations along few actions are much quicker in front of them than behind.
-    without, counts, across = without.mT.contiguous(), counts.mT.contiguous(), features.mT
+    without, counts, across = (part.mT.contiguous() for part in (without, counts, features))
     weights = without.new_zeros(number, actions, size)
-    precision = without.new_zeros(0)
+    precision = factor = without.new_zeros(0)
     total = counts.sum(0)
-    columns, one, other = _pairs(actions)
-    products = (features[..., :, None] * features[..., None, :]).flatten(-2)  # [S, N, R R]
+    columns, places = _pairs(actions), _pairs(size)
+    first, second = torch.triu_indices(size, size)
+    products = (across[:, first] * across[:, second]).mT  # [S, N, R (R + 1) / 2]
     prior = torch.eye(size * actions).to(without) / scale**2
     for step in range(NEWTON_STEPS):
         chances = (without + weights @ across).softmax(-2)  # [S, A, N]
-        slope = (counts - total * chances) @ features - weights / scale**2
+        often = total * chances
+        slope = (counts - often) @ features - weights / scale**2
         if step < CURVATURES:
-            same = (one == other).to(total)[:, None]
-            shares = total * chances[:, one] * (same - chances[:, other])
-            blocks = (shares @ products)[:, columns].unflatten(-1, (size, size))  # [S, A, A, R, R]
+            shares = torch.cat([-often[:, a, None] * chances[:, a:] for a in range(actions)], 1)
+            shares[:, columns.diagonal()] += often
+            blocks = (shares @ products)[:, columns][..., places]  # [S, A, A, R, R]
             precision = blocks.permute(0, 3, 1, 4, 2).flatten(3).flatten(1, 2) + prior
-        change = torch.linalg.solve(precision, slope.mT.flatten(1))
+            factor = torch.linalg.cholesky(precision)
+        change = torch.cholesky_solve(slope.mT.flatten(1)[..., None], factor)[..., 0]
         weights = weights + change.unflatten(1, (size, actions)).mT
     return weights.mT.flatten(1), precision
 
 
-def _pairs(size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The unordered pair that each ``[size, size]`` is, and the members of each pair."""
+def _pairs(size: int) -> Tensor:
+    """The unordered pair that each ``[size, size]`` is, in the order of the upper triangle."""
     first, second = torch.triu_indices(size, size)
     which = torch.zeros(size, size, dtype=torch.long)
     which[first, second] = which[second, first] = torch.arange(len(first))
-    return which, first, second
+    return which
