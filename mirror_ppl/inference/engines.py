@@ -268,9 +268,12 @@ def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequen
     kinds = [kind for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
     source = [(kind.__qualname__, _source(kind)) for kind in kinds]
     weights = [fingerprint(human), None if network is None else fingerprint(network)]
-    # What it leans on elsewhere shows in what it says; a program of one's own may need more than
-    # made-up rounds have.
-    said = [] if has_own_program(human) else said_of_made_up_rounds(human)
+    try:  # what it leans on elsewhere shows in what it says
+        said = said_of_made_up_rounds(human)
+    except Exception:
+        if not has_own_program(human):
+            raise
+        said = []  # a program of one's own may need more than made-up rounds have
     description = [weights, source, said, __version__, [str(part) for part in what]]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 

@@ -122,11 +122,11 @@ def _mode(
     products = (across[:, first] * across[:, second]).mT  # [S, N, R (R + 1) / 2]
     prior = torch.eye(size * actions).to(without) / scale**2
     for step in range(NEWTON_STEPS):
-        chances = (without + weights @ across).softmax(-2)  # [S, A, N]
-        often = total * chances
+        probability = (without + weights @ across).softmax(-2)  # [S, A, N]
+        often = total * probability
         slope = (counts - often) @ features - weights / scale**2
         if step < CURVATURES:
-            shares = torch.cat([-often[:, a, None] * chances[:, a:] for a in range(actions)], 1)
+            shares = torch.cat([-often[:, a, None] * probability[:, a:] for a in range(actions)], 1)
             shares[:, columns.diagonal()] += often
             blocks = (shares @ products)[:, columns][..., places]  # [S, A, A, R, R]
             precision = blocks.permute(0, 3, 1, 4, 2).flatten(3).flatten(1, 2) + prior

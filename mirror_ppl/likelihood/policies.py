@@ -77,7 +77,7 @@ def within(human: HumanModel, log_joint: Tensor, margin: float) -> Tensor:
             best.
     """
     if dependencies(human).adds_to_actions:
-        # What is recorded besides actions may tell of somebody whom no policy is like.
+        # What is recorded besides actions may tell of a person whom no policy resembles.
         log_joint = log_joint - log_joint.amax(-1, keepdim=True)
     best = log_joint.amax(0)
     return best >= best.max() - margin

@@ -7,6 +7,8 @@ from torch import Tensor
 
 SAMPLE = 32
 """Combinations by which it is known which rounds tell most."""
+MANY = 4 * SAMPLE
+"""Combinations that are worth trying some of them first."""
 
 
 def some_of(combinations: Tensor) -> Tensor:

@@ -44,7 +44,7 @@ from mirror_ppl.likelihood.round_views import (
 )
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.sums import Sums
-from mirror_ppl.likelihood.telling import some_of, telling_first
+from mirror_ppl.likelihood.telling import MANY, some_of, telling_first
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.belief_tracking import CHUNK
 from mirror_ppl.models.human import HumanModel
@@ -132,8 +132,17 @@ class ViewTableBuilder:
     @torch.no_grad()
     def add(self, rounds: Rounds) -> None:
         """Go through more rounds, as many at once as there is little to go through."""
-        order, before, first = self._order(rounds), len(self._rounds), 0
-        rounds = rounds.chosen(order)
+        order, before = self._order(rounds), len(self._rounds)
+        if order is None:
+            self._go_through(rounds)
+            return
+        self._go_through(rounds.chosen(order))
+        place = torch.tensor(order).argsort().tolist()
+        for parts in (self._rounds, self._seen, self._recorded):
+            parts[before:] = [parts[before + one] for one in place]
+
+    def _go_through(self, rounds: Rounds) -> None:
+        first = 0
         while first < len(rounds):
             some = rounds.at(first, first + self._at_once())
             if self.human.chained:
@@ -141,19 +150,18 @@ class ViewTableBuilder:
             else:
                 self._add_together(some)
             first += len(some)
-        place = torch.tensor(order).argsort().tolist()
-        for parts in (self._rounds, self._seen, self._recorded):
-            parts[before:] = [parts[before + one] for one in place]
 
-    def _order(self, rounds: Rounds) -> list[int]:
+    def _order(self, rounds: Rounds) -> list[int] | None:
         """The order in which rounds are gone through: those first that tell most of combinations.
 
-        As they are where few are to be given up, or attention is proposed by the rounds before.
+        ``None`` for as they are, where few are to be given up or attention is proposed by the
+        rounds before.
         """
-        some, number = some_of(self.alive), len(rounds)
-        in_order = self.human.has_round_latents or len(self.alive) < 4 * len(some)
-        if self.screening is None or in_order or number <= FEW_ROUNDS:
-            return list(range(number))
+        number = len(rounds)
+        as_they_are = self.human.has_round_latents or len(self.alive) < MANY
+        if self.screening is None or as_they_are or number <= FEW_ROUNDS:
+            return None
+        some = some_of(self.alive)
         candidates = {name: axis[some].repeat(number) for name, axis in self.grid.items()}
         row = torch.arange(number, device=some.device).repeat_interleave(len(some))
         views, which = views_of_rounds(self.human, candidates, row, rounds)

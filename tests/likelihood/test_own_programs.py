@@ -15,11 +15,13 @@ from test_one_program import recordings
 
 import mirror_ppl
 from benchmarks.one_program import exact_mean, own_program, toy
+from mirror_ppl import face
 from mirror_ppl.communication.person import Person
 from mirror_ppl.errors import HumanModelError, InputError
-from mirror_ppl.inference import batches
+from mirror_ppl.inference import batches, engines
 from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.nuts import NUTSOptions
+from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.inference.svi import SVIOptions
@@ -238,10 +240,33 @@ def test_the_former_name_of_importance(recordings):
     assert [one.filename for one in told] == [__file__] * 2  # of whoever gave it
 
 
-def test_its_runs_are_told_apart_without_running_it():
+def test_runs_of_one_that_needs_more_than_made_up_rounds_are_told_apart():
     class Particular(ToyHuman):
         def model(self, rounds, world=False):
             raise RuntimeError("of nobody but the recorded")
 
     human = Particular(self_model())
     assert run_identity(human, None, ["x"]) != run_identity(human, None, ["y"])
+
+
+def test_runs_are_told_apart_by_what_a_program_leans_on_elsewhere():
+    weight = 1.0
+
+    class Leaning(ToyHuman):
+        def model(self, rounds, world=False):
+            super().model(rounds, world)
+            pyro.factor("elsewhere", torch.tensor(weight))
+
+    human = Leaning(self_model())
+    before = run_identity(human, None, [])
+    weight = 2.0
+    assert run_identity(human, None, []) != before
+
+
+def test_a_model_is_tried_once_a_fit(recordings, monkeypatch):
+    tried = []
+    for module in (face, fitting, engines):
+        monkeypatch.setattr(module, "check_contract", tried.append)
+    human = ToyHuman(self_model())
+    mirror_ppl.infer(recordings, human=human, draws=5, train_rounds=1, explore=0)
+    assert tried == [human]
