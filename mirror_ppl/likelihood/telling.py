@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SAMPLE = 32
+SAMPLE = 64
 """Combinations by which it is known which rounds tell most."""
 MANY = 4 * SAMPLE
 """Combinations that are worth trying some of them first."""
