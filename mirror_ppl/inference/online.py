@@ -38,8 +38,10 @@ class OnlinePosterior:
             which every fit calls): else all that it leaves open is up to the person.
         network: a trained guide (see :func:`mirror_ppl.training.guide_file.load_guide`); without,
             draws are those of ``importance``, which takes longer at each asking.
-        seed: of everything random. The same rounds in the same order, with draws asked for after
-            the same of them, give the same draws.
+        seed: of everything random. The same rounds, added by the same calls, with draws asked for
+            after the same of them, give the same draws. Rounds that are added together are gone
+            through in an order of their own (:mod:`mirror_ppl.likelihood.telling`), so that draws
+            may be others than if they came one by one, of the same posterior.
         allow_contradictions: share of the steps that are added at once, from 0 to 1, that may
             contradict the next observation.
 
