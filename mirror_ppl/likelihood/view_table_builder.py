@@ -165,8 +165,10 @@ class ViewTableBuilder:
         candidates = {name: axis[some].repeat(number) for name, axis in self.grid.items()}
         row = torch.arange(number, device=some.device).repeat_interleave(len(some))
         views, which = views_of_rounds(self.human, candidates, row, rounds)
-        found = self._log_likelihoods(views)[:, which].unflatten(-1, (number, -1))
-        prior = (self.score + self.log_prior)[:, some]
+        # As many policies as tell moments apart: that is enough to tell rounds apart, too.
+        few = {name: policy[: self.screening.merge_policies] for name, policy in self.policies.items()}
+        found = self._log_likelihoods(views, few)[:, which].unflatten(-1, (number, -1))
+        prior = (self.score + self.log_prior)[: len(found), some]
         return telling_first(found, prior, self.screening.margin)
 
     def _at_once(self) -> int:
@@ -394,13 +396,16 @@ class ViewTableBuilder:
         )
         return kept, place
 
-    def _log_likelihoods(self, views: ManyViews) -> Tensor:
+    def _log_likelihoods(
+        self, views: ManyViews, policies: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
         """Of what was recorded under each policy and view, ``[policies, V]``."""
         if not len(views.acted):  # of padding alone
             return self.score.new_zeros(len(self.score), len(views.moments))
         moments = views.moments[None]
         along = Sums.of(moments, moments != NO_VIEW, len(views.acted))
-        return along(self._of_moments(self.policies, views)[:, None])[:, 0]
+        policies = self.policies if policies is None else policies
+        return along(self._of_moments(policies, views)[:, None])[:, 0]
 
     def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
         """Log joint ``[policies, U, G]`` of actions and attention, of their likelihoods."""
