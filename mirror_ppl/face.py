@@ -28,6 +28,7 @@ from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
+from mirror_ppl.inference.results.criticism import OK
 from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
@@ -74,6 +75,8 @@ class Fit(fitting.Fit):
         told = self.summary
         doubtful = _doubtful(told)
         warning = f"; weights not to be relied on: {', '.join(doubtful)}" if doubtful else ""
+        wrong = [one["id"] for one in told["people"] if one["check"]["verdict"] != OK]
+        warning += f"; not explained by the model: {', '.join(wrong)}" if wrong else ""
         return (
             f"Fit({told['domain']}, {told['setting']}: {len(self.people)} people, "
             f"{told['guide']}, {len(next(iter(self.posterior.draws.values())))} draws{warning})"
@@ -88,6 +91,27 @@ class Fit(fitting.Fit):
     def plot(self) -> FitPlots:
         """The pictures of this fit, such as ``fit.plot.sight()``."""
         return FitPlots(self.data)
+
+    @property
+    def check(self) -> pd.DataFrame:
+        """Whether the model explains each person: verdict, reasons, held-out NLLs, p-values.
+
+        A row a person. ``nll`` (nats an action of held-out rounds) stands beside ``nll_base_rate``
+        (by how often they did each action before) and ``nll_no_implants`` (if they were the robot);
+        p-values are near 0 where there is more of something than the model says, near 1 where less.
+        """
+        import pandas as pd
+
+        rows = []
+        for person in self.summary["people"]:
+            told = dict(person["check"])
+            rows.append(
+                {"verdict": told.pop("verdict"), "reasons": "; ".join(told.pop("reasons"))}
+                | {"nll": (person["test"] or {}).get("nll")}
+                | {name: told[name] for name in ("nll_base_rate", "nll_no_implants")}
+                | told["p_values"]
+            )
+        return pd.DataFrame(rows, index=pd.Index(self.people, name="person"))
 
     def person(self, name: str | None = None) -> FittedPerson:
         """One of the people; the only one unless named.
@@ -152,6 +176,9 @@ class FittedPerson:
     def __repr__(self) -> str:
         doubtful = self.name in _doubtful(self.fit.summary)
         warning = "; weights not to be relied on" if doubtful else ""
+        check = self.summary["check"]
+        if check["verdict"] != OK:
+            warning += f"; {check['verdict']}: {'; '.join(check['reasons'])}"
         return f"FittedPerson({self.name}: {self.summary['rounds']} rounds{warning})"
 
     @property

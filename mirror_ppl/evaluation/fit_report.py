@@ -8,12 +8,15 @@ from typing import Any
 from rich.table import Table
 
 from mirror_ppl.console import console_for_tables
+from mirror_ppl.inference.results.criticism import OK
 from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.models.implants import NOTICES
 
 FEW = 20
 """Effective draws below which a pooled posterior is coarse."""
+MOST_DOUBTED = 20
+"""People of whom it is said why the model does not explain them."""
 WIDTH = 184
 """Characters, where nobody says how many there are."""
 BORDER = 3
@@ -34,8 +37,9 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     _show_people(
         summary,
         f"What each person {what} and how they decide: {summary['domain']}, {summary['setting']}",
-        "median [90% interval] truth, if known; NLL in nats an action, floor: their own entropy",
+        "median [90% interval] truth, if known",
     )
+    _show_predictions(summary["people"])
     people, wrong = summary["people"], summary["contradictions"]
     print(_served(people))
     if wrong["contradicting"]:
@@ -58,6 +62,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
             f"Fewer than {FEW} effective draws under the population for {', '.join(few)}: it is at "
             "odds with what they did, or far from the prior; their posterior is coarse"
         )
+    _show_checks(people)
     opened = [person["identifiability"] for person in people if "identifiability" in person]
     _show_entropy(opened, sites)
     tested = [person["test"] for person in people if person["test"]]
@@ -72,6 +77,17 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         print(line)
 
 
+def _show_checks(people: Sequence[dict[str, Any]]) -> None:
+    """Whom the model does not explain, and why."""
+    doubted = [person for person in people if person["check"]["verdict"] != OK]
+    print(f"Model check: {len(people) - len(doubted)} of {len(people)} people ok")
+    for person in doubted[:MOST_DOUBTED]:
+        check = person["check"]
+        print(f"  {person['id']} {check['verdict']}: {'; '.join(check['reasons'])}")
+    if len(doubted) > MOST_DOUBTED:
+        print(f"  and {len(doubted) - MOST_DOUBTED} more, in summary.json")
+
+
 def _served(people: Sequence[dict[str, Any]]) -> str:
     """Which engine inferred whom; by name, but of the one that inferred most."""
     by_engine: dict[str, list[str]] = {}
@@ -83,21 +99,37 @@ def _served(people: Sequence[dict[str, Any]]) -> str:
 
 
 def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
-    """One table, or several below each other if it would be too wide."""
+    """What was inferred of each person."""
     people, newcomer = summary["people"], summary.get("newcomer")
-    console = console_for_tables(WIDTH)
     columns = []
     for name in people[0]["implants"]:
         cells = [_cell(person["implants"][name]) for person in people]
         if newcomer is not None:
             cells.append(_cell(newcomer[name] | {"truth": None}))
         columns.append([name.replace("sight_", "").replace("_", " "), *cells])
-    for name in ("NLL", "floor", "accuracy"):
-        cells = [_number((person["test"] or {}).get(name.lower(), None), 3) for person in people]
-        columns.append([name, *cells, *(["-"] if newcomer is not None else [])])
     who = ["person", *(person["id"] for person in people)]
     if newcomer is not None:
         who.append("newcomer")
+    _show_blocks(title, who, columns, caption, None if newcomer is None else len(people))
+
+
+def _show_blocks(
+    title: str,
+    who: Sequence[str],
+    columns: Sequence[Sequence[str]],
+    caption: str,
+    ends: int | None,
+) -> None:
+    """A table, or several below each other if it would be too wide.
+
+    Args:
+        title: above it.
+        who: the first column.
+        columns: the others.
+        caption: below it.
+        ends: number of the row after which there is a line.
+    """
+    console = console_for_tables(WIDTH)
     # Not by tables, which would make them as narrow as they are.
     console.print(title, style="italic", markup=False, highlight=False)
     for block in _side_by_side(who, columns, console.width):
@@ -106,9 +138,30 @@ def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
             table.add_column(column[0], justify="right" if number else "left")
         for number, row in enumerate(zip(who, *block, strict=True)):
             if number:
-                table.add_row(*row, end_section=number == len(people))
+                table.add_row(*row, end_section=number == ends)
         console.print(table)
     console.print(f"({caption})", style="dim", markup=False, highlight=False)
+
+
+def _show_predictions(people: Sequence[dict[str, Any]]) -> None:
+    """How held-out actions are predicted, and whether the model explains each person."""
+    scores: dict[str, list[str]] = {}
+    if any(person["test"] for person in people):
+        for name in ("NLL", "floor", "accuracy"):
+            own = [(person["test"] or {}).get(name.lower()) for person in people]
+            scores[name] = [_number(value, 3) for value in own]
+        for name in ("base_rate", "no_implants"):
+            own = [person["check"][f"nll_{name}"] for person in people]
+            scores[name.replace("_", " ")] = [_number(value, 3) for value in own]
+    scores["model check"] = [person["check"]["verdict"] for person in people]
+    _show_blocks(
+        "How held-out actions are predicted, and whether the model explains each person",
+        ["person", *(person["id"] for person in people)],
+        [[name, *cells] for name, cells in scores.items()],
+        "NLL in nats an action; floor: their own entropy; base rate: NLL by how often they did "
+        "each before; no implants: if they were the robot",
+        ends=None,
+    )
 
 
 def _side_by_side(

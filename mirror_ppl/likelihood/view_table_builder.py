@@ -166,7 +166,9 @@ class ViewTableBuilder:
         row = torch.arange(number, device=some.device).repeat_interleave(len(some))
         views, which = views_of_rounds(self.human, candidates, row, rounds)
         # As many policies as tell moments apart: that is enough to tell rounds apart, too.
-        few = {name: policy[: self.screening.merge_policies] for name, policy in self.policies.items()}
+        few = {
+            name: policy[: self.screening.merge_policies] for name, policy in self.policies.items()
+        }
         found = self._log_likelihoods(views, few)[:, which].unflatten(-1, (number, -1))
         prior = (self.score + self.log_prior)[: len(found), some]
         return telling_first(found, prior, self.screening.margin)

@@ -9,14 +9,15 @@ from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
 from mirror_ppl.plots import sight
 from mirror_ppl.plots.identifiability import plot_identifiability
 from mirror_ppl.plots.implants import plot_implants
+from mirror_ppl.plots.model_check import plot_model_check
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.rounds import plot_predictive_check, plot_round
 
 if TYPE_CHECKING:
     import arviz as az
 
-OPEN = "open.png"
-FILES = (*sight.FILES, OPEN)
+OPEN, CHECK = "open.png", "check.png"
+FILES = (*sight.FILES, CHECK, OPEN)
 """Names of the files of all pictures that there may be."""
 
 
@@ -65,6 +66,10 @@ class FitPlots:
             raise InputError("nothing about what these people see is left to identify")
         return plot_identifiability(self.data)
 
+    def check(self) -> Picture:
+        """Whether the model explains each person, see :func:`plot_model_check`."""
+        return plot_model_check(self.data)
+
     def predictive_check(self) -> Picture:
         """How often people change lanes, beside how often the model says that they do.
 
@@ -87,6 +92,7 @@ class FitPlots:
     def files(self) -> dict[str, tuple[Picture, str]]:
         """Every picture that a fit writes, with what it shows, by file name."""
         pictures = dict(sight.sight_pictures(self.data))
+        pictures[CHECK] = self.check(), "whether the model explains each person"
         if self._has_identifiability():
             shows = "what is open about what they see, and what would tell"
             pictures[OPEN] = plot_identifiability(self.data), shows

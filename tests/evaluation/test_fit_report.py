@@ -17,11 +17,16 @@ def person(number):
     }
     implants["rule_type_a"] = {"most_probable": "left first", "probability": 0.75}
     test = {"nll": 0.25, "floor": 0.125, "accuracy": 0.5} if number == 1 else None
+    check = {"verdict": "ok", "reasons": [], "p_values": {"delayed": 0.4}}
+    check |= {"nll_base_rate": None, "nll_no_implants": None}
+    if test:
+        check |= {"nll_base_rate": 0.375, "nll_no_implants": 0.625}
     return {
         "id": f"person-0{number}",
         "engine": "importance",
         "implants": implants,
         "test": test,
+        "check": check,
     }
 
 
@@ -32,12 +37,13 @@ def shown(capsys, **changes):
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("width", "tables"), [(184, 1), (60, 2), (35, 5)])
+@pytest.mark.parametrize(("width", "tables"), [(184, 2), (60, 4), (35, 8)])
 def test_columns_stand_below_each_other_where_there_is_no_room(width, tables, capsys, monkeypatch):
     monkeypatch.setattr(fit_report, "WIDTH", width)
     out = shown(capsys)
     assert out.count("person-01") == out.count("┏") == tables
-    for text in ("radius", "0.50 [0, 3]", "1.50 [0, 3]", "left first (0.75)", "0.125"):
+    texts = "radius", "0.50 [0, 3]", "1.50 [0, 3]", "left first (0.75)", "0.125", "0.375", "0.625"
+    for text in texts:
         assert text in out
     assert out.count("consistency") == 1
     assert all(len(line) <= width for line in out.splitlines() if "│" in line)
@@ -65,6 +71,17 @@ def test_what_is_not_to_be_trusted_is_told(capsys):
     few[1]["rounds"] = 0  # who did nothing is not at odds with it
     assert "effective draws" not in shown(capsys, people=few)
     assert "relied on" not in shown(capsys)
+
+
+def test_whom_the_model_does_not_explain_is_told_with_reasons(capsys):
+    assert "Model check: 2 of 2 people ok" in shown(capsys)
+    late = person(2)
+    late["check"] |= {"verdict": "suspect", "reasons": ["acts late (p < 0.0005)", "earns less"]}
+    out = shown(capsys, people=[person(1), late])
+    assert "Model check: 1 of 2 people ok" in out
+    assert "person-02 suspect: acts late (p < 0.0005); earns less" in out
+    out = shown(capsys, people=[late] * 22)
+    assert out.count("earns less") == 20 and "and 2 more, in summary.json" in out
 
 
 def test_posterior_entropy_and_the_most_informative_scenario_are_printed(capsys):

@@ -16,7 +16,7 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.population.pooling import Population
 from mirror_ppl.inference.results.identifiability import Identifiability, identify
-from mirror_ppl.inference.results.posterior_predictive import Predictions, predict_people
+from mirror_ppl.inference.results.predictions import Predictions, predict_people
 from mirror_ppl.inference.workers import People, Workers
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, draw_prior_of_each

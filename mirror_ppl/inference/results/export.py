@@ -15,7 +15,8 @@ but for those of the guide ``nuts`` and of pooled people, which follow a chain.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.results.identifiability import Identifiability
-from mirror_ppl.inference.results.posterior_predictive import Predictions
+from mirror_ppl.inference.results.predictions import Predictions
 from mirror_ppl.models.implants import SIGHT
 
 
@@ -138,6 +139,42 @@ def add_identifiability(
     for name in group.data_vars:
         group[name].attrs["units"] = "nats"
     data.add_groups({"identifiability": group})
+
+
+def add_check(
+    data: az.InferenceData,
+    people: Sequence[Mapping[str, Any]],
+    attributes: Mapping[str, str | int | float],
+) -> None:
+    """Add the group ``model_check`` to those of a fit: whether the model explains each person.
+
+    Args:
+        data: of the fit.
+        people: their parts of the summary, with ``check`` and ``test``.
+        attributes: what the file says of itself.
+    """
+    checks = [person["check"] for person in people]
+    names = list(dict.fromkeys(name for check in checks for name in check["p_values"]))
+    values = [[check["p_values"].get(name, math.nan) for name in names] for check in checks]
+    group = xr.Dataset(
+        {
+            "verdict": (("person",), [check["verdict"] for check in checks]),
+            "p_value": (("person", "check"), np.array(values).reshape(len(checks), len(names))),
+            "nll": (("person",), [(one["test"] or {}).get("nll", math.nan) for one in people]),
+            **{
+                name: (
+                    ("person",),
+                    [math.nan if one[name] is None else one[name] for one in checks],
+                )
+                for name in ("nll_base_rate", "nll_no_implants")
+            },
+        },
+        {"person": data["posterior"]["person"].values, "check": names},
+        {key: str(value) for key, value in attributes.items()},
+    )
+    for name in ("nll", "nll_base_rate", "nll_no_implants"):
+        group[name].attrs["units"] = "nats"
+    data.add_groups({"model_check": group})
 
 
 def save_inference_data(data: az.InferenceData, path: Path) -> None:

@@ -159,6 +159,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     drawn = {name: value.cpu() for name, value in posterior.draws.items()}
 
     from mirror_ppl.inference.results.export import (
+        add_check,
         add_identifiability,
         in_units,
         to_inference_data,
@@ -185,8 +186,10 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
             person["pareto_k"] = value if isfinite(value) else None
         if posterior.effective is not None:
             person["effective_draws"] = round(float(posterior.effective[number]), 1)
+        person["check"] = predicted.checks[number]
         if unidentified is not None:
             person["identifiability"] = unidentified.of(number, scenarios)
+    add_check(data, found, attributes)
     seconds = dict(posterior.seconds)
     add_seconds(seconds, described.seconds)
     summary = attributes | {

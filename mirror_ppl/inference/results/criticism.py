@@ -1,0 +1,172 @@
+"""Whether a human model explains a person at all, in a word and with reasons.
+
+Besides :mod:`mirror_ppl.inference.results.checks` the model is held against two simpler ones, by
+how well they predict held-out actions: how often the person did each before, whatever the state;
+and the robot itself, without implants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
+from mirror_ppl.inference.results.checks import (
+    CHECKS,
+    REPLICATES,
+    SHARE,
+    Steps,
+    p_values,
+    steps_of,
+)
+from mirror_ppl.inference.results.posterior_predictive import chosen_log_probability, predict_rounds
+from mirror_ppl.inference.results.summary import predictive
+from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.self_model import SelfModel
+
+OK, SUSPECT, UNEXPLAINED = "ok", "suspect", "unexplained"
+"""The verdicts."""
+LEVEL = 0.05
+"""Share of people whom the model explains that may be suspect."""
+SURE = 2.0
+"""Standard errors by which a prediction has to be worse for that to be sure."""
+DRAWS, QUICK = 100, ImportanceOptions(proposals=64, enough=50.0)
+"""How it is inferred how strictly the robot would choose in their place."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the model explains a person.
+
+    Attributes:
+        word: ``ok``, ``suspect`` or ``unexplained``.
+        reasons: for it, the strongest first.
+    """
+
+    word: str
+    reasons: tuple[str, ...] = ()
+
+
+def verdict(found: Mapping[str, float], lead: Tensor | None) -> Verdict:
+    """The verdict on a person.
+
+    *Suspect* is who does something of which the model says that hardly anybody like them would:
+    one p-value is nearer to 0 or 1 than it should be in :data:`LEVEL` of all people, whatever
+    number of p-values there are (Bonferroni). *Unexplained* is a suspect whose held-out actions the
+    model predicts worse than by how often they did each before, and anybody of whom that is sure.
+
+    Args:
+        found: p-values, see :func:`p_values`.
+        lead: by how many nats the model predicts each held-out action better than that, ``[N']``;
+            ``None`` without such rounds.
+    """
+    tails = {name: 2 * min(value, 1 - value) for name, value in found.items()}
+    limit = LEVEL / max(1, len(tails))
+    reasons = []
+    for name in sorted(tails, key=lambda one: tails[one]):  # stable: of equals the first
+        if tails[name] < limit:
+            least = 1 / REPLICATES
+            size = f"p < {least:.4f}" if tails[name] < least else f"p = {tails[name]:.4f}"
+            reasons.append(f"{_says(name, found[name] < 1 / 2)} ({size})")
+    word = SUSPECT if reasons else OK
+    if lead is not None and len(lead) > 1 and lead.mean() < 0:
+        sure = bool(lead.mean() < -SURE * lead.std() / len(lead) ** 0.5)
+        if sure or reasons:
+            word = UNEXPLAINED
+            reasons.append(
+                f"held-out actions are predicted {-float(lead.mean()):.3f} nats worse than by how "
+                "often each was chosen before"
+            )
+    return Verdict(word, tuple(reasons))
+
+
+def _says(name: str, more: bool) -> str:
+    if name in CHECKS:
+        return CHECKS[name].more if more else CHECKS[name].less
+    action = name.removeprefix(SHARE)
+    return f'does "{action}" {"more" if more else "less"} often than the model says'
+
+
+def base_rate(train: Demonstrations, test: Demonstrations, actions: int) -> Tensor:
+    """Nats of each held-out action ``[N']`` of one person by the shares of actions before.
+
+    Half an action of each kind is added (Jeffreys's prior), so that none has probability 0.
+    """
+    counts = torch.bincount(train.actions[train.mask], minlength=actions) + 1 / 2
+    return -(counts / counts.sum()).log()[test.actions[test.mask]]
+
+
+def no_implants(
+    self_model: SelfModel, train: Demonstrations, test: Demonstrations, seed: int
+) -> Tensor:
+    """Nats of each held-out action ``[N']`` of one person if they were the robot itself.
+
+    It sees everything and takes nothing for granted; how strictly it chooses is inferred.
+    """
+    human = load_human_model("no-implants", self_model)
+    if bool(train.mask.any()):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            views = ViewTableBuilder(human, None)
+            views.add(rounds_of(train, 0))
+            weighted = sample_importance(human, views.table(), QUICK)
+            drawn = weighted.sample(DRAWS, grid_of(perceived_sites(human)))
+    else:
+        drawn = draw_prior(human, 1, DRAWS, seed % 2**32)
+    found = predict_rounds(human, test, drawn).cpu()
+    mixed = chosen_log_probability(predictive(found)[None], test.to("cpu"))
+    return -mixed[0, test.mask.cpu()]
+
+
+def criticize(
+    human: HumanModel,
+    rounds: tuple[Demonstrations, Demonstrations | None],
+    log_probabilities: tuple[Tensor, Tensor | None],
+    seed: int,
+) -> dict[str, Any]:
+    """What is told in ``summary.json`` of whether the model explains one person.
+
+    Args:
+        human: the model of people.
+        rounds: of one person: those that were learned from, and the held-out ones, if any.
+        log_probabilities: of actions there, ``[S, 1, B, T, A]``.
+        seed: of everything random.
+
+    Returns:
+        ``verdict``, ``reasons``, ``p_values`` by name, ``nll_base_rate`` and ``nll_no_implants``
+        (``None`` without held-out rounds).
+    """
+    domain, (train, test) = human.domain, rounds
+    steps = Steps.joined(
+        [
+            steps_of(domain, own.to("cpu"), predicted)
+            for own, predicted in zip(rounds, log_probabilities, strict=True)
+            if own is not None and predicted is not None
+        ]
+    )
+    found = p_values(steps, domain.actions, torch.Generator().manual_seed(seed))
+    often = robot = lead = None
+    if test is not None and log_probabilities[1] is not None and bool(test.mask.any()):
+        own = test.to("cpu")
+        often = base_rate(train.to("cpu"), own, len(domain.actions))
+        mixed = predictive(log_probabilities[1])[None]
+        lead = often + chosen_log_probability(mixed, own)[0, own.mask]
+        robot = no_implants(human.self_model, train, test, seed)
+    judged = verdict(found, lead)
+    return {
+        "verdict": judged.word,
+        "reasons": list(judged.reasons),
+        "p_values": found,
+        "nll_base_rate": None if often is None else float(often.mean()),
+        "nll_no_implants": None if robot is None else float(robot.mean()),
+    }

@@ -1,0 +1,139 @@
+"""Predictions of everybody's actions, and whether the model explains them; a few people at a time.
+
+The views of one person's rounds under a hundred draws take up to 13 MB, and log-probabilities of
+actions under all draws another one. Both are needed for a moment only: predictions go through the
+people in groups, and of each group nothing is kept but its results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.inference.results.criticism import criticize
+from mirror_ppl.inference.results.posterior_predictive import (
+    chosen_log_probability,
+    groups,
+    of_people,
+    predict_rounds,
+)
+from mirror_ppl.inference.results.summary import score
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.progress import Report, silent
+
+PREDICTIVE_STREAM, CRITICISM_STREAM = 2**31, 2**32
+"""Added to seeds of predictive draws, which inference and played rounds must not share."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Predictions of P people's actions, on the CPU.
+
+    Attributes:
+        posterior: actions in the training rounds, one for each posterior draw, ``[S, P, B, T]``,
+            int8.
+        prior: actions there, one for each prior draw, ``[S', P, B, T]``, int8.
+        log_likelihood: of the training rounds under each posterior draw, ``[S, P, B]``.
+        held_out: probabilities of actions in the held-out rounds under each posterior draw,
+            ``[S, P, B', T', A]``; ``None`` without such rounds.
+        scores: of each person's held-out rounds, see :func:`score`; ``None`` without such rounds.
+        checks: whether the model explains each person, see :func:`criticize`.
+    """
+
+    posterior: Tensor
+    prior: Tensor
+    log_likelihood: Tensor
+    held_out: Tensor | None = None
+    scores: list[dict[str, Any] | None] | None = None
+    checks: Sequence[dict[str, Any]] = ()
+
+    @classmethod
+    def joined(cls, parts: Sequence[Predictions]) -> Predictions:
+        """The predictions of the people of all parts, in order."""
+
+        def together(tensors: Sequence[Tensor]) -> Tensor:
+            return tensors[0] if len(tensors) == 1 else torch.cat(list(tensors), 1)
+
+        held_out = [part.held_out for part in parts if part.held_out is not None]
+        scores = [one for part in parts if part.scores is not None for one in part.scores]
+        return cls(
+            together([part.posterior for part in parts]),
+            together([part.prior for part in parts]),
+            together([part.log_likelihood for part in parts]),
+            together(held_out) if held_out else None,
+            scores if held_out else None,
+            [one for part in parts for one in part.checks],
+        )
+
+
+@torch.no_grad()
+def predict_people(
+    human: HumanModel,
+    rounds: tuple[Demonstrations, Demonstrations | None],
+    draws: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
+    seed: int,
+    report: Report = silent,
+    first: int = 0,
+) -> Predictions:
+    """Predict what P people do, each action given what was done before it.
+
+    The predictive draws of each person have a generator of their own, so that they do not depend on
+    who else was recorded.
+
+    Args:
+        human: the model of people.
+        rounds: those that were learned from, and the held-out ones, if there are any.
+        draws: of implants, from the posterior ``[S, P, 1, ...]`` and the prior ``[S', P, 1, ...]``.
+        seed: of predictive draws.
+        report: told of people done.
+        first: number of the first of these people among all.
+    """
+    (train, test), parts = rounds, []
+    people = train.num_people
+    for some in groups(people):
+        report("predict", some.start, people, "people")
+        posterior, prior = (of_people(own, some) for own in draws)
+        own = train.part(some)
+        generators = [
+            torch.Generator().manual_seed(PREDICTIVE_STREAM + seed * 1_000_003 + first + person)
+            for person in some
+        ]
+        learned = predict_rounds(human, own, posterior).cpu()
+        part = Predictions(
+            _drawn(learned, generators),
+            _drawn(predict_rounds(human, own, prior).cpu(), generators),
+            chosen_log_probability(learned, own.to("cpu")).sum(-1),
+        )
+        found = None
+        if test is not None:
+            own = test.part(some)
+            found = predict_rounds(human, own, posterior).cpu()
+            part = replace(part, held_out=found.exp(), scores=score(found, own.to("cpu")))
+        checks = [
+            criticize(
+                human,
+                (train.part(one), None if test is None else test.part(one)),
+                (learned[:, place : place + 1], None if found is None else found[:, [place]]),
+                CRITICISM_STREAM + seed * 1_000_003 + first + person,
+            )
+            for place, (person, one) in enumerate((one, range(one, one + 1)) for one in some)
+        ]
+        del learned, found
+        parts.append(replace(part, checks=checks))
+    report("predict", people, people, "people")
+    return Predictions.joined(parts)
+
+
+def _drawn(log_probabilities: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+    """Actions ``[S, P, B, T]``, int8, by log-probabilities ``[S, P, B, T, A]``."""
+    actions = []
+    for person, generator in enumerate(generators):
+        own = log_probabilities[:, person].exp()
+        drawn = torch.multinomial(own.flatten(0, -2), 1, generator=generator)
+        actions.append(drawn.view(own.shape[:-1]).to(torch.int8))
+    return torch.stack(actions, 1)

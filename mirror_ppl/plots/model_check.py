@@ -1,0 +1,110 @@
+"""Whether the human model explains each person."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mirror_ppl.inference.results.checks import REPLICATES
+from mirror_ppl.inference.results.criticism import LEVEL, OK
+from mirror_ppl.plots.picture import Picture, label_of
+from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE
+
+if TYPE_CHECKING:
+    import arviz as az
+    import xarray as xr
+
+ROW, COLUMN = 0.34, 0.62
+"""Inches of a person and of a check."""
+LIKELIHOODS = 3.6
+"""Inches of the panel of held-out actions."""
+LEAST_WIDTH, CHARACTER = 1.4, 0.09
+"""Inches of the left panel without ids, and of a character of an id."""
+WRAP, DARK = 12, 1.8
+"""Characters in a line of a name, and how deep a colour is that asks for white letters."""
+MOST_PEOPLE = 60
+
+
+def plot_model_check(data: az.InferenceData) -> Picture:
+    """Draw the posterior predictive checks of each person, and how held-out actions are predicted.
+
+    Left: two-sided p-values, those blue of which there is more than the model says, those red of
+    which there is less; in frames those by which a person is suspect. Right, if rounds were held
+    out: nats an action by the model, by how often they did each before, and without implants.
+
+    Args:
+        data: with the group ``model_check``; of more than 60 people the first are drawn.
+    """
+    group = data["model_check"].isel(person=slice(MOST_PEOPLE))
+    labels = [label_of(str(person)) for person in group["person"].values]
+    labels = [
+        label if verdict == OK else f"{label} ({verdict})"
+        for label, verdict in zip(labels, group["verdict"].values, strict=True)
+    ]
+    tested = bool(np.isfinite(group["nll"].values).any())
+    checks = len(group["check"])
+    least = LEAST_WIDTH + COLUMN * max(checks, 3) + CHARACTER * max(map(len, labels))
+    widths = [least, LIKELIHOODS][: 1 + tested]
+    figure = Picture(figsize=(sum(widths), ROW * len(labels) + 2.4), layout="constrained")
+    axes = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
+    _p_values(axes[0], group)
+    axes[0].set_yticks(range(len(labels)), labels)
+    if tested:
+        _likelihoods(axes[1], group)
+    for ax in axes:
+        ax.set_ylim(len(labels) - 0.5, -0.5)
+        ax.spines[:].set_visible(False)
+    return figure
+
+
+def _p_values(ax, group: xr.Dataset) -> None:
+    values = group["p_value"].values
+    tails = 2 * np.minimum(values, 1 - values)
+    # In powers of ten, to either side.
+    depth = -np.log10(tails.clip(1 / REPLICATES, 1))
+    ax.imshow(
+        np.where(values < 0.5, depth, -depth),
+        cmap="RdBu",
+        vmin=-4,
+        vmax=4,
+        aspect="auto",
+    )
+    limit = LEVEL / np.maximum(np.isfinite(values).sum(1), 1)
+    for row, own in enumerate(tails):
+        for column, tail in enumerate(own):
+            if not np.isfinite(tail):
+                continue
+            text = f"{tail:.2f}" if tail >= 0.01 else f"{tail:.4f}"
+            text = f"<{1 / REPLICATES:.4f}" if tail < 1 / REPLICATES else text
+            colour = "white" if depth[row, column] > DARK else BLACK
+            frame = {"edgecolor": colour, "facecolor": "none", "pad": 1.5, "lw": 1}
+            ax.text(
+                column,
+                row,
+                text.replace("0.", "."),
+                ha="center",
+                va="center",
+                color=colour,
+                fontsize=8,
+                bbox=frame if tail < limit[row] else None,
+            )
+    names = [textwrap.fill(str(name), WRAP) for name in group["check"].values]
+    ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9)
+    ax.set_title("Two-sided p-values: blue more, red less\nthan the model says", fontsize=11)
+
+
+def _likelihoods(ax, group: xr.Dataset) -> None:
+    rows = np.arange(len(group["person"]))
+    for name, colour, marker, label in (
+        ("nll_base_rate", GREY, "|", "how often each before"),
+        ("nll_no_implants", ORANGE, "D", "no implants"),
+        ("nll", BLUE, "o", "the model"),
+    ):
+        ax.plot(group[name].values, rows, marker, color=colour, label=label, mew=2, ms=7)
+    ax.set_xlim(0, 1.05 * float(np.nanmax(group["nll_base_rate"].values.clip(group["nll"].values))))
+    ax.set_yticks([])
+    ax.set_xlabel("nats an action")
+    ax.set_title("Held-out actions", fontsize=11)
+    ax.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1, 0.5))

@@ -1,0 +1,102 @@
+"""Whether the model explains a person: verdicts, references, and what a fit tells of them."""
+
+import pytest
+import torch
+from paths import ROOT
+
+import mirror_ppl
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.inference.results import criticism
+from mirror_ppl.inference.results.criticism import base_rate, no_implants, verdict
+from mirror_ppl.inference.results.posterior_predictive import predict_rounds
+from mirror_ppl.inference.results.summary import predictive
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+
+def test_a_p_value_near_0_or_1_makes_suspect():
+    """Of five checks one may be at .01 two-sided: .005 to either side."""
+    fine = {"delayed": 0.3, "switches": 0.01, "reward": 0.9, "surprise": 0.5, "share of stay": 0.99}
+    assert verdict(fine, None) == criticism.Verdict("ok")
+    found = verdict(fine | {"switches": 0.004, "reward": 0.9999}, None)
+    assert found.word == "suspect"
+    assert found.reasons == (
+        "earns less than the model says (p < 0.0005)",
+        "changes what they do more often than the model says (p = 0.0080)",
+    )
+    (reason,) = verdict(fine | {"share of stay": 1.0}, None).reasons
+    assert reason == 'does "stay" less often than the model says (p < 0.0005)'
+
+
+def test_worse_than_how_often_each_was_chosen_is_unexplained():
+    fine, late = {"delayed": 0.5}, {"delayed": 0.0}
+    surely = torch.tensor([-0.2, -0.3, -0.25, -0.2])
+    perhaps = torch.tensor([-0.9, 0.8, -0.7, 0.6])
+    assert verdict(fine, -surely).word == verdict(fine, perhaps).word == "ok"
+    assert verdict(late, -surely).word == "suspect"
+    assert verdict(fine, surely).word == verdict(late, perhaps).word == "unexplained"
+    assert verdict(fine, surely).reasons == (
+        "held-out actions are predicted 0.237 nats worse than by how often each was chosen before",
+    )
+    assert verdict({}, None).word == "ok"
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([0])
+
+
+def test_the_base_rate_is_of_the_rounds_before(recordings):
+    train, test = recordings.select_rounds(range(4)), recordings.select_rounds([4])
+    switched = int(train.actions.sum())
+    chance = (switched + 0.5) / (train.actions.numel() + 1)
+    often = base_rate(train, test, 2)
+    chances = torch.tensor([1 - chance, chance])
+    torch.testing.assert_close(often, -chances.log()[test.actions.flatten()])
+
+
+def test_without_rounds_before_the_robot_is_as_its_prior(recordings):
+    self_model = load_self_model(shipped_weights("driving"))[0]
+    robot = load_human_model("no-implants", self_model)
+    test = recordings.select_rounds([4, 5])
+    found = no_implants(self_model, recordings.select_rounds([]), test, 7)
+    prior = draw_prior(robot, 1, criticism.DRAWS, 7)
+    mixed = predictive(predict_rounds(robot, test, prior))
+    chosen = mixed.gather(-1, test.actions[..., None])[test.mask]
+    torch.testing.assert_close(found, -chosen.flatten())
+    # With rounds the robot's consistency is known, which cannot be worse by much.
+    learned = no_implants(self_model, recordings.select_rounds(range(4)), test, 7)
+    assert float(learned.mean()) < float(found.mean()) + 0.1
+
+
+@pytest.fixture(scope="module")
+def late():
+    """Of two people of the prior, seed 100, one always acts on the belief of the step before."""
+    self_model = load_self_model(shipped_weights("driving"))[0]
+    human = load_human_model(f"{ROOT}/docs/examples/late_reactions.py:LatePerson", self_model)
+    implants = {name: value[0] for name, value in draw_prior(human, 2, 1, 100).items()}
+    implants["late"] = torch.tensor([[0.01], [0.99]])
+    return play_rounds(human, implants, 24, "fog", torch.Generator().manual_seed(100))
+
+
+def test_a_fit_says_who_is_late(late):
+    fit = mirror_ppl.infer(late, engine="importance", seed=1)
+    check = fit.check
+    assert list(check.index) == ["person-01", "person-02"]
+    assert list(check["verdict"]) == ["ok", "suspect"] or check["verdict"].iloc[1] == "unexplained"
+    assert "acts as if one step late" in check["reasons"].iloc[1]
+    assert check["delayed"].iloc[0] > 0.005 > check["delayed"].iloc[1]
+    assert "person-02" in repr(fit) and "person-01" not in repr(fit)
+    assert "one step late" in repr(fit.person("person-02"))
+    own = fit.summary["people"][1]["check"]
+    assert (
+        own["verdict"] == check["verdict"].iloc[1] and own["p_values"]["delayed"] == check["delayed"].iloc[1]
+    )
+    group = fit.data["model_check"]
+    assert list(group["verdict"].values) == list(check["verdict"])
+    assert group["p_value"].sel(person="person-02", check="delayed") == check["delayed"].iloc[1]
+    for name in ("nll", "nll_base_rate", "nll_no_implants"):
+        assert list(group[name].values) == list(check[name])
+    assert len(fit.plot.check().axes) == 2
