@@ -173,6 +173,23 @@ fit.plot.round(person, 2, held_out=True)
 fit.plot.predictive_check()
 
 # %% [markdown]
+# **Person by person.** Every fit compares what each person did with 2,000 replicates from the
+# posterior predictive: how often they switch, whether they act as the model said one step
+# *before*, what their actions earn, how surprising they are. Dark cells would be people who do
+# more (blue) or less (red) of something than the model says; frames mark p-values that make a
+# person *suspect*. Right: held-out actions as the model predicts them, beside
+# how often the person chose each action before, and beside the robot without implants.
+
+# %%
+fit.plot.check()
+
+# %%
+fit.check.drop(columns="reasons").round(3)
+
+# %% [markdown]
+# *All of these people drive as the model says. `docs/trust.md` shows some who do not, and what
+# the check misses.*
+#
 # The same check with ArviZ's own tools. Each line is what ten people might have done, by one draw
 # of the prior (left) or the posterior (right): the share of people with at most so many lane
 # changes a round. The black line is what they did.

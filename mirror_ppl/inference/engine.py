@@ -29,6 +29,8 @@ class Inferred:
     Attributes:
         draws: joint posterior draws by site, ``[S, P, 1, ...]``, as the human model samples them.
         pareto_k: of importance weights ``[P]``, if there are any.
+        log_evidence: log marginal likelihood ``[P]`` of each person's recorded actions under the
+            model's own prior, nats, where an engine estimates it.
         losses: negative ELBO at each step in nats, if one was optimized.
         population: that people are from, if they were pooled.
         effective: number ``[P]`` of each person's own draws that pooling leaves, if they were.
@@ -39,6 +41,7 @@ class Inferred:
 
     draws: Mapping[str, Tensor]
     pareto_k: Tensor | None = None
+    log_evidence: Tensor | None = None
     losses: tuple[float, ...] = field(default=())
     population: Population | None = None
     effective: Tensor | None = None

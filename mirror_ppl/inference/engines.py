@@ -207,7 +207,14 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         population = pooling.fit(own.draws, options.draws, seed, report)
     population = population.spaced(options.draws)
     pooled = pooling.pooled(own.draws, population, seed)
-    return replace(own, draws=pooled.draws, population=population, effective=pooled.effective)
+    # Under the population's prior another one, which is not estimated.
+    return replace(
+        own,
+        draws=pooled.draws,
+        log_evidence=None,
+        population=population,
+        effective=pooled.effective,
+    )
 
 
 def _each(engine: Engine, job: Job) -> Inferred:
@@ -247,6 +254,7 @@ def _in_parts(engine: Engine, job: Job) -> Inferred:
     return Inferred(
         draws,
         torch.cat([part["pareto_k"] for part in parts]),
+        torch.cat([part["log_evidence"] for part in parts]),
         engines=tuple(name for part in parts for name in part["engines"]),
         seconds=seconds,
     )
@@ -258,6 +266,7 @@ def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
     return {
         "draws": narrowed(found.draws),
         "pareto_k": found.pareto_k,
+        "log_evidence": found.log_evidence,
         "engines": list(found.engines) or [engine.name] * part.rounds.num_people,
         "seconds": seconds,
     }

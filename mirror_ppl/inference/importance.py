@@ -29,7 +29,7 @@ def infer_by_importance(
             from; adaptive importance sampling unless given.
     """
     first_pass = first_pass or _by_importance
-    people, found, drawn, engines = job.rounds.num_people, [], [], []
+    people, found, drawn = job.rounds.num_people, [], []
     with torch.random.fork_rng(devices=[]):
         builders = person_builders(job.human, job.rounds, job.screening)
         for person in range(people):
@@ -47,14 +47,14 @@ def infer_by_importance(
             draws = own.sample(job.draws, builder.grid)
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)
-            found.append(own.pareto_k)
+            found.append((own.pareto_k, own.log_evidence, engine))
             drawn.append(draws)
-            engines.append(engine)
         order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
     # Site after site, so that draws of pooled people, which are many, are not in memory twice.
     joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
-    return Inferred(joined, torch.tensor(found), engines=tuple(engines))
+    pareto_k, log_evidence, engines = zip(*found, strict=True)
+    return Inferred(joined, torch.tensor(pareto_k), torch.tensor(log_evidence), engines=engines)
 
 
 def _by_importance(builder: ViewTableBuilder, options: ImportanceOptions) -> tuple[str, Weighted]:

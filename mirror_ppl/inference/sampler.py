@@ -61,6 +61,8 @@ class Weighted:
             draw, ``[S, G]``, up to what all of them share.
         log_weights: normalized and Pareto-smoothed, ``[S]``.
         pareto_k: of the weights.
+        log_evidence: log of the marginal likelihood of the recorded actions, nats; an estimate
+            whose standard error is about ``(1 / effective - 1 / S) ** 0.5``.
         proposed_residual: whether the residual was proposed by what the rounds say of it.
     """
 
@@ -69,6 +71,7 @@ class Weighted:
     log_joint: Tensor
     log_weights: Tensor
     pareto_k: float
+    log_evidence: float
     proposed_residual: bool = False
 
     @property
@@ -357,9 +360,17 @@ class Sampler:
         mixture = torch.logsumexp(torch.stack(parts), 0)
         target = joint.logsumexp(-1) + of_scalars + of_discrete + prior
         target = target + torch.cat(self._corrections)
-        log_weights, pareto_k = pareto_smoothed((target - mixture).double())
+        weights = (target - mixture).double()
+        log_weights, pareto_k = pareto_smoothed(weights)
+        log_evidence = float(weights.logsumexp(0)) - math.log(len(weights))
         return Weighted(
-            policy, self.combinations, joint, log_weights, pareto_k, self.proposes_residual
+            policy,
+            self.combinations,
+            joint,
+            log_weights,
+            pareto_k,
+            log_evidence,
+            self.proposes_residual,
         )
 
     def _joint(self, policy: Draws, number: int) -> Tensor:

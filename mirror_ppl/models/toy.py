@@ -86,10 +86,12 @@ class ToyPosterior:
     Attributes:
         reach: probability of each bin ``[P, n]``.
         rates: parameters of the Beta posterior of each rate given the bin, ``[P, n, 2]``.
+        log_evidence: log marginal likelihood of the recorded actions ``[P]``, nats.
     """
 
     reach: Tensor
     rates: dict[str, Tensor]
+    log_evidence: Tensor
 
     def mean(self, site: str) -> Tensor:
         """Posterior mean of a rate ``[P]``."""
@@ -125,9 +127,10 @@ def toy_posterior(human: ToyHuman, demonstrations: Demonstrations) -> ToyPosteri
     for (site, prior), when in zip(RATES.items(), (seen, 1 - seen), strict=True):
         one = prior[0] + (second * when).sum((1, 2))
         two = prior[1] + (first * when).sum((1, 2))
-        evidence += _log_beta(one, two)
+        evidence += _log_beta(one, two) - _log_beta(*torch.tensor(prior, dtype=torch.double))
         rates[site] = torch.stack([one, two], -1)
-    return ToyPosterior(torch.softmax(evidence, -1), rates)
+    log_evidence = evidence.logsumexp(-1) - torch.tensor(len(bins)).log()
+    return ToyPosterior(torch.softmax(evidence, -1), rates, log_evidence)
 
 
 def _log_beta(one: Tensor, two: Tensor) -> Tensor:

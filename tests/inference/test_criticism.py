@@ -92,7 +92,8 @@ def test_a_fit_says_who_is_late(late):
     assert "one step late" in repr(fit.person("person-02"))
     own = fit.summary["people"][1]["check"]
     assert (
-        own["verdict"] == check["verdict"].iloc[1] and own["p_values"]["delayed"] == check["delayed"].iloc[1]
+        own["verdict"] == check["verdict"].iloc[1]
+        and own["p_values"]["delayed"] == check["delayed"].iloc[1]
     )
     group = fit.data["model_check"]
     assert list(group["verdict"].values) == list(check["verdict"])

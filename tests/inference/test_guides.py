@@ -100,6 +100,8 @@ def test_importance_finds_the_exact_posterior(toy, recordings, network, guide):
         (share - exact.reach).abs() < bound(exact.reach * (1 - exact.reach) + 1e-4, worth)
     ).all()
     assert (found.pareto_k < 0.7).all()
+    # An average of weights, whose relative variance is at most 1 / worth.
+    assert (found.log_evidence - exact.log_evidence).abs().max() < bound(1.0, worth)
 
 
 def test_variational_posteriors_are_about_right(toy, recordings):

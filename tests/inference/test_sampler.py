@@ -130,7 +130,7 @@ def test_draws_before_something_was_learned_count_as_they_were_drawn(toy, table)
 
 def weighted(log_weights):
     weights = torch.log_softmax(torch.as_tensor(log_weights).double(), 0)
-    return Weighted({}, None, weights[:, None], weights, 0.0)
+    return Weighted({}, None, weights[:, None], weights, 0.0, 0.0)
 
 
 def test_weights_are_toned_down_until_enough_draws_count():

@@ -184,6 +184,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         if posterior.pareto_k is not None:
             value = float(posterior.pareto_k[number])
             person["pareto_k"] = value if isfinite(value) else None
+        if posterior.log_evidence is not None:
+            person["log_evidence"] = round(float(posterior.log_evidence[number]), 3)
         if posterior.effective is not None:
             person["effective_draws"] = round(float(posterior.effective[number]), 1)
         person["check"] = predicted.checks[number]

@@ -1,0 +1,144 @@
+"""Whether a fit notices people whom its human model does not explain.
+
+    python -m benchmarks.model_check --seed 0 --out docs/results/model_check.csv
+
+People of several kinds, drawn from the prior of the human model but for what their kind says, drive
+in fog, 20 rounds to learn from and 6 held out. Counted are verdicts, and the sight thresholds that
+the 90% interval holds, of all and of those that came from people with the verdict ``ok``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+import torch
+import tyro
+import xarray as xr
+from torch import Tensor
+
+import mirror_ppl
+from mirror_ppl.arviz import az
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.models import HumanModel, Implants
+from mirror_ppl.models.implants import reach, sight_sites
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.plots.model_check import plot_model_check
+
+SHOWN = 3
+"""People of each kind in the picture."""
+LATE = "docs/examples/late_reactions.py:LatePerson"
+
+
+class Noticing(HumanModel):
+    """What is in reach is noticed half of the time, by chance at every step; to simulate only."""
+
+    def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
+        """Half of what is in reach."""
+        masks = super().sees(implants, observation, step)
+        luck = torch.rand(masks["visual"].shape) < 1 / 2
+        return {name: mask & luck for name, mask in masks.items()}
+
+
+class Staying(HumanModel):
+    """Dislikes to switch lanes: by 1.5 on logits."""
+
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """The first action is to stay."""
+        logits = super().act(implants, belief, values)
+        liked = torch.zeros(logits.shape[-1])
+        liked[0] = 1.5
+        return torch.log_softmax(logits + liked, -1)
+
+
+class OtherGoal(HumanModel):
+    """Does what the robot would avoid."""
+
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """Values with the other sign, half as strong."""
+        return super().act(implants, belief, -values / 2)
+
+
+def kinds(self_model: SelfModel) -> dict[str, tuple[HumanModel, dict[str, float]]]:
+    """Kinds of people: their program, and values of sites that all of them have."""
+    own = HumanModel(self_model)
+    return {
+        "as modelled": (own, {}),
+        "a step late": (load_human_model(LATE, self_model), {"late": 0.99}),
+        "notices half": (Noticing(self_model), {}),
+        "dislikes switching": (Staying(self_model), {}),
+        "another goal": (OtherGoal(self_model), {}),
+        "a fifth at random": (own, {"lapse": 0.2}),
+    }
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is measured.
+
+    Attributes:
+        seed: of people and rounds.
+        people: of each kind.
+        out: file for the table; printed alone unless given.
+        picture: file for the checks of the first three of each kind.
+    """
+
+    seed: int = 0
+    people: int = 20
+    out: Path | None = None
+    picture: Path | None = None
+
+
+def main(options: Options) -> None:
+    """Run the study."""
+    torch.set_num_threads(1)
+    self_model, _ = load_self_model(shipped_weights("driving"))
+    rows, shown = [], []
+    for kind, (human, known) in kinds(self_model).items():
+        torch.manual_seed(options.seed)
+        drawn = draw_prior(human, options.people, 1, options.seed)
+        implants = {name: value[0] for name, value in drawn.items()}
+        implants |= {name: torch.full((options.people, 1), value) for name, value in known.items()}
+        generator = torch.Generator().manual_seed(options.seed)
+        recordings = play_rounds(human, implants, 26, "fog", generator)
+        fit = mirror_ppl.infer(recordings, seed=options.seed, train_rounds=20)
+        truth, sites = reach(human.domain, implants)[:, 0], sight_sites(human.domain)
+        held, sure = [], fit.check["verdict"] == "ok"
+        for person, own in enumerate(fit.summary["people"]):
+            bounds = [own["implants"][site] for site in sites]
+            held.append(
+                sum(
+                    one["q05"] <= float(value) <= one["q95"]
+                    for one, value in zip(bounds, truth[person], strict=True)
+                )
+            )
+        first = fit.data["model_check"].isel(person=slice(SHOWN))
+        names = [f"{kind} {number + 1}" for number in range(len(first["person"]))]
+        shown.append(first.assign_coords(person=names))
+        verdicts = fit.check["verdict"].value_counts()
+        right = [count for count, ok in zip(held, sure, strict=True) if ok]
+        rows.append(
+            {
+                "kind": kind,
+                "people": options.people,
+                **{name: int(verdicts.get(name, 0)) for name in ("ok", "suspect", "unexplained")},
+                "held": sum(held) / (len(sites) * len(held)),
+                "held_of_ok": sum(right) / (len(sites) * len(right)) if right else float("nan"),
+                "first_reason": fit.check["reasons"].str.split(r" \(").str[0].mode()[0],
+            }
+        )
+        print(pd.DataFrame(rows[-1:]).to_string(index=False, header=len(rows) == 1), flush=True)
+    if options.out is not None:
+        pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.3f")
+    if options.picture is not None:
+        joined = az.InferenceData(model_check=xr.concat(shown, "person"))
+        options.picture.write_bytes(plot_model_check(joined).content())
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
