@@ -1,10 +1,11 @@
 """Whether a fit notices people whom its human model does not explain.
 
-    python -m benchmarks.model_check --seed 0 --out docs/results/model_check.csv
+    python -m benchmarks.model_check --out docs/results/model_check.csv
 
 People of several kinds, drawn from the prior of the human model but for what their kind says, drive
 in fog, 20 rounds to learn from and 6 held out. Counted are verdicts, and the sight thresholds that
-the 90% interval holds, of all and of those that came from people with the verdict ``ok``.
+the 90% interval holds, of all people and of those with the verdict ``ok``; with the human model
+``all``, too, and of whom which of its models is the most probable one.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ import mirror_ppl
 from mirror_ppl.arviz import az
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.models import HumanModel, Implants
+from mirror_ppl.models.family import KINDS, Late
 from mirror_ppl.models.implants import reach, sight_sites
-from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.simulation import play_rounds
@@ -32,7 +33,6 @@ from mirror_ppl.plots.model_check import plot_model_check
 
 SHOWN = 3
 """People of each kind in the picture."""
-LATE = "docs/examples/late_reactions.py:LatePerson"
 
 
 class Noticing(HumanModel):
@@ -69,7 +69,7 @@ def kinds(self_model: SelfModel) -> dict[str, tuple[HumanModel, dict[str, float]
     own = HumanModel(self_model)
     return {
         "as modelled": (own, {}),
-        "a step late": (load_human_model(LATE, self_model), {"late": 0.99}),
+        "a step late": (Late(self_model), {"late": 0.99}),
         "notices half": (Noticing(self_model), {}),
         "dislikes switching": (Staying(self_model), {}),
         "another goal": (OtherGoal(self_model), {}),
@@ -84,14 +84,35 @@ class Options:
     Attributes:
         seed: of people and rounds.
         people: of each kind.
+        human_models: that are fitted.
         out: file for the table; printed alone unless given.
         picture: file for the checks of the first three of each kind.
     """
 
     seed: int = 0
     people: int = 20
+    human_models: tuple[str, ...] = ("mirror", "all")
     out: Path | None = None
     picture: Path | None = None
+
+
+def found(fit: mirror_ppl.Fit, truth: Tensor) -> dict[str, float]:
+    """Verdicts, thresholds held, and most probable models; truth is ``[P, D]``."""
+    sites, check = sight_sites(fit.human.domain), fit.check
+    held = [
+        sum(
+            own["implants"][site]["q05"] <= float(value) <= own["implants"][site]["q95"]
+            for site, value in zip(sites, reached, strict=True)
+        )
+        / len(sites)
+        for own, reached in zip(fit.summary["people"], truth, strict=True)
+    ]
+    verdicts, held = check["verdict"].value_counts(), pd.Series(held, check.index)
+    counts = {name: int(verdicts.get(name, 0)) for name in ("ok", "suspect", "unexplained")}
+    rates = {"held": held.mean(), "held_of_ok": held[check["verdict"] == "ok"].mean()}
+    models = [own["check"].get("models", {}) for own in fit.summary["people"]]
+    best = pd.Series([max(one, key=one.__getitem__, default="") for one in models]).value_counts()
+    return {"people": len(held)} | counts | rates | {name: best.get(name, 0) for name in KINDS}
 
 
 def main(options: Options) -> None:
@@ -106,33 +127,16 @@ def main(options: Options) -> None:
         implants |= {name: torch.full((options.people, 1), value) for name, value in known.items()}
         generator = torch.Generator().manual_seed(options.seed)
         recordings = play_rounds(human, implants, 26, "fog", generator)
-        fit = mirror_ppl.infer(recordings, seed=options.seed, train_rounds=20)
-        truth, sites = reach(human.domain, implants)[:, 0], sight_sites(human.domain)
-        held, sure = [], fit.check["verdict"] == "ok"
-        for person, own in enumerate(fit.summary["people"]):
-            bounds = [own["implants"][site] for site in sites]
-            held.append(
-                sum(
-                    one["q05"] <= float(value) <= one["q95"]
-                    for one, value in zip(bounds, truth[person], strict=True)
-                )
-            )
-        first = fit.data["model_check"].isel(person=slice(SHOWN))
-        names = [f"{kind} {number + 1}" for number in range(len(first["person"]))]
-        shown.append(first.assign_coords(person=names))
-        verdicts = fit.check["verdict"].value_counts()
-        right = [count for count, ok in zip(held, sure, strict=True) if ok]
-        rows.append(
-            {
-                "kind": kind,
-                "people": options.people,
-                **{name: int(verdicts.get(name, 0)) for name in ("ok", "suspect", "unexplained")},
-                "held": sum(held) / (len(sites) * len(held)),
-                "held_of_ok": sum(right) / (len(sites) * len(right)) if right else float("nan"),
-                "first_reason": fit.check["reasons"].str.split(r" \(").str[0].mode()[0],
-            }
-        )
-        print(pd.DataFrame(rows[-1:]).to_string(index=False, header=len(rows) == 1), flush=True)
+        truth = reach(human.domain, implants)[:, 0]
+        for fitted in options.human_models:
+            fit = mirror_ppl.infer(recordings, human=fitted, seed=options.seed, train_rounds=20)
+            rows.append({"kind": kind, "human_model": fitted} | found(fit, truth))
+            header = len(rows) == 1
+            print(pd.DataFrame(rows[-1:]).to_string(index=False, header=header), flush=True)
+            if fitted == options.human_models[0]:
+                first = fit.data["model_check"].isel(person=slice(SHOWN))
+                names = [f"{kind} {number + 1}" for number in range(len(first["person"]))]
+                shown.append(first.assign_coords(person=names))
     if options.out is not None:
         pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.3f")
     if options.picture is not None:

@@ -99,6 +99,7 @@ class Fit(fitting.Fit):
         A row a person. ``nll`` (nats an action of held-out rounds) stands beside ``nll_base_rate``
         (by how often they did each action before) and ``nll_no_implants`` (if they were the robot);
         p-values are near 0 where there is more of something than the model says, near 1 where less.
+        Of the human model ``all``, ``p(<model>)`` are the probabilities of its models.
         """
         import pandas as pd
 
@@ -109,6 +110,7 @@ class Fit(fitting.Fit):
                 {"verdict": told.pop("verdict"), "reasons": "; ".join(told.pop("reasons"))}
                 | {"nll": (person["test"] or {}).get("nll")}
                 | {name: told[name] for name in ("nll_base_rate", "nll_no_implants")}
+                | {f"p({name})": value for name, value in told.get("models", {}).items()}
                 | told["p_values"]
             )
         return pd.DataFrame(rows, index=pd.Index(self.people, name="person"))

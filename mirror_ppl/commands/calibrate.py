@@ -56,8 +56,9 @@ class Options:
     out: Path = Path("runs/calibration")
     """Folder for the results; made if it is not there."""
     human_model: str | None = None
-    """Another human model: one-radius, per-item, perceptual-only, policy-only or no-implants, or
-    one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
+    """Another human model: all (weighs mirror, late and preferring for each person), late,
+    preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or no-implants,
+    or one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     jobs: int = -1

@@ -80,7 +80,10 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
 def _show_checks(people: Sequence[dict[str, Any]]) -> None:
     """Whom the model does not explain, and why."""
     doubted = [person for person in people if person["check"]["verdict"] != OK]
-    print(f"Model check: {len(people) - len(doubted)} of {len(people)} people ok")
+    hint = ""
+    if doubted and "models" not in doubted[0]["check"]:
+        hint = "; --human-model all weighs other models of them"
+    print(f"Model check: {len(people) - len(doubted)} of {len(people)} people ok{hint}")
     for person in doubted[:MOST_DOUBTED]:
         check = person["check"]
         print(f"  {person['id']} {check['verdict']}: {'; '.join(check['reasons'])}")

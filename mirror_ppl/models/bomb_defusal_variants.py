@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.bomb_defusal import BombDefusalHuman
+from mirror_ppl.models.family import AnyKind, HardOfHearing, Late, Preferring
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.variants import NoImplants
 from mirror_ppl.models.view import View
@@ -58,6 +61,26 @@ class BombDefusalNoImplants(NoImplants):
         """Everything."""
         del implants, step
         return _everything(observation)
+
+
+class BombDefusalLate(Late, BombDefusalHuman):
+    """Searches and guesses, and reacts late."""
+
+
+class BombDefusalPreferring(Preferring, BombDefusalHuman):
+    """Searches and guesses, and prefers some buttons."""
+
+
+class BombDefusalHardOfHearing(HardOfHearing, BombDefusalHuman):
+    """Searches and guesses; messages by some channels do not reach them."""
+
+    spans = BombDefusalHuman.spans
+
+
+class BombDefusalAnyKind(AnyKind, BombDefusalHuman):
+    """Searches and guesses; of which kind they are is open."""
+
+    value_names = MappingProxyType({**BombDefusalHuman.value_names, **AnyKind.value_names})
 
 
 def _everything(observation: Observation) -> Visibility:

@@ -13,9 +13,13 @@ from mirror_ppl.checks import require_kind
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.bomb_defusal_variants import (
+    BombDefusalAnyKind,
+    BombDefusalHardOfHearing,
+    BombDefusalLate,
     BombDefusalNoImplants,
     BombDefusalPerceptualOnly,
     BombDefusalPolicyOnly,
+    BombDefusalPreferring,
 )
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
@@ -30,6 +34,10 @@ OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
         "perceptual-only": BombDefusalPerceptualOnly,
         "policy-only": BombDefusalPolicyOnly,
         "no-implants": BombDefusalNoImplants,
+        "late": BombDefusalLate,
+        "preferring": BombDefusalPreferring,
+        "hard-of-hearing": BombDefusalHardOfHearing,
+        "all": BombDefusalAnyKind,
     }
 }
 """What names in ``VARIANTS`` stand for in domains that need another model than `HumanModel`."""

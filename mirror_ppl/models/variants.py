@@ -11,6 +11,7 @@ from torch import Tensor
 from mirror_ppl.domains.base import Observation, Visibility, by_eye
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import implants as implant_priors
+from mirror_ppl.models.family import AnyKind, HardOfHearing, Late, Preferring
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel
 
@@ -116,5 +117,9 @@ VARIANTS: dict[str, type[HumanModel]] = {
     "perceptual-only": PerceptualOnly,
     "policy-only": PolicyOnly,
     "no-implants": NoImplants,
+    "late": Late,
+    "preferring": Preferring,
+    "hard-of-hearing": HardOfHearing,
+    "all": AnyKind,
 }
 """Human models of the package by the names that commands take; the first is what they fit."""

@@ -103,7 +103,8 @@ def _likelihoods(ax, group: xr.Dataset) -> None:
         ("nll", BLUE, "o", "the model"),
     ):
         ax.plot(group[name].values, rows, marker, color=colour, label=label, mew=2, ms=7)
-    ax.set_xlim(0, 1.05 * float(np.nanmax(group["nll_base_rate"].values.clip(group["nll"].values))))
+    values = [group[name].values for name in ("nll_base_rate", "nll_no_implants", "nll")]
+    ax.set_xlim(0, 1.08 * float(np.nanmax(values)))
     ax.set_yticks([])
     ax.set_xlabel("nats an action")
     ax.set_title("Held-out actions", fontsize=11)

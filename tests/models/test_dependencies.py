@@ -23,6 +23,7 @@ from mirror_ppl.likelihood.combinations import (
 )
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.dependencies import dependencies
+from mirror_ppl.models.family import Preferring
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import scalar_sites
 from mirror_ppl.models.self_model import SelfModel
@@ -43,6 +44,10 @@ FOUND = {f"found_{stage}": set(TERMINALS) for stage in range(3)}
 PARENTS = {
     ("bomb_defusal", "mirror"): (dict.fromkeys(TERMINALS, SEARCH), FOUND),
     ("bomb_defusal", "perceptual-only"): (dict.fromkeys(TERMINALS, SEARCH), FOUND),
+    **{
+        ("bomb_defusal", name): (dict.fromkeys(TERMINALS, SEARCH), FOUND)
+        for name in ("late", "preferring", "hard-of-hearing", "all")
+    },
 }
 """What sites of the prior and latents of rounds depend on; all others on nothing."""
 ACTIONS = {
@@ -52,8 +57,13 @@ ACTIONS = {
     "perceptual-only": CHOICE,
     "policy-only": CHOICE | RESIDUAL,
     "no-implants": CHOICE,
+    "late": CHOICE | RESIDUAL | {"late"},
+    "preferring": CHOICE | RESIDUAL,
+    "hard-of-hearing": CHOICE | RESIDUAL,
+    "all": CHOICE | RESIDUAL | {"late", "kind"},
 }
-BELIEVED = {("bomb_defusal", "mirror"): RULES, ("bomb_defusal", "policy-only"): RULES}
+KNOWING = ("mirror", "policy-only", "late", "preferring", "hard-of-hearing", "all")
+BELIEVED = {("bomb_defusal", name): RULES for name in KNOWING}
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +90,8 @@ def test_shipped_models_depend_on_what_is_written_in_them(world, name, robots):
     found = dependencies(human)
     assert with_parents(found.prior) == prior
     assert with_parents(found.round_latents) == latents
-    assert found.actions == ACTIONS[name] | BELIEVED.get((world, name), set())
+    preferred = {"shares_goal", *human.preferences} if isinstance(human, Preferring) else set()
+    assert found.actions == ACTIONS[name] | BELIEVED.get((world, name), set()) | preferred
     assert bool(found.round_latents) == human.has_round_latents
     # What follows for engines.
     read = perceived_sites(human)

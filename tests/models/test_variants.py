@@ -22,6 +22,7 @@ from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 POLICY = {"consistency", "lapse", "residual_in", "residual_out"}
+PREFERENCES = {"shares_goal", "prefers_switch"}
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,8 @@ def test_variants_keep_the_contract(self_model, name):
     human = load_human_model(name, self_model)
     check_contract(human)
     assert human.domain.name == "driving"
-    assert human.belief_size == self_model.latent
+    beliefs = 2 if name in ("late", "all") else 1  # that of the step before, too
+    assert human.belief_size == beliefs * self_model.latent
 
 
 def test_the_sites_of_each(self_model):
@@ -54,11 +56,15 @@ def test_the_sites_of_each(self_model):
         "perceptual-only": sights | assumed | choice,
         "policy-only": POLICY,
         "no-implants": choice,
+        "late": sights | assumed | POLICY | {"late"},
+        "preferring": sights | assumed | POLICY | PREFERENCES,
+        "hard-of-hearing": sights | assumed | POLICY | {"hears_visual", "hears_verbal"},
+        "all": sights | assumed | POLICY | PREFERENCES | {"late", "kind"},
     }
     found = {name: set(sample_sites(VARIANTS[name](self_model), 1)) for name in VARIANTS}
     assert found == expected
     read = {name: len(perceived_sites(VARIANTS[name](self_model))) for name in VARIANTS}
-    assert list(read.values()) == [6, 3, 2, 6, 0, 0]
+    assert list(read.values()) == [6, 3, 2, 6, 0, 0, 6, 6, 8, 6]
 
 
 def scores(human, rounds, policy, combinations=None):

@@ -29,6 +29,7 @@ from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models.family import KIND
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
@@ -170,3 +171,13 @@ def criticize(
         "nll_base_rate": None if often is None else float(often.mean()),
         "nll_no_implants": None if robot is None else float(robot.mean()),
     }
+
+
+def models_of(human: HumanModel, kind: Tensor) -> dict[str, float]:
+    """Posterior probability of each model of a family, of draws ``[S]`` of one person's kind.
+
+    See :class:`mirror_ppl.models.family.AnyKind`.
+    """
+    names = human.value_names[KIND]
+    often = torch.bincount(kind.long().flatten(), minlength=len(names)) / kind.numel()
+    return dict(zip(names, often.tolist(), strict=True))

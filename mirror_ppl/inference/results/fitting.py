@@ -16,10 +16,12 @@ from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.inference.amortized_guide import AmortizedGuide
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
 from mirror_ppl.inference.population.pooling import Pooling, Population
+from mirror_ppl.inference.results.criticism import models_of
 from mirror_ppl.inference.results.description import Description, describe
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.models.family import KIND
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
@@ -189,6 +191,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         if posterior.effective is not None:
             person["effective_draws"] = round(float(posterior.effective[number]), 1)
         person["check"] = predicted.checks[number]
+        if KIND in human.value_names:
+            person["check"]["models"] = models_of(human, posterior.draws[KIND][:, number])
         if unidentified is not None:
             person["identifiability"] = unidentified.of(number, scenarios)
     add_check(data, found, attributes)

@@ -1,0 +1,148 @@
+"""The family of human models: each by itself, and all of them as one program."""
+
+import pytest
+import torch
+
+import mirror_ppl
+from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.family import (
+    KIND,
+    KINDS,
+    LATE,
+    SHARES_GOAL,
+    AnyKind,
+    HardOfHearing,
+    Late,
+    Preferring,
+)
+from mirror_ppl.models.implants import sight_sites
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+WORLDS = ("driving", "search_rescue", "bomb_defusal")
+
+
+def self_model(world):
+    return load_self_model(shipped_weights(world), world)[0]
+
+
+@pytest.fixture(scope="module")
+def driving():
+    return self_model("driving")
+
+
+def beliefs(human, world):
+    return torch.randn(1, 5, human.belief_size, generator=torch.Generator().manual_seed(1))
+
+
+def chances(human, implants, belief):
+    return human.act(implants, belief, human.action_values(belief))
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_each_kind_all_is_that_model(world, kind):
+    """To within the least probability of being late, a millionth."""
+    robot = self_model(world)
+    everybody, own = load_human_model("all", robot), load_human_model(kind, robot)
+    implants = {name: value[0] for name, value in draw_prior(everybody, 1, 1, 3).items()}
+    implants[KIND] = torch.tensor([[list(KINDS).index(kind)]])
+    belief = beliefs(everybody, world)
+    found = chances(everybody, implants, belief)
+    part = belief if own.belief_size == everybody.belief_size else belief[..., : own.belief_size]
+    torch.testing.assert_close(found, chances(own, implants, part), atol=2e-4, rtol=1e-3)
+    torch.testing.assert_close(found.exp().sum(-1), torch.ones(1, 5))
+
+
+def test_late_follows_the_belief_before(driving):
+    human, base = Late(driving), HumanModel(driving)
+    implants = {name: value[0] for name, value in draw_prior(human, 1, 1, 3).items()}
+    belief = beliefs(human, "driving")
+    now, before = belief.chunk(2, -1)
+    half = chances(human, implants | {LATE: torch.tensor([[0.5]])}, belief).exp()
+    both = [chances(base, implants, part).exp() for part in (now, before)]
+    torch.testing.assert_close(half, (both[0] + both[1]) / 2)
+
+
+def test_the_belief_before_is_kept(driving):
+    human, base = Late(driving), HumanModel(driving)
+    evidence = torch.randn(2, 3, driving.encoder.ego.out_features)
+    first, second = torch.full((3,), len(human.domain.actions)), torch.zeros(3, dtype=torch.long)
+    one = base.believe(torch.zeros(3, base.belief_size), evidence[0], first).mean
+    other = base.believe(one, evidence[1], second).mean
+    found = human.believe(torch.zeros(3, human.belief_size), evidence[0], first)
+    torch.testing.assert_close(found, torch.cat([one, one], -1))
+    found = human.believe(found, evidence[1], second)
+    torch.testing.assert_close(found, torch.cat([other, one], -1))
+
+
+def test_who_shares_no_goal_does_not_look_at_values(driving):
+    human = Preferring(driving)
+    implants = {name: value[0] for name, value in draw_prior(human, 1, 1, 3).items()}
+    implants |= {SHARES_GOAL: torch.zeros(1, 1), "prefers_switch": torch.full((1, 1), 1.5)}
+    implants |= {"residual_in": torch.zeros(1, 1, 49, 8), "residual_out": torch.zeros(1, 1, 9, 2)}
+    found = chances(human, implants, beliefs(human, "driving"))
+    torch.testing.assert_close(found[..., 1] - found[..., 0], torch.full((1, 5), 1.5))
+
+
+def test_what_does_not_reach_somebody_changes_nothing(driving):
+    """Messages of one channel at a time, to somebody who sees nothing, each of which changes."""
+    human = HardOfHearing(driving)
+    domain, generator = human.domain, torch.Generator().manual_seed(1)
+    implants = {name: value[0, :, 0] for name, value in draw_prior(human, 1, 1, 3).items()}
+    implants |= {site: torch.zeros(1, dtype=torch.long) for site in sight_sites(domain)}
+    observation = domain.observe(domain.initial(1, generator))
+    nothing = {m.name: torch.zeros(1, len(m.items), dtype=torch.bool) for m in domain.modalities}
+
+    def seen(told, **hears):
+        view, _ = human.perceive(
+            implants | {name: torch.tensor([value]) for name, value in hears.items()},
+            domain.nothing_known(1),
+            observation,
+            told,
+            0,
+        )
+        return torch.cat([view.visible[name] for name in nothing], -1)
+
+    silent = seen(nothing, hears_visual=1, hears_verbal=1)
+    for name, other in (("visual", "verbal"), ("verbal", "visual")):
+        told = nothing | {name: ~nothing[name]}
+        deaf, hearing = {f"hears_{name}": 0, f"hears_{other}": 1}, {f"hears_{name}": 1}
+        assert torch.equal(seen(told, **deaf), silent)
+        assert not torch.equal(seen(told, **hearing, **{f"hears_{other}": 0}), silent)
+
+
+def of_kind(human, seed, **known):
+    implants = {name: value[0] for name, value in draw_prior(human, 2, 1, seed).items()}
+    implants |= {name: torch.full((2, 1), value) for name, value in known.items()}
+    return play_rounds(human, implants, 12, "fog", torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(
+    ("kind", "model", "known"),
+    [
+        ("mirror", HumanModel, {"consistency": 4.0}),
+        ("late", Late, {"consistency": 4.0, LATE: 0.95}),
+        ("preferring", Preferring, {"consistency": 4.0, SHARES_GOAL: -0.8}),
+    ],
+)
+def test_kinds_are_told_apart(driving, kind, model, known):
+    recordings = of_kind(model(driving), 100, **known)
+    found = infer(AnyKind(driving), recordings, InferenceOptions("importance", 200), 1)
+    own = (found.draws[KIND][:, :, 0] == list(KINDS).index(kind)).float().mean(0)
+    assert (own > 0.5).all()
+    assert (found.pareto_k < 0.7).all()
+
+
+def test_a_fit_tells_the_probability_of_each_model(driving):
+    recordings = of_kind(Late(driving), 100, **{LATE: 0.95, "consistency": 4.0})
+    fit = mirror_ppl.infer(recordings, human="all", seed=1)
+    for number, person in enumerate(fit.summary["people"]):
+        models = person["check"]["models"]
+        assert list(models) == list(KINDS) and sum(models.values()) == pytest.approx(1)
+        assert person["implants"][KIND]["most_probable"] == "late"
+        assert person["implants"][KIND]["probability"] == pytest.approx(models["late"])
+        assert fit.check["p(late)"].iloc[number] == models["late"] > 0.9
