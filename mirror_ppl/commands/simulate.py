@@ -1,12 +1,18 @@
 """`python -m mirror_ppl.simulate`: record rounds of simulated people."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mirror_ppl.console import usable_device
 from mirror_ppl.errors import OptionError
 from mirror_ppl.limits import check_numbers, require_memory
 from mirror_ppl.progress import Progress
+
+if TYPE_CHECKING:
+    from mirror_ppl.data import Demonstrations
 
 PROGRAM = "python -m mirror_ppl.simulate"
 COPIES = 4
@@ -32,6 +38,9 @@ class Options:
     population: str = "paper"
     """Who: paper (sight limited by the setting alone; in bomb_defusal as quick at every terminal)
     or diverse (each their own sight)."""
+    human_model: str | None = None
+    """People drawn from the prior of a human model instead: one of the package's, such as late, or
+    path/to/file.py:Class, whose code is run. What they see is up to their implants."""
     people: int = 10
     """How many people, at least 1."""
     rounds: int = 40
@@ -45,6 +54,8 @@ class Options:
     """Where to compute: cpu, cuda or cuda:0."""
 
     def __post_init__(self) -> None:
+        if self.human_model is not None and self.population != "paper":
+            raise OptionError("--population is not of people who are drawn from a --human-model")
         check_numbers(self, "people", "rounds", "seed")
         if not 0 <= self.told <= 1:
             raise OptionError(f"--told must be from 0 to 1, not {self.told}")
@@ -68,27 +79,43 @@ def main(options: Options) -> None:
     require_memory(_bytes(options), "rounds of so many people")
     folder = output_folder(options.out.parent, [options.out.name], lock_of(options.out))
     with folder, Progress("simulate", domain.horizon) as progress:
-        demonstrations = simulate(
-            options.domain,
-            setting,
-            options.population,
-            options.people,
-            options.rounds,
-            options.seed,
-            device,
-            progress,
-            options.told,
-        )
+        if options.human_model is not None:
+            demonstrations = _of_a_model(options, setting, device)
+        else:
+            demonstrations = simulate(
+                options.domain,
+                setting,
+                options.population,
+                options.people,
+                options.rounds,
+                options.seed,
+                device,
+                progress,
+                options.told,
+            )
         provenance = {**demonstrations.provenance, "command": _command(options)}
         path = save_demonstrations(options.out, replace(demonstrations, provenance=provenance))
 
     assert demonstrations.rewards is not None and demonstrations.action_entropy is not None
     reward = demonstrations.rewards.nansum(-1).mean().item()
     entropy = demonstrations.action_entropy.nanmean().item()
-    print(f"{path}: {options.domain}, {setting}, population {options.population}")
+    population = demonstrations.provenance["population"]
+    print(f"{path}: {options.domain}, {setting}, population {population}")
     print(f"  people {options.people}, rounds of each {options.rounds}, seed {options.seed}")
     print(f"  mean reward of a round {reward:.3f}")
     print(f"  mean entropy of an action {entropy:.4f} nats")
+
+
+def _of_a_model(options: Options, setting: str, device: str) -> Demonstrations:
+    from mirror_ppl.models.loading import load_human_model
+    from mirror_ppl.models.simulation import simulate_from_prior
+    from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+    self_model, _ = load_self_model(shipped_weights(options.domain), options.domain)
+    human = load_human_model(options.human_model, self_model).to(device)
+    return simulate_from_prior(
+        human, options.people, options.rounds, setting, options.seed, options.told
+    )
 
 
 def _bytes(options: Options) -> int:
@@ -108,6 +135,12 @@ def _command(options: Options) -> str:
     values = {part.name: getattr(options, part.name) for part in fields(options)}
     if options.setting is None:
         values["setting"] = get_domain(options.domain).settings[-1]
-    unsaid = {"out"} if options.told else {"out", "told"}
-    parts = [f"--{name} {value}" for name, value in values.items() if name not in unsaid]
+    unsaid = {"out", "population" if options.human_model else "human_model"}
+    if not options.told:
+        unsaid.add("told")
+    parts = [
+        f"--{name.replace('_', '-')} {value}"
+        for name, value in values.items()
+        if name not in unsaid
+    ]
     return " ".join([PROGRAM, *parts])

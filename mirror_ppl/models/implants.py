@@ -178,6 +178,20 @@ def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
     return torch.stack(torch.broadcast_tensors(*found)).movedim(0, -1)
 
 
+def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Draws ``[S, P, 1, ...]`` as ``[S, P, ...]``, indices of sight bins replaced by distances."""
+    bins = torch.tensor(domain.reach_bins)
+    return {
+        name: (bins[value] if is_reach(name, value) else value).squeeze(2)
+        for name, value in draws.items()
+    }
+
+
+def is_reach(name: str, value: Tensor) -> bool:
+    """Whether draws of a site are indices into the domain's ``reach_bins``."""
+    return name.startswith(SIGHT) and not value.is_floating_point()
+
+
 def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
     """``delta(zH_t)`` ``[..., P, B, A]`` of beliefs ``[..., P, B, Z]``: one hidden layer; or 0."""
     if "residual_in" not in implants:

@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import pyro
 import torch
 from pyro import poutine
 from torch import Tensor
 
+from mirror_ppl.checks import real_number, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains.base import Observation, map_state, roll_out, total_reward
+from mirror_ppl.domains.base import (
+    Domain,
+    Observation,
+    Visibility,
+    map_state,
+    require_known,
+    roll_out,
+    total_reward,
+)
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
+from mirror_ppl.models.implants import in_units
+from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.version import __version__
 
 
 @torch.no_grad()
@@ -23,6 +36,7 @@ def play_rounds(
     setting: str,
     generator: torch.Generator,
     scenario: Tensor | None = None,
+    told: float = 0.0,
 ) -> Demonstrations:
     """Let people with given implants play rounds; every action is drawn from the program itself.
 
@@ -36,6 +50,10 @@ def play_rounds(
         setting: name under which the rounds are recorded; what people see is up to their implants.
         generator: source of how rounds begin and of what people choose.
         scenario: of each round of each person, ``[P B]`` in that order; drawn unless given.
+        told: chance that an item that can be communicated is, at each step.
+
+    Returns:
+        The rounds, with the entropy of each action.
     """
     require_standard_program(human, "be simulated in the true world")
     domain, steps = human.domain, human.domain.horizon
@@ -55,10 +73,8 @@ def play_rounds(
     state = map_state(by_person, begin)
     observed = [domain.observe(state)]
     actions = torch.zeros(people, rounds, steps, dtype=torch.long, device=device)
-    nothing = {
-        m.name: torch.zeros(1, len(m.items), dtype=torch.bool, device=device)
-        for m in domain.modalities
-    }
+    heard: list[Visibility] = []
+    entropy = torch.zeros(people, rounds, steps, device=device)
     lengths = torch.zeros(people, rounds, dtype=torch.long, device=device)
     under_way = lengths == 0
     varies = human.has_round_latents
@@ -75,6 +91,7 @@ def play_rounds(
     for step in range(steps):
         under_way &= ~domain.over(state)
         lengths += under_way
+        heard.append(_told(domain, observed[-1], under_way, told, generator))
         with torch.random.fork_rng(devices=[]), pyro.plate("person", people, dim=-2):
             latents = _round_latents(human, drawn, observed, seed + 1) if varies else {}
             last = actions[..., step - 1] if step else actions.new_full((), len(domain.actions))
@@ -83,13 +100,15 @@ def play_rounds(
                     by_round({**drawn, **latents}),
                     last.expand(people, rounds).flatten(),
                     {name: value.flatten(0, 1) for name, value in observed[-1].items()},
-                    nothing,
+                    {name: mask.flatten(0, 1) for name, mask in heard[-1].items()},
                     every,
                 )
             )
             belief = by_person(beliefs.believed)
             log_probability = human.act(drawn, belief, human.action_values(belief))
-        probability = log_probability.exp().flatten(0, 1)
+        probability = log_probability.exp()
+        entropy[..., step] = torch.special.entr(probability).sum(-1)
+        probability = probability.flatten(0, 1)
         chosen = torch.multinomial(probability, 1, generator=generator)
         actions[..., step] = chosen.view(people, rounds)
         state = domain.transition(state, actions[..., step])
@@ -109,9 +128,80 @@ def play_rounds(
         observations=observation,
         actions=actions,
         rewards=by_person(rewards),
+        action_entropy=entropy,
+        told={name: torch.stack([one[name] for one in heard], 2) for name in heard[0]},
         round_counts=torch.full((people,), rounds),
         lengths=lengths,
     )
+
+
+def _told(
+    domain: Domain,
+    observation: Observation,
+    under_way: Tensor,
+    chance: float,
+    generator: torch.Generator,
+) -> Visibility:
+    """Which items ``[P, B, K]`` are told by chance; the generator is not used for none."""
+    can_be = domain.communicable(observation)
+    if not chance:
+        return {name: torch.zeros_like(mask) for name, mask in can_be.items()}
+    return {
+        name: mask
+        & under_way[..., None]
+        & (torch.rand(mask.shape, generator=generator, device=mask.device) < chance)
+        for name, mask in can_be.items()
+    }
+
+
+def simulate_from_prior(
+    human: HumanModel,
+    people: int,
+    rounds: int,
+    setting: str | None = None,
+    seed: int = 0,
+    told: float = 0.0,
+) -> Demonstrations:
+    """Record people who are as a human model has them, drawn from its prior.
+
+    Args:
+        human: the model of people.
+        people: number of people P.
+        rounds: number of rounds B of each.
+        setting: name under which the rounds are recorded; what people see is up to their implants.
+            The last of the domain unless given.
+        seed: of everything random.
+        told: chance that an item that can be communicated is, at each step.
+
+    Returns:
+        Their rounds, with the truth of each site that is one number a person, thresholds of sight
+        in the domain's unit of distance.
+
+    Raises:
+        InputError: fewer than one person or round, no seed, or ``told`` is no probability.
+        UnknownNameError: there is no such setting.
+        HumanModelError: the model's program is its own.
+    """
+    domain, device = human.domain, next(human.parameters()).device
+    setting = require_known(setting or domain.settings[-1], "setting", domain.settings, domain.name)
+    people, rounds = whole_number(people, "people", 1), whole_number(rounds, "rounds", 1)
+    seed, told = seed_number(seed), real_number(told, "told", 0, 1)
+    drawn = draw_prior(human, people, 1, seed)
+    generator = torch.Generator(device).manual_seed(seed)
+    implants = {name: value[0] for name, value in drawn.items()}
+    recorded = play_rounds(human, implants, rounds, setting, generator, told=told)
+    truth = {
+        name: value[0].float()
+        for name, value in in_units(domain, drawn).items()
+        if value.dim() == 2  # noqa: PLR2004
+    }
+    provenance = {
+        "population": f"prior of {type(human).__name__}",
+        "seed": seed,
+        "version": __version__,
+        **({"told": told} if told else {}),
+    }
+    return replace(recorded, truth=truth, provenance=provenance)
 
 
 def _round_latents(

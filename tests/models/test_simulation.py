@@ -5,11 +5,15 @@ import torch
 from example_course import gone_through
 from example_person import Averaging, Unused
 
+from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, sight_sites
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.simulation import play_rounds, simulate_from_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
@@ -70,3 +74,61 @@ def test_rounds_end_when_all_is_done(kind, monkeypatch):
             assert (rows[:length] == 8).all() or length == 6
             assert length == 6 or float(rows[length]) < 8
             assert (played.actions[person, number, length:] == -1).all()
+
+
+@pytest.mark.parametrize("world", ["driving", "search_rescue", "bomb_defusal"])
+def test_people_of_the_prior_come_with_their_truth(world):
+    human = load_human_model("all", load_self_model(shipped_weights(world), world)[0])
+    domain = human.domain
+    found = simulate_from_prior(human, 3, 2, seed=5, told=0.5)
+    drawn = draw_prior(human, 3, 1, 5)
+    scalars = {name for name, value in drawn.items() if value.dim() == 3}
+    assert set(found.truth) == scalars and found.shape[:2] == (3, 2)
+    assert found.setting == domain.settings[-1]
+    for name, value in found.truth.items():
+        own = drawn[name][0, :, 0]
+        bins = torch.tensor(domain.reach_bins)
+        expected = bins[own] if name.startswith("sight_") else own.float()
+        assert torch.equal(value, expected), name
+    assert found.provenance["population"] == f"prior of {type(human).__name__}"
+    assert found.provenance["seed"] == 5 and found.provenance["told"] == 0.5
+    entropy = found.action_entropy[found.mask]
+    assert (entropy >= 0).all() and (
+        entropy <= torch.tensor(len(domain.actions)).log() + 1e-5
+    ).all()
+    check_world(found, 0.0)
+    # Half of what can be communicated is, and nothing else.
+    steps = found.shape[2]
+    now = {name: value[:, :, :steps] for name, value in found.observation().items()}
+    can_be = domain.communicable(now)
+    told = torch.cat([(mask & found.mask[..., None]).flatten() for mask in found.told.values()])
+    could = torch.cat([(mask & found.mask[..., None]).flatten() for mask in can_be.values()])
+    assert not (told & ~could).any()
+    assert abs(float(told.sum() / could.sum()) - 0.5) < 4 * 0.5 / float(could.sum()) ** 0.5
+    silent = simulate_from_prior(human, 3, 2, seed=5)
+    assert not any(mask.any() for mask in silent.told.values()) and "told" not in silent.provenance
+
+
+def test_entropy_is_that_of_the_choice(self_model):
+    """Of somebody who throws a coin at every step."""
+    human = HumanModel(self_model)
+    known = {"consistency": torch.full((2, 1), 1e-6), "lapse": torch.tensor([[0.5], [0.999]])}
+    known |= {"residual_out": torch.zeros(2, 1, RESIDUAL_HIDDEN + 1, 2)}
+    played = play_rounds(human, known, 3, "fog", torch.Generator().manual_seed(1))
+    torch.testing.assert_close(
+        played.action_entropy[played.mask], torch.full((90,), 2.0).log(), atol=1e-4, rtol=0
+    )
+
+
+def test_who_cannot_be_drawn_is_refused(self_model):
+    human = HumanModel(self_model)
+    for arguments, message in (
+        ((0, 1), "people must be at least 1"),
+        ((1, 0), "rounds must be at least 1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            simulate_from_prior(human, *arguments)
+    with pytest.raises(InputError, match="told"):
+        simulate_from_prior(human, 1, 1, told=2.0)
+    with pytest.raises(UnknownNameError, match="smoke"):
+        simulate_from_prior(human, 1, 1, "smoke")

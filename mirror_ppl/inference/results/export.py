@@ -21,32 +21,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import xarray as xr
 from torch import Tensor
 
 from mirror_ppl.arviz import az
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.schema import TRUTH
-from mirror_ppl.domains import Domain, get_domain
+from mirror_ppl.domains import get_domain
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.results.identifiability import Identifiability
 from mirror_ppl.inference.results.predictions import Predictions
-from mirror_ppl.models.implants import SIGHT
-
-
-def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Draws ``[S, P, ...]`` with the indices of sight bins replaced by distances."""
-    bins = torch.tensor(domain.reach_bins)
-    return {
-        name: (bins[value] if is_reach(name, value) else value).squeeze(2)
-        for name, value in draws.items()
-    }
-
-
-def is_reach(name: str, value: Tensor) -> bool:
-    """Whether draws of a site are indices into the domain's ``reach_bins``."""
-    return name.startswith(SIGHT) and not value.is_floating_point()
+from mirror_ppl.models.implants import SIGHT, in_units
 
 
 def to_inference_data(

@@ -23,6 +23,7 @@ from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.family import KIND
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.implants import in_units
 from mirror_ppl.models.recorded import check_rounds
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.models.world_knowledge import fit_world
@@ -163,7 +164,6 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     from mirror_ppl.inference.results.export import (
         add_check,
         add_identifiability,
-        in_units,
         to_inference_data,
     )
     from mirror_ppl.inference.results.population_file import add_population

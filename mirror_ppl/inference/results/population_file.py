@@ -19,8 +19,8 @@ from mirror_ppl.arviz import az
 from mirror_ppl.checks import as_path
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.population.pooling import Pooling, Population
-from mirror_ppl.inference.results.export import in_units, is_reach
 from mirror_ppl.inference.results.posterior_file import check_origin, read_results
+from mirror_ppl.models.implants import in_units, is_reach
 
 SAMPLE = ("chain", "draw")
 

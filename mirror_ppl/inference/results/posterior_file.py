@@ -15,8 +15,8 @@ from torch import Tensor
 from mirror_ppl.checks import as_path, require_kind, whole_number
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.results.export import is_reach
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.implants import is_reach
 from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.weights import fingerprint
