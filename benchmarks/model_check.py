@@ -41,8 +41,10 @@ class Noticing(HumanModel):
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """Half of what is in reach."""
         masks = super().sees(implants, observation, step)
-        luck = torch.rand(masks["visual"].shape) < 1 / 2
-        return {name: mask & luck for name, mask in masks.items()}
+        # Of this step alone: the global random state is the same at each.
+        generator = torch.Generator().manual_seed(step)
+        noticed = torch.rand(masks["visual"].shape, generator=generator) < 1 / 2
+        return {name: mask & noticed for name, mask in masks.items()}
 
 
 class Staying(HumanModel):

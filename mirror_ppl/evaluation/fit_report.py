@@ -12,11 +12,12 @@ from mirror_ppl.inference.results.criticism import OK
 from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.models.implants import NOTICES
+from mirror_ppl.models.loading import MIRROR, model_name
 
 FEW = 20
 """Effective draws below which a pooled posterior is coarse."""
 MOST_DOUBTED = 20
-"""People of whom it is said why the model does not explain them."""
+"""People for whom reasons are printed."""
 WIDTH = 184
 """Characters, where nobody says how many there are."""
 BORDER = 3
@@ -62,7 +63,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
             f"Fewer than {FEW} effective draws under the population for {', '.join(few)}: it is at "
             "odds with what they did, or far from the prior; their posterior is coarse"
         )
-    _show_checks(people)
+    _show_checks(people, model_name(summary.get("human_model", "")))
     opened = [person["identifiability"] for person in people if "identifiability" in person]
     _show_entropy(opened, sites)
     tested = [person["test"] for person in people if person["test"]]
@@ -77,12 +78,10 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         print(line)
 
 
-def _show_checks(people: Sequence[dict[str, Any]]) -> None:
+def _show_checks(people: Sequence[dict[str, Any]], model: str) -> None:
     """Whom the model does not explain, and why."""
     doubted = [person for person in people if person["check"]["verdict"] != OK]
-    hint = ""
-    if doubted and "models" not in doubted[0]["check"]:
-        hint = "; --human-model all weighs other models of them"
+    hint = "; --human-model all weighs other models of them" if doubted and model == MIRROR else ""
     print(f"Model check: {len(people) - len(doubted)} of {len(people)} people ok{hint}")
     for person in doubted[:MOST_DOUBTED]:
         check = person["check"]

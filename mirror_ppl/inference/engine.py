@@ -30,7 +30,8 @@ class Inferred:
         draws: joint posterior draws by site, ``[S, P, 1, ...]``, as the human model samples them.
         pareto_k: of importance weights ``[P]``, if there are any.
         log_evidence: log marginal likelihood ``[P]`` of each person's recorded actions under the
-            model's own prior, nats, where an engine estimates it.
+            model's own prior, nats, where an engine estimates it; NaN where it is not defined, with
+            factors or observed sites, or attention whose values are drawn adds noise to it.
         losses: negative ELBO at each step in nats, if one was optimized.
         population: that people are from, if they were pooled.
         effective: number ``[P]`` of each person's own draws that pooling leaves, if they were.

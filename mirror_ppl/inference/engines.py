@@ -272,6 +272,10 @@ def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
     }
 
 
+FORMAT = 2
+"""Of what is kept of a run; raised whenever that changes, so that older runs are not resumed."""
+
+
 def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequence[object]) -> str:
     """What results belong to, as a hash: model with its source, network, and options and so on."""
     kinds = [kind for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
@@ -283,7 +287,7 @@ def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequen
         if not has_own_program(human):
             raise
         said = []  # a program of one's own may need more than made-up rounds have
-    description = [weights, source, said, __version__, [str(part) for part in what]]
+    description = [weights, source, said, __version__, FORMAT, [str(part) for part in what]]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import nan
 
 import torch
 
@@ -10,8 +11,11 @@ from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_i
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
+from mirror_ppl.likelihood.densities import adds_to_prior
 from mirror_ppl.likelihood.tables import person_builders, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
+from mirror_ppl.models.dependencies import dependencies
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.measured import measured_draws
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.timing import stage
@@ -30,6 +34,7 @@ def infer_by_importance(
     """
     first_pass = first_pass or _by_importance
     people, found, drawn = job.rounds.num_people, [], []
+    estimated = has_evidence(job.human) and not job.rounds.measurements
     with torch.random.fork_rng(devices=[]):
         builders = person_builders(job.human, job.rounds, job.screening)
         for person in range(people):
@@ -47,7 +52,7 @@ def infer_by_importance(
             draws = own.sample(job.draws, builder.grid)
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)
-            found.append((own.pareto_k, own.log_evidence, engine))
+            found.append((own.pareto_k, own.log_evidence if estimated else nan, engine))
             drawn.append(draws)
         order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
@@ -55,6 +60,16 @@ def infer_by_importance(
     joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
     pareto_k, log_evidence, engines = zip(*found, strict=True)
     return Inferred(joined, torch.tensor(pareto_k), torch.tensor(log_evidence), engines=engines)
+
+
+def has_evidence(human: HumanModel) -> bool:
+    """Whether averages of importance weights estimate a marginal likelihood of actions.
+
+    They do not where the program says more than it samples, as by factors, nor where values of
+    attention are drawn, which adds noise that their standard error leaves out.
+    """
+    drawn_attention = human.has_round_latents and not human.chained
+    return not (adds_to_prior(human) or dependencies(human).adds_to_actions or drawn_attention)
 
 
 def _by_importance(builder: ViewTableBuilder, options: ImportanceOptions) -> tuple[str, Weighted]:

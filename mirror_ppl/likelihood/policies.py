@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from mirror_ppl.likelihood.combinations import log_priors
+from mirror_ppl.likelihood.combinations import discrete_sites, log_priors
 from mirror_ppl.likelihood.densities import adds_to_prior, log_correction
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
@@ -39,8 +39,22 @@ def draw_policies(
         seed: of their draws.
 
     Returns:
-        The policies; ``None`` if hardly any draw from the prior is probable.
+        The policies; ``None`` if hardly any draw from the prior is probable. With a site by which
+        people are of different kinds, so many for each of its values in turn.
     """
+    found = _drawn_policies(human, grid, number, seed)
+    site = human.stratified_by
+    if found is None or site is None:
+        return found
+    values = discrete_sites(human)[site].to(found[site])
+    strata = {name: value.repeat_interleave(len(values), 0) for name, value in found.items()}
+    strata[site] = values.repeat(number).view(-1, *[1] * (found[site].dim() - 1))
+    return strata
+
+
+def _drawn_policies(
+    human: HumanModel, grid: Mapping[str, Tensor], number: int, seed: int
+) -> Draws | None:
     if not adds_to_prior(human):
         return draw_prior(human, 1, number, seed)
     size = max(1, min(AT_ONCE, ENTRIES // max(len(one) for one in (*grid.values(), (0,)))))

@@ -277,7 +277,7 @@ def views_of_moments(
     some, belief = (moment // action_count).unique(return_inverse=True)
     with WithoutSites("action_values"):
         values = [human.action_values(part) for part in state.mean[some].split(CHUNK)]
-    found = torch.cat(values) if len(some) else state.mean.new_zeros(0, action_count)
+    found = torch.cat(values)
     return (
         ManyViews(
             moments,

@@ -115,8 +115,10 @@ class ViewTableBuilder:
             self.policies = found or {}
             if found is None:  # nobody is known under whom combinations could be given up
                 self.screening = screening = None
-        policies = 0 if screening is None else screening.policies
-        self.score = torch.zeros(policies, prod(self.sizes), device=device)
+        number = 0 if screening is None else screening.policies
+        if self.policies:
+            number = len(next(iter(self.policies.values())))
+        self.score = torch.zeros(number, prod(self.sizes), device=device)
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
@@ -166,10 +168,9 @@ class ViewTableBuilder:
         row = torch.arange(number, device=some.device).repeat_interleave(len(some))
         views, which = views_of_rounds(self.human, candidates, row, rounds)
         # As many policies as tell moments apart: that is enough to tell rounds apart, too.
-        few = {
-            name: policy[: self.screening.merge_policies] for name, policy in self.policies.items()
-        }
-        found = self._log_likelihoods(views, few)[:, which].unflatten(-1, (number, -1))
+        found = self._log_likelihoods(views, self._merging(self.screening))[:, which].unflatten(
+            -1, (number, -1)
+        )
         prior = (self.score + self.log_prior)[: len(found), some]
         return telling_first(found, prior, self.screening.margin)
 
@@ -374,9 +375,7 @@ class ViewTableBuilder:
         """Moments of a round that count as one made one; which each view is then."""
         if not len(views.acted):  # of padding alone
             return views, torch.arange(len(views.moments), device=views.moments.device)
-        policies = {
-            name: policy[: screening.merge_policies] for name, policy in self.policies.items()
-        }
+        policies = self._merging(screening)
         keys = [
             torch.round(self._of_moments(policies, views, some) / screening.resolution).long().T
             for some in torch.arange(len(views.acted), device=views.acted.device).split(CHUNK)
@@ -397,6 +396,12 @@ class ViewTableBuilder:
             views.number,
         )
         return kept, place
+
+    def _merging(self, screening: Screening) -> dict[str, Tensor]:
+        """The policies that tell moments apart: as many of each kind of people."""
+        kinds = len(self.score) // screening.policies
+        number = kinds * screening.merge_policies
+        return {name: policy[:number] for name, policy in self.policies.items()}
 
     def _log_likelihoods(
         self, views: ManyViews, policies: Mapping[str, Tensor] | None = None

@@ -84,8 +84,8 @@ class Preferring(HumanModel):
     """Wants something else: another goal, more or less caution, a habit.
 
     ``shares_goal`` is how far the robot's action values are theirs: 1 for all of it, 0 for not at
-    all, -1 for the opposite. ``prefers_<action>`` is added to logits whatever an action leads to;
-    0 for the first action, with which the others are compared.
+    all, -1 for the opposite. ``prefers_<action>`` is added to the log-probability of an action,
+    whatever it leads to (lapses, too), before normalization; it is 0 for the first action.
     """
 
     @property
@@ -113,7 +113,7 @@ class Preferring(HumanModel):
 class HardOfHearing(HumanModel):
     """Does not take in what is communicated by some channels: ``hears_<modality>``, 1 if they do.
 
-    Recordings with messages tell, such as those of rounds in which a communicator assists.
+    It is inferred from recordings with messages, such as rounds in which a communicator assists.
     """
 
     def prior(self) -> dict[str, Tensor]:
@@ -141,14 +141,15 @@ class HardOfHearing(HumanModel):
 
 
 class AnyKind(Late, Preferring):
-    """Somebody of whom it is open to which of the family they belong."""
+    """People whose kind is unknown: each is inferred together with the other implants."""
 
     value_names: Mapping[str, Sequence[str]] = MappingProxyType({KIND: tuple(KINDS)})
+    stratified_by = KIND
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person, of all kinds, and their kind."""
-        chances = torch.tensor(list(KINDS.values())).to(next(self.self_model.parameters()))
-        return super().prior() | {KIND: pyro.sample(KIND, dist.Categorical(chances))}
+        probabilities = torch.tensor(list(KINDS.values())).to(next(self.self_model.parameters()))
+        return super().prior() | {KIND: pyro.sample(KIND, dist.Categorical(probabilities))}
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of actions ``[..., P, B, A]``, as their kind has it."""

@@ -65,9 +65,13 @@ class HumanModel(nn.Module):
     Attributes:
         value_names: names of the values 0, 1 and so on of discrete sites whose values have no
             order. Summaries have the most probable value of these, and quantiles of all others.
+        stratified_by: a discrete site of :meth:`prior`, which perception does not read and on which
+            no other site depends, if people of its values behave so differently that each value
+            needs policies of its own where combinations are given up and moments merged.
     """
 
     value_names: Mapping[str, Sequence[str]] = MappingProxyType({})
+    stratified_by: str | None = None
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Make sure that a class that changes what spans are about declares them.

@@ -33,7 +33,7 @@ from mirror_ppl.inference.results.fitting import split_rounds
 from mirror_ppl.inference.results.summary import score, summarize
 from mirror_ppl.models.weights import load_self_model
 
-RESULTS = {"open.png", "posterior.nc", "samples.png", "sight.png", "summary.json"}
+RESULTS = {"check.png", "open.png", "posterior.nc", "samples.png", "sight.png", "summary.json"}
 
 
 def content(folder):

@@ -127,3 +127,9 @@ def test_parts_are_joined_in_order():
     assert both.before.tolist() == [-1, 0, -1, -1, 3, -1]
     assert both.actions.tolist() == [0, 1, 0, 1, 1, 1]
     assert both.log_probability.shape == (1, 6, 2) and len(both.rewards) == 6
+
+
+def test_what_the_model_holds_impossible_is_surprising():
+    sure = torch.tensor([[[0.5, 0.5], [1.0, 0.0]]]).log()
+    impossible = Steps(torch.tensor([0, 1]), sure, torch.tensor([-1, 0]), REWARDS[:2])
+    assert p_values(impossible, ACTIONS, torch.Generator().manual_seed(0))["surprise"] == 0

@@ -1,5 +1,7 @@
 """Whether the model explains a person: verdicts, references, and what a fit tells of them."""
 
+import math
+
 import pytest
 import torch
 from paths import ROOT
@@ -23,24 +25,27 @@ def test_a_p_value_near_0_or_1_makes_suspect():
     found = verdict(fine | {"switches": 0.004, "reward": 0.9999}, None)
     assert found.word == "suspect"
     assert found.reasons == (
-        "earns less than the model says (p < 0.0005)",
-        "changes what they do more often than the model says (p = 0.0080)",
+        "earns less than the model says (p < 0.001)",
+        "changes what they do more often than the model says (p = 0.008)",
     )
     (reason,) = verdict(fine | {"share of stay": 1.0}, None).reasons
-    assert reason == 'does "stay" less often than the model says (p < 0.0005)'
+    assert reason == 'does "stay" less often than the model says (p < 0.001)'
 
 
 def test_worse_than_how_often_each_was_chosen_is_unexplained():
     fine, late = {"delayed": 0.5}, {"delayed": 0.0}
-    surely = torch.tensor([-0.2, -0.3, -0.25, -0.2])
-    perhaps = torch.tensor([-0.9, 0.8, -0.7, 0.6])
+    surely = torch.tensor([-2.0, -3.0, -2.5, -2.0])
+    perhaps = torch.tensor([-9.0, 8.0, -7.0, 6.0])
     assert verdict(fine, -surely).word == verdict(fine, perhaps).word == "ok"
     assert verdict(late, -surely).word == "suspect"
     assert verdict(fine, surely).word == verdict(late, perhaps).word == "unexplained"
-    assert verdict(fine, surely).reasons == (
-        "held-out actions are predicted 0.237 nats worse than by how often each was chosen before",
+    assert verdict(fine, surely, 38).reasons == (
+        "held-out actions are predicted 0.250 nats worse than by how often each was chosen before",
     )
-    assert verdict({}, None).word == "ok"
+    # One round says nothing of how much rounds differ, unless it cannot be at all.
+    assert verdict(fine, surely[:1]).word == verdict({}, None).word == "ok"
+    assert verdict(fine, torch.tensor([1.0, -math.inf])).word == "unexplained"
+    assert verdict(fine, surely[:0]).word == "ok"
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,16 @@
 """The family of human models: each by itself, and all of them as one program."""
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
 import mirror_ppl
 from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table import combination_number
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import (
     KIND,
@@ -19,7 +25,7 @@ from mirror_ppl.models.family import (
 from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
-from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.simulation import play_rounds, simulate_from_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 WORLDS = ("driving", "search_rescue", "bomb_defusal")
@@ -146,3 +152,42 @@ def test_a_fit_tells_the_probability_of_each_model(driving):
         assert person["implants"][KIND]["most_probable"] == "late"
         assert person["implants"][KIND]["probability"] == pytest.approx(models["late"])
         assert fit.check["p(late)"].iloc[number] == models["late"] > 0.9
+
+
+@pytest.mark.parametrize("known", [{SHARES_GOAL: -0.8}, {SHARES_GOAL: 1.0}])
+def test_what_few_kinds_of_people_could_have_seen_is_not_given_up(driving, known):
+    """Policies of each kind tell what is given up; of few drawn from all, most are mirror's."""
+    human, everybody = Preferring(driving), AnyKind(driving)
+    implants = {name: value[0] for name, value in draw_prior(human, 4, 1, 100).items()}
+    implants |= {name: torch.full((4, 1), value) for name, value in known.items()}
+    rounds = play_rounds(human, implants, 20, "fog", torch.Generator().manual_seed(100))
+    for person in range(4):
+        builder = ViewTableBuilder(everybody, Screening())
+        builder.add(rounds_of(rounds, person))
+        own = {site: implants[site][person, 0] for site in builder.grid}
+        true = combination_number(own, dict(zip(builder.grid, builder.sizes, strict=True)))
+        assert (builder.alive == true).any()
+        kinds = builder.policies[KIND].flatten().tolist()
+        assert kinds == [0, 1, 2] * Screening().policies
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("name", ["late", "all"])
+def test_without_rounds_what_is_known_is_the_prior(world, name):
+    human = load_human_model(name, self_model(world))
+    rounds = simulate_from_prior(human, 1, 2, seed=1)
+    fit = mirror_ppl.infer(rounds, human=human, train_rounds=0)
+    assert fit.summary["people"][0]["rounds"] == 0
+    assert abs(fit.summary["people"][0]["log_evidence"]) < 1e-3
+
+
+def test_evidence_is_of_actions_alone(driving):
+    class Asked(HumanModel):
+        def prior(self):
+            implants = super().prior()
+            pyro.sample("asked", dist.Normal(implants["consistency"], 0.5), obs=torch.tensor(3.0))
+            return implants
+
+    rounds = of_kind(HumanModel(driving), 100)
+    fit = mirror_ppl.infer(rounds, human=Asked(driving), engine="importance")
+    assert fit.summary["people"][0]["log_evidence"] is None

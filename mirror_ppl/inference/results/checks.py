@@ -206,6 +206,8 @@ def p_values(steps: Steps, actions: Sequence[str], generator: torch.Generator) -
 
 def _more(replicated: Tensor, recorded: Tensor) -> float:
     """How probably a replicate is above what was recorded, ties counted by half."""
-    same = (replicated - recorded).abs() <= TIE * (1 + recorded.abs())
+    near = (replicated - recorded).abs() <= TIE * (1 + recorded.abs())
+    # What the model holds impossible is infinitely surprising.
+    same = torch.where(recorded.isfinite(), near, replicated == recorded)
     above = (replicated > recorded) & ~same
     return float((above.double() + same.double() / 2).mean())

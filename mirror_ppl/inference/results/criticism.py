@@ -7,6 +7,7 @@ and the robot itself, without implants.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -29,7 +30,7 @@ from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
-from mirror_ppl.models.family import KIND
+from mirror_ppl.models.family import KIND, AnyKind
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
@@ -39,8 +40,8 @@ OK, SUSPECT, UNEXPLAINED = "ok", "suspect", "unexplained"
 """The verdicts."""
 LEVEL = 0.05
 """Share of people whom the model explains that may be suspect."""
-SURE = 2.0
-"""Standard errors by which a prediction has to be worse for that to be sure."""
+STANDARD_ERRORS = 2.0
+"""By how many of them predictions have to be worse to count without other reasons."""
 DRAWS, QUICK = 100, ImportanceOptions(proposals=64, enough=50.0)
 """How it is inferred how strictly the robot would choose in their place."""
 
@@ -58,34 +59,36 @@ class Verdict:
     reasons: tuple[str, ...] = ()
 
 
-def verdict(found: Mapping[str, float], lead: Tensor | None) -> Verdict:
+def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -> Verdict:
     """The verdict on a person.
 
-    *Suspect* is who does something of which the model says that hardly anybody like them would:
-    one p-value is nearer to 0 or 1 than it should be in :data:`LEVEL` of all people, whatever
-    number of p-values there are (Bonferroni). *Unexplained* is a suspect whose held-out actions the
-    model predicts worse than by how often they did each before, and anybody of whom that is sure.
+    ``suspect``: a p-value so near to 0 or 1 that of all people whom the model explains at most
+    :data:`LEVEL` have one, whatever the number of checks (Bonferroni). ``unexplained``: a suspect
+    whose held-out actions the model predicts worse than the shares of actions in earlier rounds
+    do, or anybody for whom that difference exceeds :data:`STANDARD_ERRORS`.
 
     Args:
         found: p-values, see :func:`p_values`.
-        lead: by how many nats the model predicts each held-out action better than that, ``[N']``;
-            ``None`` without such rounds.
+        lead: by how many nats the model predicts each held-out round better than those shares
+            ``[B']``; ``None`` without such rounds.
+        actions: in all of these rounds.
     """
     tails = {name: 2 * min(value, 1 - value) for name, value in found.items()}
-    limit = LEVEL / max(1, len(tails))
+    limit, least = LEVEL / max(1, len(tails)), 2 / REPLICATES
     reasons = []
     for name in sorted(tails, key=lambda one: tails[one]):  # stable: of equals the first
         if tails[name] < limit:
-            least = 1 / REPLICATES
-            size = f"p < {least:.4f}" if tails[name] < least else f"p = {tails[name]:.4f}"
+            size = f"p < {least:.3f}" if tails[name] < least else f"p = {tails[name]:.3f}"
             reasons.append(f"{_says(name, found[name] < 1 / 2)} ({size})")
     word = SUSPECT if reasons else OK
-    if lead is not None and len(lead) > 1 and lead.mean() < 0:
-        sure = bool(lead.mean() < -SURE * lead.std() / len(lead) ** 0.5)
-        if sure or reasons:
+    if lead is not None and len(lead) and lead.sum() < 0:
+        total, number = float(lead.sum()), len(lead)
+        # Rounds are the sample: what is done in one depends on each other.
+        error = float(lead.std()) * number**0.5 if number > 1 else math.inf
+        if reasons or not math.isfinite(total) or total < -STANDARD_ERRORS * error:
             word = UNEXPLAINED
             reasons.append(
-                f"held-out actions are predicted {-float(lead.mean()):.3f} nats worse than by how "
+                f"held-out actions are predicted {-total / actions:.3f} nats worse than by how "
                 "often each was chosen before"
             )
     return Verdict(word, tuple(reasons))
@@ -135,7 +138,7 @@ def criticize(
     log_probabilities: tuple[Tensor, Tensor | None],
     seed: int,
 ) -> dict[str, Any]:
-    """What is told in ``summary.json`` of whether the model explains one person.
+    """Whether the model explains one person, as ``summary.json`` has it.
 
     Args:
         human: the model of people.
@@ -161,9 +164,12 @@ def criticize(
         own = test.to("cpu")
         often = base_rate(train.to("cpu"), own, len(domain.actions))
         mixed = predictive(log_probabilities[1])[None]
-        lead = often + chosen_log_probability(mixed, own)[0, own.mask]
-        robot = no_implants(human.self_model, train, test, seed)
-    judged = verdict(found, lead)
+        lead = torch.zeros(own.mask.shape[1:]).to(often)
+        lead[own.mask[0]] = often + chosen_log_probability(mixed, own)[0, own.mask]
+        lead = lead.sum(-1)[own.mask[0].any(-1)]
+        if isinstance(human.self_model, SelfModel):
+            robot = no_implants(human.self_model, train, test, seed)
+    judged = verdict(found, lead, 1 if often is None else len(often))
     return {
         "verdict": judged.word,
         "reasons": list(judged.reasons),
@@ -173,7 +179,7 @@ def criticize(
     }
 
 
-def models_of(human: HumanModel, kind: Tensor) -> dict[str, float]:
+def models_of(human: AnyKind, kind: Tensor) -> dict[str, float]:
     """Posterior probability of each model of a family, of draws ``[S]`` of one person's kind.
 
     See :class:`mirror_ppl.models.family.AnyKind`.
