@@ -121,14 +121,6 @@ def test_rewards_are_those_that_were_recorded(world):
     assert (found.before[inside] == torch.arange(len(inside))[inside] - 1).all()
 
 
-def test_parts_are_joined_in_order():
-    one, other = steps([0, 1, 0]), steps([1, 1, 1])
-    both = Steps.joined([one, other])
-    assert both.before.tolist() == [-1, 0, -1, -1, 3, -1]
-    assert both.actions.tolist() == [0, 1, 0, 1, 1, 1]
-    assert both.log_probability.shape == (1, 6, 2) and len(both.rewards) == 6
-
-
 def test_what_the_model_holds_impossible_is_surprising():
     sure = torch.tensor([[[0.5, 0.5], [1.0, 0.0]]]).log()
     impossible = Steps(torch.tensor([0, 1]), sure, torch.tensor([-1, 0]), REWARDS[:2])

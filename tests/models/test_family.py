@@ -6,6 +6,14 @@ import pytest
 import torch
 
 import mirror_ppl
+from mirror_ppl.communication import (
+    Communicator,
+    ExpectedUtility,
+    Person,
+    RoundSoFar,
+    SimulatorWorld,
+)
+from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
@@ -191,3 +199,26 @@ def test_evidence_is_of_actions_alone(driving):
     rounds = of_kind(HumanModel(driving), 100)
     fit = mirror_ppl.infer(rounds, human=Asked(driving), engine="importance")
     assert fit.summary["people"][0]["log_evidence"] is None
+
+
+def test_whom_no_channel_reaches_is_told_nothing(driving):
+    """In the moments in which those who hear, alike in all else, are told something."""
+    human = HardOfHearing(driving)
+    draws = draw_prior(human, 1, 16, 1)
+    draws |= {site: torch.zeros_like(draws[site]) for site in sight_sites(human.domain)}
+    heard = {site: torch.ones_like(draws[site]) for site in ("hears_visual", "hears_verbal")}
+    deaf = {site: torch.zeros_like(value) for site, value in heard.items()}
+    only = heard | {"hears_verbal": deaf["hears_verbal"]}
+    recordings = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    told = []
+    for hears in (heard, only, deaf):
+        person = Person(human, draws | hears)
+        communicator = Communicator(person, ExpectedUtility(SimulatorWorld(human.domain), 5))
+        decisions = [
+            communicator.plan(RoundSoFar.of(recordings, "person-01", number, 3))
+            for number in range(6)
+        ]
+        told.append([{channel for channel, _ in one.message} for one in decisions])
+    assert any(told[0])
+    assert any(told[1]) and not any("verbal" in channels for channels in told[1])
+    assert not any(told[2])

@@ -568,4 +568,4 @@ def test_help_names_every_choice(capsys):
     for name in (*PEOPLE, *DOMAIN.settings, *POPULATIONS):
         assert name in text
     for option in fields(Options):
-        assert f"--{option.name}" in text
+        assert f"--{option.name.replace('_', '-')}" in text

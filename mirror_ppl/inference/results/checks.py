@@ -9,8 +9,9 @@ with what the model says would be done, step by step given all that was recorded
     p_h = P(T_h^rep > T_h) + 1/2 P(T_h^rep = T_h)
 
 (Gelman, Meng and Stern, 1996). As each step is drawn given the recorded ones before it, no round
-has to be simulated, and a check depends on nothing that was done later. Rounds that were learned
-from and held-out ones count alike, which makes p-values of the former cautious.
+has to be simulated, and a check depends on nothing that was done later. Only rounds that were
+learned from count: draws of the posterior are right given these, and p-values are then cautious,
+while a wide posterior would be found surprised by every other round.
 """
 
 from __future__ import annotations
@@ -48,21 +49,6 @@ class Steps:
     log_probability: Tensor
     before: Tensor
     rewards: Tensor
-
-    @classmethod
-    def joined(cls, parts: Sequence[Steps]) -> Steps:
-        """The steps of all parts, in order."""
-        begins = torch.tensor([len(part.actions) for part in parts]).cumsum(0).tolist()
-        before = [
-            torch.where(part.before < 0, -1, part.before + begin)
-            for part, begin in zip(parts, [0, *begins[:-1]], strict=True)
-        ]
-        return cls(
-            torch.cat([part.actions for part in parts]),
-            torch.cat([part.log_probability for part in parts], 1),
-            torch.cat(before),
-            torch.cat([part.rewards for part in parts]),
-        )
 
     @property
     def follows(self) -> Tensor:

@@ -21,7 +21,6 @@ from mirror_ppl.inference.results.checks import (
     CHECKS,
     REPLICATES,
     SHARE,
-    Steps,
     p_values,
     steps_of,
 )
@@ -151,13 +150,7 @@ def criticize(
         (``None`` without held-out rounds).
     """
     domain, (train, test) = human.domain, rounds
-    steps = Steps.joined(
-        [
-            steps_of(domain, own.to("cpu"), predicted)
-            for own, predicted in zip(rounds, log_probabilities, strict=True)
-            if own is not None and predicted is not None
-        ]
-    )
+    steps = steps_of(domain, train.to("cpu"), log_probabilities[0])
     found = p_values(steps, domain.actions, torch.Generator().manual_seed(seed))
     often = robot = lead = None
     if test is not None and log_probabilities[1] is not None and bool(test.mask.any()):
