@@ -28,7 +28,7 @@ from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.results.criticism import OK
+from mirror_ppl.inference.results.criticism import OK, UNCHECKED
 from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
@@ -54,6 +54,8 @@ KEPT = ("means", "draws")
 """What may be kept of predictions."""
 SHIPPED = "the people that ship"
 """Recordings of :func:`infer` unless others are given."""
+FINE = (OK, UNCHECKED)
+"""Verdicts that are no warning."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
 """Names of all files that a fit may write."""
 
@@ -75,7 +77,7 @@ class Fit(fitting.Fit):
         told = self.summary
         doubtful = _doubtful(told)
         warning = f"; weights not to be relied on: {', '.join(doubtful)}" if doubtful else ""
-        wrong = [one["id"] for one in told["people"] if one["check"]["verdict"] != OK]
+        wrong = [one["id"] for one in told["people"] if one["check"]["verdict"] not in FINE]
         warning += f"; not explained by the model: {', '.join(wrong)}" if wrong else ""
         return (
             f"Fit({told['domain']}, {told['setting']}: {len(self.people)} people, "
@@ -179,7 +181,7 @@ class FittedPerson:
         doubtful = self.name in _doubtful(self.fit.summary)
         warning = "; weights not to be relied on" if doubtful else ""
         check = self.summary["check"]
-        if check["verdict"] != OK:
+        if check["verdict"] not in FINE:
             warning += f"; {check['verdict']}: {'; '.join(check['reasons'])}"
         return f"FittedPerson({self.name}: {self.summary['rounds']} rounds{warning})"
 

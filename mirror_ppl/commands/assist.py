@@ -301,6 +301,13 @@ def _people(options: Options):
         )
     if not str(source["seed"]).isdecimal():
         raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")
+    from mirror_ppl.models.simulation import PRIOR_OF
+
+    if str(source["population"]).startswith(PRIOR_OF):
+        raise PosteriorError(
+            f"{options.posterior}: is of people drawn from the {source['population']}, who cannot "
+            "be played further; plan messages for them with mirror_ppl.Communicator"
+        )
     require_known(source["population"], "population", PEOPLE[domain].populations)
     return posterior, source
 

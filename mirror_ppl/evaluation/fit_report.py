@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from mirror_ppl.console import console_for_tables
-from mirror_ppl.inference.results.criticism import OK
+from mirror_ppl.inference.results.criticism import OK, UNCHECKED
 from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.models.implants import NOTICES
@@ -80,9 +80,13 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
 
 def _show_checks(people: Sequence[dict[str, Any]], model: str) -> None:
     """Whom the model does not explain, and why."""
-    doubted = [person for person in people if person["check"]["verdict"] != OK]
+    checked = [person for person in people if person["check"]["verdict"] != UNCHECKED]
+    if not checked:
+        print("Model check: none without training rounds")
+        return
+    doubted = [person for person in checked if person["check"]["verdict"] != OK]
     hint = "; --human-model all weighs other models of them" if doubted and model == MIRROR else ""
-    print(f"Model check: {len(people) - len(doubted)} of {len(people)} people ok{hint}")
+    print(f"Model check: {len(checked) - len(doubted)} of {len(checked)} people ok{hint}")
     for person in doubted[:MOST_DOUBTED]:
         check = person["check"]
         print(f"  {person['id']} {check['verdict']}: {'; '.join(check['reasons'])}")

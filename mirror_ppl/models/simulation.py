@@ -27,6 +27,9 @@ from mirror_ppl.models.implants import in_units
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.version import __version__
 
+PRIOR_OF = "prior of "
+"""What the population of people begins with who are drawn from a human model's prior."""
+
 
 @torch.no_grad()
 def play_rounds(
@@ -196,7 +199,7 @@ def simulate_from_prior(
         if value.dim() == 2  # noqa: PLR2004
     }
     provenance = {
-        "population": f"prior of {type(human).__name__}",
+        "population": f"{PRIOR_OF}{type(human).__name__}",
         "seed": seed,
         "version": __version__,
         **({"told": told} if told else {}),

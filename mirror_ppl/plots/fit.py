@@ -67,7 +67,13 @@ class FitPlots:
         return plot_identifiability(self.data)
 
     def check(self) -> Picture:
-        """Whether the model explains each person, see :func:`plot_model_check`."""
+        """Whether the model explains each person, see :func:`plot_model_check`.
+
+        Raises:
+            InputError: there were no training rounds, so nothing was checked.
+        """
+        if not self.data["model_check"].sizes["check"]:
+            raise InputError("without training rounds there is nothing to check")
         return plot_model_check(self.data)
 
     def predictive_check(self) -> Picture:
@@ -92,7 +98,8 @@ class FitPlots:
     def files(self) -> dict[str, tuple[Picture, str]]:
         """Every picture that a fit writes, with what it shows, by file name."""
         pictures = dict(sight.sight_pictures(self.data))
-        pictures[CHECK] = self.check(), "whether the model explains each person"
+        if self.data["model_check"].sizes["check"]:
+            pictures[CHECK] = self.check(), "whether the model explains each person"
         if self._has_identifiability():
             shows = "what is open about what they see, and what would tell"
             pictures[OPEN] = plot_identifiability(self.data), shows

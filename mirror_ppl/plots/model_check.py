@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mirror_ppl.inference.results.checks import REPLICATES
-from mirror_ppl.inference.results.criticism import LEVEL, OK
+from mirror_ppl.inference.results.criticism import LEVEL, OK, UNCHECKED
 from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE
+from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE
 
 if TYPE_CHECKING:
     import arviz as az
@@ -40,7 +40,7 @@ def plot_model_check(data: az.InferenceData) -> Picture:
     group = data["model_check"].isel(person=slice(MOST_PEOPLE))
     labels = [label_of(str(person)) for person in group["person"].values]
     labels = [
-        label if verdict == OK else f"{label} ({verdict})"
+        label if verdict in (OK, UNCHECKED) else f"{label} ({verdict})"
         for label, verdict in zip(labels, group["verdict"].values, strict=True)
     ]
     tested = bool(np.isfinite(group["nll"].values).any())
@@ -76,8 +76,8 @@ def _p_values(ax, group: xr.Dataset) -> None:
         for column, tail in enumerate(own):
             if not np.isfinite(tail):
                 continue
-            text = f"{tail:.2f}" if tail >= 0.01 else f"{tail:.4f}"
-            text = f"<{1 / REPLICATES:.4f}" if tail < 1 / REPLICATES else text
+            text = f"{tail:.2f}" if tail >= 0.01 else f"{tail:.3f}"  # noqa: PLR2004
+            text = f"<{2 / REPLICATES:.3f}" if tail < 2 / REPLICATES else text
             colour = "white" if depth[row, column] > DARK else BLACK
             frame = {"edgecolor": colour, "facecolor": "none", "pad": 1.5, "lw": 1}
             ax.text(
@@ -92,20 +92,23 @@ def _p_values(ax, group: xr.Dataset) -> None:
             )
     names = [textwrap.fill(str(name), WRAP) for name in group["check"].values]
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9)
-    ax.set_title("Two-sided p-values: blue more, red less\nthan the model says", fontsize=11)
+    title = (
+        "Two-sided p-values; blue: more, red: less than predicted;\nframes: such people are suspect"
+    )
+    ax.set_title(title, fontsize=11)
 
 
 def _likelihoods(ax, group: xr.Dataset) -> None:
     rows = np.arange(len(group["person"]))
-    for name, colour, marker, label in (
-        ("nll_base_rate", GREY, "|", "how often each before"),
-        ("nll_no_implants", ORANGE, "D", "no implants"),
-        ("nll", BLUE, "o", "the model"),
+    for name, colour, marker, size, label in (
+        ("nll_no_implants", ORANGE, "D", 7, "no implants"),
+        ("nll", BLUE, "o", 7, "the model"),
+        ("nll_base_rate", BLACK, "|", 14, "base rate: how often each action before"),
     ):
-        ax.plot(group[name].values, rows, marker, color=colour, label=label, mew=2, ms=7)
+        ax.plot(group[name].values, rows, marker, color=colour, label=label, mew=2, ms=size)
     values = [group[name].values for name in ("nll_base_rate", "nll_no_implants", "nll")]
     ax.set_xlim(0, 1.08 * float(np.nanmax(values)))
     ax.set_yticks([])
-    ax.set_xlabel("nats an action")
+    ax.set_xlabel("nats an action; less is better")
     ax.set_title("Held-out actions", fontsize=11)
     ax.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1, 0.5))

@@ -43,7 +43,8 @@ def test_worse_than_how_often_each_was_chosen_is_unexplained():
         "held-out actions are predicted 0.250 nats worse than by how often each was chosen before",
     )
     # One round says nothing of how much rounds differ, unless it cannot be at all.
-    assert verdict(fine, surely[:1]).word == verdict({}, None).word == "ok"
+    assert verdict(fine, surely[:1]).word == "ok"
+    assert verdict({}, surely).word == verdict({}, None).word == "unchecked"
     assert verdict(fine, torch.tensor([1.0, -math.inf])).word == "unexplained"
     assert verdict(fine, surely[:0]).word == "ok"
 

@@ -14,6 +14,7 @@ from mirror_ppl.communication import (
     SimulatorWorld,
 )
 from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.errors import InputError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
@@ -186,7 +187,11 @@ def test_without_rounds_what_is_known_is_the_prior(world, name):
     rounds = simulate_from_prior(human, 1, 2, seed=1)
     fit = mirror_ppl.infer(rounds, human=human, train_rounds=0)
     assert fit.summary["people"][0]["rounds"] == 0
-    assert abs(fit.summary["people"][0]["log_evidence"]) < 1e-3
+    assert abs(fit.summary["people"][0]["log_evidence"]) < 0.05  # an average of weights
+    assert fit.summary["people"][0]["check"]["verdict"] == "unchecked"
+    assert "check.png" not in fit.plot.files() and "not explained" not in repr(fit)
+    with pytest.raises(InputError, match="without training rounds there is nothing to check"):
+        fit.plot.check()
 
 
 def test_evidence_is_of_actions_alone(driving):

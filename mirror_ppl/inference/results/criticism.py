@@ -35,7 +35,7 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
 
-OK, SUSPECT, UNEXPLAINED = "ok", "suspect", "unexplained"
+OK, SUSPECT, UNEXPLAINED, UNCHECKED = "ok", "suspect", "unexplained", "unchecked"
 """The verdicts."""
 LEVEL = 0.05
 """Share of people whom the model explains that may be suspect."""
@@ -50,7 +50,7 @@ class Verdict:
     """Whether the model explains a person.
 
     Attributes:
-        word: ``ok``, ``suspect`` or ``unexplained``.
+        word: ``ok``, ``suspect``, ``unexplained`` or ``unchecked``.
         reasons: for it, the strongest first.
     """
 
@@ -64,7 +64,8 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
     ``suspect``: a p-value so near to 0 or 1 that of all people whom the model explains at most
     :data:`LEVEL` have one, whatever the number of checks (Bonferroni). ``unexplained``: a suspect
     whose held-out actions the model predicts worse than the shares of actions in earlier rounds
-    do, or anybody for whom that difference exceeds :data:`STANDARD_ERRORS`.
+    do, or anybody for whom that difference exceeds :data:`STANDARD_ERRORS`. ``unchecked``: without
+    training rounds there is nothing to check.
 
     Args:
         found: p-values, see :func:`p_values`.
@@ -79,6 +80,8 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
         if tails[name] < limit:
             size = f"p < {least:.3f}" if tails[name] < least else f"p = {tails[name]:.3f}"
             reasons.append(f"{_says(name, found[name] < 1 / 2)} ({size})")
+    if not found:
+        return Verdict(UNCHECKED)
     word = SUSPECT if reasons else OK
     if lead is not None and len(lead) and lead.sum() < 0:
         total, number = float(lead.sum()), len(lead)
