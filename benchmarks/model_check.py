@@ -123,7 +123,6 @@ def main(options: Options) -> None:
     self_model, _ = load_self_model(shipped_weights("driving"))
     rows, shown = [], []
     for kind, (human, known) in kinds(self_model).items():
-        torch.manual_seed(options.seed)
         drawn = draw_prior(human, options.people, 1, options.seed)
         implants = {name: value[0] for name, value in drawn.items()}
         implants |= {name: torch.full((options.people, 1), value) for name, value in known.items()}

@@ -28,7 +28,7 @@ from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.results.criticism import OK, UNCHECKED
+from mirror_ppl.inference.results.criticism import FINE
 from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
@@ -54,8 +54,6 @@ KEPT = ("means", "draws")
 """What may be kept of predictions."""
 SHIPPED = "the people that ship"
 """Recordings of :func:`infer` unless others are given."""
-FINE = (OK, UNCHECKED)
-"""Verdicts that are no warning."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
 """Names of all files that a fit may write."""
 

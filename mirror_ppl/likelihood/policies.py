@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.combinations import discrete_sites, log_priors
 from mirror_ppl.likelihood.densities import adds_to_prior, log_correction
 from mirror_ppl.models.dependencies import dependencies
@@ -41,12 +42,20 @@ def draw_policies(
     Returns:
         The policies; ``None`` if hardly any draw from the prior is probable. With a site by which
         people are of different kinds, so many for each of its values in turn.
+
+    Raises:
+        HumanModelError: ``stratified_by`` is no discrete site.
     """
     found = _drawn_policies(human, grid, number, seed)
     site = human.stratified_by
     if found is None or site is None:
         return found
-    values = discrete_sites(human)[site].to(found[site])
+    discrete = discrete_sites(human)
+    if site not in discrete:
+        raise HumanModelError(
+            f"{type(human).__name__}.stratified_by is {site!r}, no discrete site of prior()"
+        )
+    values = discrete[site].to(found[site])
     strata = {name: value.repeat_interleave(len(values), 0) for name, value in found.items()}
     strata[site] = values.repeat(number).view(-1, *[1] * (found[site].dim() - 1))
     return strata

@@ -1,7 +1,7 @@
 """A family of human models: people who react late, who want something else, or who do not hear.
 
 Each is a program of its own, to fit, simulate and calibrate. :class:`AnyKind` is the first two and
-the package's own model at once: to which of them somebody belongs is a site, ``kind``. Its
+the package's own model at once: which of them holds for a person is a site, ``kind``. Its
 posterior weighs the models by their marginal likelihoods, and what they share, predictions and
 plans are averages over them (Bayesian model averaging)::
 
@@ -12,7 +12,7 @@ plans are averages over them (Bayesian model averaging)::
     a_t             ~ (1 - late) p(a | zH_t) + late p(a | zH_{t-1})
     p(a | z)        ~ exp(prefers_a) p(a | z, shares_goal * Q(z)), normalized
 
-Sites of other kinds than somebody's own have their prior.
+Implants of the other models keep their prior.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def _told(
     chance: float,
     generator: torch.Generator,
 ) -> Visibility:
-    """Which items ``[P, B, K]`` are told by chance; the generator is not used for none."""
+    """Which items ``[P, B, K]`` are told at random; the generator is not used for none."""
     can_be = domain.communicable(observation)
     if not chance:
         return {name: torch.zeros_like(mask) for name, mask in can_be.items()}

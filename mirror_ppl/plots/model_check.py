@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mirror_ppl.inference.results.checks import REPLICATES
-from mirror_ppl.inference.results.criticism import LEVEL, OK, UNCHECKED
+from mirror_ppl.inference.results.criticism import FINE, LEVEL
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE
 
@@ -40,7 +40,7 @@ def plot_model_check(data: az.InferenceData) -> Picture:
     group = data["model_check"].isel(person=slice(MOST_PEOPLE))
     labels = [label_of(str(person)) for person in group["person"].values]
     labels = [
-        label if verdict in (OK, UNCHECKED) else f"{label} ({verdict})"
+        label if verdict in FINE else f"{label} ({verdict})"
         for label, verdict in zip(labels, group["verdict"].values, strict=True)
     ]
     tested = bool(np.isfinite(group["nll"].values).any())

@@ -17,25 +17,25 @@ from mirror_ppl.inference.results.checks import (
     steps_of,
 )
 
-CHANCES = torch.tensor([[0.9, 0.1], [0.3, 0.7], [0.6, 0.4]])
+PROBABILITIES = torch.tensor([[0.9, 0.1], [0.3, 0.7], [0.6, 0.4]])
 REWARDS = torch.tensor([[0.0, -1.0], [-2.0, 0.5], [1.0, 1.0]])
 ACTIONS = ("stay", "switch")
 
 
 def steps(actions, draws=1):
     """Three steps, the last of a round of its own."""
-    chances = CHANCES.log().expand(draws, -1, -1)
-    return Steps(torch.tensor(actions), chances, torch.tensor([-1, 0, -1]), REWARDS)
+    probabilities = PROBABILITIES.log().expand(draws, -1, -1)
+    return Steps(torch.tensor(actions), probabilities, torch.tensor([-1, 0, -1]), REWARDS)
 
 
 def by_hand(actions):
     """Values of all checks of a course of three actions, summed over the steps they are about."""
     first, second, third = actions
     return {
-        "delayed": CHANCES[0, second],
+        "delayed": PROBABILITIES[0, second],
         "switches": float(first != second),  # of the recorded first one, see below
         "reward": sum(REWARDS[step, action] for step, action in enumerate(actions)),
-        "surprise": -sum(CHANCES[step, action].log() for step, action in enumerate(actions)),
+        "surprise": -sum(PROBABILITIES[step, action].log() for step, action in enumerate(actions)),
         SHARE + "stay": float((first == 0) + (second == 0) + (third == 0)),
     }
 
@@ -47,21 +47,21 @@ def test_p_values_are_those_of_all_courses(recorded):
     expected = dict.fromkeys(by_hand(recorded), 0.0)
     own = by_hand(recorded)
     for course in itertools.product([0, 1], repeat=3):
-        chance = math.prod(float(CHANCES[step, action]) for step, action in enumerate(course))
+        weight = math.prod(float(PROBABILITIES[step, action]) for step, action in enumerate(course))
         # Steps follow the recorded ones, so that the second switches from the recorded first one.
         values = by_hand(course) | {"switches": float(course[1] != recorded[0])}
         for name, value in values.items():
             apart = float(value) - float(own[name])
-            expected[name] += chance * (0.5 if abs(apart) < 1e-6 else float(apart > 0))
+            expected[name] += weight * (0.5 if abs(apart) < 1e-6 else float(apart > 0))
     assert found.keys() == expected.keys()
     for name, value in expected.items():
         assert abs(found[name] - value) < 4 * 0.5 / REPLICATES**0.5, name
 
 
 def test_of_more_than_two_actions_the_share_of_each_is_compared():
-    chances = torch.full((1, 4, 3), 1 / 3).log()
+    probabilities = torch.full((1, 4, 3), 1 / 3).log()
     three = Steps(
-        torch.tensor([0, 0, 0, 0]), chances, torch.tensor([-1, 0, 1, 2]), torch.zeros(4, 3)
+        torch.tensor([0, 0, 0, 0]), probabilities, torch.tensor([-1, 0, 1, 2]), torch.zeros(4, 3)
     )
     found = p_values(three, ("a", "b", "c"), torch.Generator().manual_seed(1))
     assert [name for name in found if name.startswith(SHARE)] == [SHARE + name for name in "abc"]
@@ -72,12 +72,12 @@ def test_of_more_than_two_actions_the_share_of_each_is_compared():
 def test_without_steps_there_is_nothing_to_compare():
     none = Steps(
         *(part[:0] for part in (torch.zeros(1).long(),)),
-        CHANCES.log()[None, :0],
+        PROBABILITIES.log()[None, :0],
         torch.zeros(0).long(),
         REWARDS[:0],
     )
     assert p_values(none, ACTIONS, torch.Generator()) == {}
-    alone = Steps(torch.tensor([0]), CHANCES.log()[None, :1], torch.tensor([-1]), REWARDS[:1])
+    alone = Steps(torch.tensor([0]), PROBABILITIES.log()[None, :1], torch.tensor([-1]), REWARDS[:1])
     found = p_values(alone, ACTIONS, torch.Generator().manual_seed(0))
     assert found.keys() == {"reward", "surprise", SHARE + "stay"}
 
@@ -85,15 +85,15 @@ def test_without_steps_there_is_nothing_to_compare():
 def test_people_of_the_model_are_seldom_suspect():
     """Mid-p-values are at most as often extreme as uniform ones, but for what is discrete."""
     generator, extreme = torch.Generator().manual_seed(3), 0
-    chances = torch.rand(2, 60, 2, generator=generator).log_softmax(-1)
+    probabilities = torch.rand(2, 60, 2, generator=generator).log_softmax(-1)
     before = torch.arange(60) - 1
     number = 300
     for _ in range(number):
         # Of one of the two draws, as the person is.
-        own = chances[int(torch.randint(2, (), generator=generator))]
+        own = probabilities[int(torch.randint(2, (), generator=generator))]
         actions = torch.multinomial(own.exp(), 1, generator=generator)[:, 0]
         found = p_values(
-            Steps(actions, chances, before, own), ACTIONS, torch.Generator().manual_seed(4)
+            Steps(actions, probabilities, before, own), ACTIONS, torch.Generator().manual_seed(4)
         )
         extreme += sum(min(value, 1 - value) < 0.025 for value in found.values())
     checks = number * (len(CHECKS) + 1)

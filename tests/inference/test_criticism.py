@@ -91,7 +91,8 @@ def test_a_fit_says_who_is_late(late):
     fit = mirror_ppl.infer(late, engine="importance", seed=1)
     check = fit.check
     assert list(check.index) == ["person-01", "person-02"]
-    assert list(check["verdict"]) == ["ok", "suspect"] or check["verdict"].iloc[1] == "unexplained"
+    assert check["verdict"].iloc[0] == "ok"
+    assert check["verdict"].iloc[1] in ("suspect", "unexplained")
     assert "acts as if one step late" in check["reasons"].iloc[1]
     assert check["delayed"].iloc[0] > 0.005 > check["delayed"].iloc[1]
     assert "person-02" in repr(fit) and "person-01" not in repr(fit)

@@ -14,7 +14,7 @@ from mirror_ppl.communication import (
     SimulatorWorld,
 )
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.errors import InputError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
@@ -178,6 +178,14 @@ def test_what_few_kinds_of_people_could_have_seen_is_not_given_up(driving, known
         assert (builder.alive == true).any()
         kinds = builder.policies[KIND].flatten().tolist()
         assert kinds == [0, 1, 2] * Screening().policies
+
+
+def test_what_is_stratified_by_has_to_be_discrete(driving):
+    class Wrong(HumanModel):
+        stratified_by = "consistency"
+
+    with pytest.raises(HumanModelError, match="stratified_by is 'consistency', no discrete"):
+        ViewTableBuilder(Wrong(driving), Screening())
 
 
 @pytest.mark.parametrize("world", WORLDS)

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains.base import Domain, map_state, total_reward
+from mirror_ppl.inference.results.summary import predictive
 
 REPLICATES = 2000
 """Replicated recordings of a person: p-values of .005 are known to within .0016."""
@@ -84,10 +85,7 @@ def switches(steps: Steps) -> Tensor:
 
 def delayed(steps: Steps) -> Tensor:
     """How probable the model had an action at the step before, ``[1, n, A]``."""
-    mean = (
-        torch.logsumexp(steps.log_probability, 0) - torch.tensor(len(steps.log_probability)).log()
-    )
-    return mean.exp()[steps.before[steps.follows]][None]
+    return predictive(steps.log_probability).exp()[steps.before[steps.follows]][None]
 
 
 def reward(steps: Steps) -> Tensor:

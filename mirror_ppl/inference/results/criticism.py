@@ -37,6 +37,8 @@ from mirror_ppl.models.self_model import SelfModel
 
 OK, SUSPECT, UNEXPLAINED, UNCHECKED = "ok", "suspect", "unexplained", "unchecked"
 """The verdicts."""
+FINE = OK, UNCHECKED
+"""Those that are no warning."""
 LEVEL = 0.05
 """Share of people whom the model explains that may be suspect."""
 STANDARD_ERRORS = 2.0
@@ -73,15 +75,15 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
             ``[B']``; ``None`` without such rounds.
         actions: in all of these rounds.
     """
+    if not found:
+        return Verdict(UNCHECKED)
     tails = {name: 2 * min(value, 1 - value) for name, value in found.items()}
-    limit, least = LEVEL / max(1, len(tails)), 2 / REPLICATES
+    limit, least = LEVEL / len(tails), 2 / REPLICATES
     reasons = []
     for name in sorted(tails, key=lambda one: tails[one]):  # stable: of equals the first
         if tails[name] < limit:
             size = f"p < {least:.3f}" if tails[name] < least else f"p = {tails[name]:.3f}"
             reasons.append(f"{_says(name, found[name] < 1 / 2)} ({size})")
-    if not found:
-        return Verdict(UNCHECKED)
     word = SUSPECT if reasons else OK
     if lead is not None and len(lead) and lead.sum() < 0:
         total, number = float(lead.sum()), len(lead)
