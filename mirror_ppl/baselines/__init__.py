@@ -8,6 +8,7 @@ from mirror_ppl.baselines.behaviour_cloning import (
 from mirror_ppl.baselines.inputs import SIGHTS, input_size, network_inputs
 from mirror_ppl.baselines.logistic import LogisticOptions, PooledLogistic, fit_pooled_logistic
 from mirror_ppl.baselines.person import NetworkPerson
+from mirror_ppl.baselines.pooled import as_one_person
 from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.baselines.sqil import SoftQ, SoftQOptions, fit_soft_q
 from mirror_ppl.baselines.training import held_out_nll
@@ -22,6 +23,7 @@ __all__ = [
     "RecurrentNetworks",
     "SoftQ",
     "SoftQOptions",
+    "as_one_person",
     "fit_behaviour_clone",
     "fit_pooled_logistic",
     "fit_soft_q",

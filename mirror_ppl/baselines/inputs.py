@@ -2,12 +2,17 @@
 
 Items of all modalities as the domain's symbols, with masks: which are visible, which were told. Of
 most steps the same is to be read as of others, so each different row of inputs is kept once.
+
+Networks of the sight "informed" are given what a message means, as the human model is: what is told
+counts as seen and no more, and what follows from everything seen and told so far can be read as
+well (:meth:`mirror_ppl.domains.base.Domain.known`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from functools import partial
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -15,11 +20,15 @@ from torch.nn.functional import one_hot, pad
 
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import Domain, Observation, Visibility
+from mirror_ppl.models.human import at_step, messages_at
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
-Sight = Literal["setting", "everything"]
-"""Which items a network reads: those that the setting shows or that were told, or all visual ones.
+Sight = Literal["setting", "everything", "informed"]
+"""Which items a network reads: those that the setting shows or that were told, or all visual ones,
+or those that the setting shows or that follow from what was seen and told.
 """
+INFORMED: Sight = "informed"
+"""The sight to which what is told is as if it were seen."""
 SIGHTS: tuple[Sight, ...] = get_args(Sight)
 
 
@@ -62,20 +71,57 @@ def visible_items(
     return visible
 
 
+def look(
+    domain: Domain,
+    sight: Sight,
+    setting: str,
+    knowledge: Any,
+    observation: Observation,
+    told: Visibility,
+) -> tuple[Visibility, Visibility, Any]:
+    """What a baseline reads at one step as seen and as told, and the knowledge after it.
+
+    Args:
+        domain: the world.
+        sight: which items are read.
+        setting: which lets people see what they see by themselves.
+        knowledge: the domain's, of the step before; only read and changed if informed.
+        observation: everything that there is to observe, ``[..., K, F]``.
+        told: what is communicated ``[..., K]``.
+    """
+    seen = visible_items(domain, sight, setting, observation)
+    if sight != INFORMED:
+        return seen, told, knowledge
+    sees = partial(visible_items, domain, sight, setting)
+    seen = {name: mask | told[name] for name, mask in seen.items()}
+    knowledge = domain.learn(knowledge, observation, seen, sees)
+    seen = {name: seen[name] | mask for name, mask in domain.known(knowledge).items()}
+    return seen, {name: torch.zeros_like(mask) for name, mask in seen.items()}, knowledge
+
+
 def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations) -> Tensor:
     """What a baseline reads at each step of recorded rounds, ``[P, B, T, I]``."""
-    observation = demonstrations.observation()
-    steps = demonstrations.shape[2]
-    seen = {
-        name: mask[:, :, :steps]
-        for name, mask in visible_items(domain, sight, demonstrations.setting, observation).items()
-    }
+    people, rounds, steps = demonstrations.shape
+    observation, told = demonstrations.observation(), dict(demonstrations.told)
+    device = demonstrations.actions.device
+    knowledge = domain.nothing_known(people, rounds, device=device)
+    looks = []
+    for step in range(steps):
+        now = at_step(observation, step)
+        *look_now, knowledge = look(
+            domain, sight, demonstrations.setting, knowledge, now, messages_at(told, step)
+        )
+        looks.append(look_now)
+    seen, heard = (
+        {name: torch.stack([one[kind][name] for one in looks], 2) for name in told}
+        for kind in range(2)
+    )
     observation = {name: value[:, :, :steps] for name, value in observation.items()}
     actions = demonstrations.actions
     none = torch.full_like(actions[:, :, :1], len(domain.actions))
     # Padding has the action -1, which is nobody's business but has to have a symbol.
     previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
-    return network_inputs(domain, observation, seen, dict(demonstrations.told), previous)
+    return network_inputs(domain, observation, seen, heard, previous)
 
 
 def input_size(domain: Domain) -> int:

@@ -136,6 +136,22 @@ class RecurrentNetworks(nn.Module):
         people = [self.people[number] for number in numbers]
         return type(self)(self.domain, people, self.sight, weights)
 
+    def shared_by(self, people: Sequence[str]) -> Self:
+        """The only network there is, as that of each of several people."""
+        weights = {
+            name: value.expand(len(people), *value.shape[1:])
+            for name, value in self.weights.items()
+        }
+        return type(self)(self.domain, people, self.sight, weights)
+
+    @classmethod
+    def ensemble(cls, members: Sequence[Self], number: int) -> Self:
+        """The networks of the person of that number in each of several trainings."""
+        each = [networks.only(number) for networks in members]
+        weights = {name: torch.cat([one.weights[name] for one in each]) for name in each[0].weights}
+        people = [one.people[0] for one in each]
+        return cls(each[0].domain, people, each[0].sight, weights).requires_grad_(False)
+
     def gates(self, inputs: Tensor) -> Tensor:
         """The inputs' part ``[P, N, 3 H]`` of the gates, of ``inputs`` ``[P, N, I]``."""
         # Most symbols never occur in a batch, and columns of zeros add nothing.

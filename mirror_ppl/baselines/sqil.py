@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from mirror_ppl.baselines.inputs import StepInputs, network_inputs
+from mirror_ppl.baselines.inputs import StepInputs, look, network_inputs
 from mirror_ppl.baselines.recurrent import RecurrentNetworks, initial_weights
 from mirror_ppl.baselines.training import (
     Report,
@@ -141,6 +141,7 @@ class SoftQ(RecurrentNetworks):
         state = map_state(lambda *parts: torch.stack(parts), *begin)
         hidden = self.start(rounds)
         last = torch.full((people, rounds), len(domain.actions), device=hidden.device)
+        knowledge = domain.nothing_known(people, rounds, device=hidden.device)
         inputs, actions = [], []
         for _ in range(domain.horizon):
             observation = domain.observe(state)
@@ -150,6 +151,9 @@ class SoftQ(RecurrentNetworks):
                 for name, may in domain.communicable(observation).items():
                     luck = [torch.rand(may.shape[1:], generator=own) for own in generators]
                     heard[name] = may & (torch.stack(luck) < told[:, None, None])
+            seen, heard, knowledge = look(
+                domain, self.sight, setting, knowledge, observation, heard
+            )
             inputs.append(network_inputs(domain, observation, seen, heard, last))
             hidden = self.step(hidden, inputs[-1])
             chances = self.act(hidden).exp()

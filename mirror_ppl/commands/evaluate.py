@@ -29,6 +29,8 @@ QUICK = ("driving",)
 """Worlds of short rounds, of which more is learned in the same time."""
 SEEDS, FEW_SEEDS = (5, 2), (2, 1)
 """Of prediction and of the others, in those worlds and otherwise."""
+ROUNDS, OTHER_ROUNDS = {"prediction": (1, 2, 5, 10, 20)}, (0, 1, 5, 20)
+"""Numbers of rounds that are learned from unless they are asked for."""
 TOLD = 0.03
 """Probability that an item is communicated at a step, in rounds that models learn from."""
 
@@ -52,13 +54,19 @@ class Options:
     in driving, and 2 and 1 where rounds are long: on two cores all studies of a world then take
     about an hour."""
     models: tuple[str, ...] = ()
-    """What is compared; by default everything that fits the study: mirror, mirror-amortized,
-    mirror-svi, mirror-population, perceptual-only, policy-only, no-implants, bc,
-    bc-everything, sqil, sqil-everything, logistic (and mirror-nuts, if asked for), or of
-    assistance and relevance mirror (which also plans as mirror-kl), bc, sqil, none, all, oracle.
-    path/to/file.py:Class is a human model of your own, whose code is run."""
-    rounds: tuple[int, ...] = (1, 2, 5, 10, 20)
-    """Numbers of rounds that are learned from, from 1 to 20; the most only, for relevance."""
+    """What is compared; by default everything that fits the study: mirror, mirror-pooled,
+    mirror-population, mirror-amortized, mirror-svi, perceptual-only, policy-only, no-implants,
+    bc, bc-everything, bc-pooled, sqil, sqil-everything, sqil-pooled, logistic, base-rate (and, if
+    asked for, mirror-nuts, mirror-known-sight, bc-informed, bc-informed-pooled, sqil-informed), or
+    of assistance and relevance mirror (which also plans as mirror-kl), perceptual-only,
+    policy-only, no-implants, bc, bc-informed, sqil, none, all, nearest, oracle (and, if asked for,
+    mirror-pooled, mirror-population, mirror-known-sight, bc-pooled, bc-informed-pooled,
+    sqil-informed, sqil-pooled). path/to/file.py:Class is a human model of your own, whose code is
+    run."""
+    rounds: tuple[int, ...] = ()
+    """Numbers of rounds that are learned from, up to 20; the most only, for relevance. 0, of models
+    with a prior, is of assistance and relevance. Unless given 1, 2, 5, 10 and 20 of prediction, and
+    0, 1, 5 and 20 otherwise."""
     played: int = 5
     """Rounds of each person in which they receive messages; of assistance and relevance."""
     draws: int = 64
@@ -85,10 +93,11 @@ class Options:
             raise OptionError(f"--told must be from 0 to 1, not {self.told}")
         if not self.domain:
             raise OptionError("--domain needs at least one world")
-        wrong = [number for number in self.rounds if not 1 <= number <= 20]  # noqa: PLR2004
-        if wrong or not self.rounds:
+        least = 1 if self.study == "prediction" else 0
+        wrong = [number for number in self.rounds if not least <= number <= 20]  # noqa: PLR2004
+        if wrong:
             raise OptionError(
-                f"--rounds must be from 1 to 20, not {', '.join(map(str, wrong)) or 'none'}"
+                f"--rounds must be from {least} to 20, not {', '.join(map(str, wrong))}"
             )
 
 
@@ -154,6 +163,11 @@ def _told(options: Options) -> float:
     return 0.0 if options.study == "prediction" else TOLD
 
 
+def _rounds(options: Options) -> tuple[int, ...]:
+    """Numbers of rounds that are learned from."""
+    return options.rounds or ROUNDS.get(options.study, OTHER_ROUNDS)
+
+
 def _cells(options: Options) -> list[Any]:
     """What is to be done."""
     from mirror_ppl.domains import get_domain
@@ -167,7 +181,7 @@ def _cells(options: Options) -> list[Any]:
         if name not in every:
             raise UnknownNameError.of("setting", name, every)
     predicting = options.study == "prediction"
-    told = _told(options)
+    told, rounds = _told(options), _rounds(options)
     cells: list[Any] = []
     for domain, settings in domains.items():
         if options.population not in (known := PEOPLE[domain].populations):
@@ -184,12 +198,12 @@ def _cells(options: Options) -> list[Any]:
             for seed in range(options.seeds or most):
                 group = Group(domain, setting, options.population, options.people, seed, told)
                 cells += (
-                    prediction_cells(group, options.models, options.rounds)
+                    prediction_cells(group, options.models, rounds)
                     if predicting
                     else assistance_cells(
                         group,
                         options.models,
-                        options.rounds if options.study == "assistance" else (max(options.rounds),),
+                        rounds if options.study == "assistance" else (max(rounds),),
                         options.played,
                         options.draws,
                     )
@@ -209,7 +223,7 @@ def _origin(options: Options) -> dict[str, Any]:
     return {
         "command": _command(options),
         "options": {name: value for name, value in asdict(options).items() if name != "jobs"}
-        | {"told": _told(options)},
+        | {"told": _told(options), "rounds": list(_rounds(options))},
         "version": __version__,
         "torch": torch.__version__,
         "machine": {"processor": platform.machine(), "cores": os.cpu_count()},

@@ -6,35 +6,32 @@ of the same people and, if it can be planned with, stands for a person in a comm
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Protocol
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from mirror_ppl.baselines import (
     BehaviourCloneOptions,
-    NetworkPerson,
-    PooledLogistic,
     RecurrentNetworks,
     SoftQOptions,
+    as_one_person,
     fit_behaviour_clone,
     fit_pooled_logistic,
     fit_soft_q,
 )
-from mirror_ppl.baselines.inputs import Sight
-from mirror_ppl.communication.person import Person
+from mirror_ppl.baselines.inputs import INFORMED, Sight
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains import DOMAINS
-from mirror_ppl.domains.base import Domain
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, listeners
+from mirror_ppl.evaluation.known_sight import known_sight
+from mirror_ppl.evaluation.learned import BaseRates, Learned, Posterior, Regressed, Trained
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.population.pooling import Population
-from mirror_ppl.inference.results.posterior_predictive import predict_rounds
-from mirror_ppl.inference.results.summary import predictive
+from mirror_ppl.inference.results.criticism import action_shares
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
@@ -50,6 +47,10 @@ VALIDATION, TEST = slice(20, 30), slice(30, 36)
 RECORDED = 36
 OTHERS = 100_000
 """Seed of the others from whom a population is learned."""
+EACH = 1_000_000
+"""Seeds of the networks of an ensemble are as far apart."""
+Fit = Callable[..., RecurrentNetworks]
+OptionsOf = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -101,97 +102,41 @@ class Group:
         return load_self_model(shipped_weights(self.domain), self.domain)[0]
 
 
-class Learned(Protocol):
-    """What was learned of P people."""
-
-    def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Log-probabilities of actions in rounds of theirs, ``[P, B, T, A]``."""
-        ...
-
-
-class Plannable(Learned, Protocol):
-    """What was learned, with which messages can be planned."""
-
-    def person(self, number: int, draws: int) -> Person:
-        """One of the people, with so many draws."""
-        ...
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """A human model with posterior draws ``[S, P, 1, ...]`` of implants."""
-
-    human: HumanModel
-    draws: Mapping[str, Tensor]
-
-    def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Of the mean over draws."""
-        return predictive(predict_rounds(self.human, rounds, self.draws))
-
-    def person(self, number: int, draws: int) -> Person:
-        """Draws from all over the posterior."""
-        first = next(iter(self.draws.values()))
-        some = torch.linspace(0, len(first) - 1, min(draws, len(first))).long()
-        own = {name: value[some, number : number + 1] for name, value in self.draws.items()}
-        return Person(self.human, own)
-
-
-@dataclass(frozen=True)
-class Trained:
-    """Networks of P people.
-
-    Attributes:
-        networks: theirs.
-        self_model: the robot's, for what it knows of the world.
-        setting: which lets people see what they see by themselves.
-        world: in which the robot plans, with what it learned of rewards.
-    """
-
-    networks: RecurrentNetworks
-    self_model: SelfModel
-    setting: str
-    world: Domain
-
-    def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Of each person's network."""
-        return self.networks.log_probabilities(rounds)
-
-    def person(self, number: int, draws: int) -> Person:
-        """One of the networks; all draws are the same, so a few do."""
-        own = self.networks.only(number)
-        human = NetworkPerson(self.self_model, own, self.setting, self.world)
-        return Person(human, human.draws(min(draws, SAME_DRAWS)))
-
-
-@dataclass(frozen=True)
-class Regressed:
-    """Pooled logistic regression of P people."""
-
-    model: PooledLogistic
-
-    def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Of each person's weights."""
-        return self.model.log_probabilities(rounds)
-
-
-Learn = Callable[[Group, int, int], Learned]
-"""Learns of a group from their first rounds, at least 1; and with a seed of everything random."""
+Learn = Callable[[Group, int, int, int], Learned]
+"""Learns of a group from their first rounds, with a seed of everything random, and so many networks
+of each person."""
 
 
 def _mirror(
-    variant: str | None = None, engine: str = "importance", from_others: bool = False
+    variant: str | None = None,
+    engine: str = "importance",
+    from_others: bool = False,
+    pooling: str = "none",
 ) -> Learn:
-    def learn(group: Group, rounds: int, seed: int) -> Posterior:
+    def learn(group: Group, rounds: int, seed: int, members: int) -> Posterior:
+        del members
         human = load_human_model(variant, group.self_model)
         train = group.recordings().select_rounds(slice(rounds))
         fit_world(human, train)
         network = network_for(engine, None, human)
         population = population_of(replace(group, seed=OTHERS)) if from_others else None
-        options = InferenceOptions(engine)
+        options = InferenceOptions(engine, pooling=pooling if rounds else "none")
         found = infer(human, train, options, seed, network, population=population)
         return Posterior(human, found.draws)
 
     return learn
+
+
+def _known_sight(group: Group, rounds: int, seed: int, members: int) -> Posterior:
+    """The human model of each person, given what they truly see and take for granted."""
+    del members
+    train, each = group.recordings().select_rounds(slice(rounds)), []
+    for person in train.people:
+        own = train.select_people([person])
+        human = known_sight(group.self_model, own)
+        each.append(infer(human, own, InferenceOptions("importance"), seed).draws)
+    draws = {name: torch.cat([one[name] for one in each], 1) for name in each[0]}
+    return Posterior(HumanModel(group.self_model), draws)
 
 
 @cache
@@ -210,71 +155,103 @@ def _parts(group: Group, rounds: int) -> tuple[Demonstrations, Demonstrations]:
     return recordings.select_rounds(slice(rounds)), recordings.select_rounds(VALIDATION)
 
 
-def _trained(group: Group, train: Demonstrations, networks: RecurrentNetworks) -> Trained:
+def _trained(
+    group: Group, train: Demonstrations, ensemble: tuple[RecurrentNetworks, ...]
+) -> Trained:
     # What rewards say of the world is nothing about people, so baselines get to know it, too.
     human = load_human_model(None, group.self_model)
     fit_world(human, train)
-    return Trained(networks, human.self_model, group.setting, planning_domain(human, {}))
+    return Trained(ensemble, human.self_model, group.setting, planning_domain(human, {}))
 
 
-def _behaviour_cloning(sight: Sight) -> Learn:
-    def learn(group: Group, rounds: int, seed: int) -> Trained:
-        parts = _parts(group, rounds)
-        networks = fit_behaviour_clone(
-            *parts, BehaviourCloneOptions.of(group.domain, sight=sight), seed
-        )
-        return _trained(group, parts[0], networks)
+def _networks(fit: Fit, options: OptionsOf, sight: Sight, pooled: bool = False) -> Learn:
+    """Recurrent networks, of each person or, pooled, the same ones of everybody."""
 
-    return learn
-
-
-def _sqil(sight: Sight) -> Learn:
-    def learn(group: Group, rounds: int, seed: int) -> Trained:
-        parts = _parts(group, rounds)
-        return _trained(
-            group, parts[0], fit_soft_q(*parts, SoftQOptions.of(group.domain, sight=sight), seed)
-        )
+    def learn(group: Group, rounds: int, seed: int, members: int) -> Trained:
+        train, validation = own = _parts(group, rounds)
+        if pooled:
+            own = (as_one_person(train), as_one_person(validation))
+        settings = options(group.domain, sight=sight)
+        # Seeds of the members of an ensemble, that of the first one being the group's.
+        found = [fit(*own, settings, seed + EACH * member) for member in range(members)]
+        if pooled:
+            found = [networks.shared_by(train.people) for networks in found]
+        return _trained(group, train, tuple(found))
 
     return learn
 
 
-def _logistic(group: Group, rounds: int, seed: int) -> Regressed:
-    del seed
+def _logistic(group: Group, rounds: int, seed: int, members: int) -> Regressed:
+    del seed, members
     return Regressed(fit_pooled_logistic(*_parts(group, rounds)))
+
+
+def _base_rate(group: Group, rounds: int, seed: int, members: int) -> BaseRates:
+    del seed, members
+    train = group.recordings().select_rounds(slice(rounds))
+    return BaseRates(action_shares(train, len(get_domain(group.domain).actions)))
 
 
 LEARNERS: dict[str, Learn] = {
     "mirror": _mirror(),
+    "mirror-pooled": _mirror(pooling="partial"),
+    "mirror-population": _mirror(from_others=True),
     "mirror-amortized": _mirror(engine="amortized"),
     "mirror-svi": _mirror(engine="svi"),
     "mirror-nuts": _mirror(engine="nuts"),
-    "mirror-population": _mirror(from_others=True),
+    "mirror-known-sight": _known_sight,
     "perceptual-only": _mirror("perceptual-only"),
     "policy-only": _mirror("policy-only"),
     "no-implants": _mirror("no-implants"),
-    "bc": _behaviour_cloning("setting"),
-    "bc-everything": _behaviour_cloning("everything"),
-    "sqil": _sqil("setting"),
-    "sqil-everything": _sqil("everything"),
+    "bc": _networks(fit_behaviour_clone, BehaviourCloneOptions.of, "setting"),
+    "bc-everything": _networks(fit_behaviour_clone, BehaviourCloneOptions.of, "everything"),
+    "bc-informed": _networks(fit_behaviour_clone, BehaviourCloneOptions.of, INFORMED),
+    "bc-pooled": _networks(fit_behaviour_clone, BehaviourCloneOptions.of, "setting", True),
+    "bc-informed-pooled": _networks(fit_behaviour_clone, BehaviourCloneOptions.of, INFORMED, True),
+    "sqil": _networks(fit_soft_q, SoftQOptions.of, "setting"),
+    "sqil-everything": _networks(fit_soft_q, SoftQOptions.of, "everything"),
+    "sqil-informed": _networks(fit_soft_q, SoftQOptions.of, INFORMED),
+    "sqil-pooled": _networks(fit_soft_q, SoftQOptions.of, "setting", True),
     "logistic": _logistic,
+    "base-rate": _base_rate,
 }
-"""Everything that can be compared, in the order in which it is shown. Guides are `exact` but for
-those of other names; ``mirror-population`` has a prior learned from others.
-Baselines get what the setting lets people see, which MIRROR has to find out, but for those that
-read ``everything``, as the human model is given it."""
+"""Everything that can be compared, in the order in which it is shown. Engines are ``importance``
+but for those of other names; ``mirror-pooled`` infers the population of the same people with them,
+``mirror-population`` has a prior learned from others, and ``mirror-known-sight`` is told what the
+people see. Baselines get what the setting lets people see, which MIRROR has to find out, but for
+those that read ``everything``, as the human model is given it; ``informed`` ones are given what a
+message means, too. Pooled ones have one network for all people."""
+ASKED_FOR = ("mirror-known-sight", "bc-informed", "bc-informed-pooled", "sqil-informed")
+"""Of these what is compared in prediction on request only: it is given what nobody has, or what
+messages mean where there are none."""
 SLOW = {
     "mirror-nuts": DOMAINS,
     "mirror-svi": ("bomb_defusal",),
     "sqil-everything": ("search_rescue", "bomb_defusal"),
+    "sqil-pooled": ("search_rescue", "bomb_defusal"),
 }
 """Of these what is compared on request only, and where: a chain of each person takes minutes, `svi`
 sums over all rules of a bomb at each of its steps, and SQIL learns from long rounds for minutes."""
-SAME_DRAWS = 16
-"""Most draws that are planned with where all are the same: they differ in chance alone, of which
-each has several courses. To a network whatever is told is something new, so that its messages are
-many and planning with it takes longest."""
-PLANNABLE = ("mirror", "bc", "sqil")
+PLANNABLE = (
+    "mirror",
+    "perceptual-only",
+    "policy-only",
+    "no-implants",
+    "bc",
+    "bc-informed",
+    "sqil",
+)
 """Of these what drives a communicator in the comparison of assistance."""
+ALSO_PLANNABLE = (
+    "mirror-pooled",
+    "mirror-population",
+    "mirror-known-sight",
+    "bc-pooled",
+    "bc-informed-pooled",
+    "sqil-informed",
+    "sqil-pooled",
+)
+"""And what does so on request."""
 
 
 def is_own(name: str) -> bool:
@@ -282,15 +259,21 @@ def is_own(name: str) -> bool:
     return ".py:" in name
 
 
-def learn(name: str, group: Group, rounds: int, seed: int) -> Learned:
+def learns_from_nothing(name: str) -> bool:
+    """Whether a learner has something to say without any round: human models have a prior."""
+    return is_own(name) or not name.startswith(("bc", "sqil", "logistic", "base-rate"))
+
+
+def learn(name: str, group: Group, rounds: int, seed: int, members: int = 1) -> Learned:
     """What a learner makes of the first rounds of a group.
 
     Args:
         name: in ``LEARNERS``, or ``path/to/file.py:Class``, a human model of somebody's own, with
             the engine ``importance``.
         group: the people.
-        rounds: how many are learned from.
+        rounds: how many are learned from; none only where :func:`learns_from_nothing`.
         seed: of everything random.
+        members: networks of each person, where there are any.
 
     Raises:
         UnknownNameError: there is no such learner.
@@ -298,7 +281,7 @@ def learn(name: str, group: Group, rounds: int, seed: int) -> Learned:
         AssetError: no trained guide ships for that domain.
     """
     if is_own(name):
-        return _mirror(name)(group, rounds, seed)
+        return _mirror(name)(group, rounds, seed, members)
     if name not in LEARNERS:
         raise UnknownNameError.of("model", name, tuple(LEARNERS))
-    return LEARNERS[name](group, rounds, seed)
+    return LEARNERS[name](group, rounds, seed, members)

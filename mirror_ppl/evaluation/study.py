@@ -16,15 +16,18 @@ import torch
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
+from mirror_ppl.evaluation.learned import Plannable
 from mirror_ppl.evaluation.learners import (
+    ALSO_PLANNABLE,
+    ASKED_FOR,
     LEARNERS,
     PLANNABLE,
     SLOW,
     TEST,
     Group,
-    Plannable,
     is_own,
     learn,
+    learns_from_nothing,
 )
 from mirror_ppl.evaluation.tables import Rows
 from mirror_ppl.inference.results.summary import score
@@ -36,21 +39,23 @@ from mirror_ppl.training.guide_file import shipped_guide
 CODE = (
     *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
     *(f"{name}/**/*.py" for name in ("inference", "likelihood", "models", "people")),
-    *(f"evaluation/{name}.py" for name in ("assistance", "learners", "oracle", "study")),
-    "evaluation/reachable_oracle.py",
+    *(f"evaluation/{name}.py" for name in ("assistance", "known_sight", "learned", "learners")),
+    *(f"evaluation/{name}.py" for name in ("oracle", "reachable_oracle", "study")),
     "cross_entropy.py",
     "row_hashing.py",
     "data/assets/*guide*.safetensors",
 )
 """Files whose change makes earlier results worthless."""
-REFERENCES = ("none", "all", "oracle")
+REFERENCES = ("none", "all", "nearest", "oracle")
 """Communicators that learn nothing of people."""
 BEGINNINGS = 100
 """Rounds whose beginnings tell whether a setting hides anything."""
 EVERYTHING = "-everything"
 """How learners end that read all that could be seen."""
-OBJECTIVES = {"mirror": ("mirror", "mirror-kl"), "bc": ("mirror",), "sqil": ("mirror",)}
-"""Planners for each learner: expected utility, and of MIRROR the divergence of beliefs, too."""
+MEMBERS = 5
+"""Networks of each person with which messages are planned, so that their planner is unsure, too."""
+UTILITY, KL = "mirror", "mirror-kl"
+"""The planner by expected utility, and that which makes beliefs alike: of ``mirror`` alone."""
 
 
 @dataclass(frozen=True)
@@ -123,14 +128,13 @@ def assist(cell: Assistance) -> Rows:
     """
     group, learned = cell.group, None
     if cell.model not in REFERENCES:
-        learned = cast(Plannable, learn(cell.model, group, cell.rounds, group.seed))
+        learned = cast(Plannable, learn(cell.model, group, cell.rounds, group.seed, MEMBERS))
     options, rows = PlannerOptions.of(group.domain), []
     for number, listener in enumerate(group.listeners(cell.played)):
         if learned is not None:
             listener = replace(listener, person=learned.person(number, cell.draws))
-        own = ("mirror",) if is_own(cell.model) else (cell.model,)
-        for objective in OBJECTIVES.get(cell.model, own):
-            who = cell.model if objective == "mirror" else objective
+        for objective in _objectives(cell.model):
+            who = cell.model if objective == UTILITY else objective
             played = play(listener, speaker(objective, listener, options, group.seed + number))
             rows.append(
                 _row(group, who, cell.rounds, f"person-{number + 1:02d}")
@@ -170,7 +174,7 @@ def prediction_cells(
     if "mirror-amortized" in chosen and not guide:
         raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
     if not chosen:
-        left_out = {name for name, where in SLOW.items() if group.domain in where}
+        left_out = {name for name, where in SLOW.items() if group.domain in where} | {*ASKED_FOR}
         if not guide:
             left_out.add("mirror-amortized")
         # Who reads everything is somebody else only where something is hidden.
@@ -183,12 +187,20 @@ def assistance_cells(
     group: Group, models: Sequence[str], rounds: Sequence[int], played: int, draws: int
 ) -> list[Assistance]:
     """Who is to speak to a group; arguments as above and of `Assistance`."""
-    every = (*PLANNABLE, *REFERENCES)
+    known = (*PLANNABLE, *ALSO_PLANNABLE, *REFERENCES)
     return [
         Assistance(group, name, number, played, 0 if name in REFERENCES else draws)
-        for name in _known(models, every, group) or every
+        for name in _known(models, known, group) or (*PLANNABLE, *REFERENCES)
         for number in ((0,) if name in REFERENCES else sorted({*rounds}))
+        if number or name in REFERENCES or learns_from_nothing(name)
     ]
+
+
+def _objectives(model: str) -> tuple[str, ...]:
+    """Whose messages are played: of a learner the planners, of a reference itself."""
+    if model in REFERENCES:
+        return (model,)
+    return (UTILITY, KL) if model == UTILITY else (UTILITY,)
 
 
 def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], str]:

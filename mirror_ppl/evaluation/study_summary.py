@@ -20,8 +20,8 @@ from mirror_ppl.evaluation.tables import Rows
 RESAMPLES = 2000
 LEVELS = (0.05, 0.95)
 FIRST = "mirror"
-BASELINES = ("bc", "bc-everything", "sqil", "sqil-everything")
-"""With whom the paper compares MIRROR."""
+BASELINES = ("bc", "bc-everything", "sqil", "sqil-everything", "logistic")
+"""With whom MIRROR is compared: those of the paper, and pooled logistic regression."""
 
 
 class Place(NamedTuple):

@@ -9,6 +9,7 @@ from example_person import DOMAIN, begun
 from example_rounds import untrained
 
 from mirror_ppl.baselines import NetworkPerson
+from mirror_ppl.baselines.inputs import look, recorded_inputs
 from mirror_ppl.baselines.person import NETWORK
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person, SimulatorWorld
 from mirror_ppl.communication.person import PlanningContext
@@ -19,6 +20,8 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.people import simulate
+
+ONLY = {NETWORK: torch.zeros(1, dtype=torch.long)}
 
 
 def recorded(domain, generator, rounds=3):
@@ -67,8 +70,8 @@ def test_acts_as_the_network_does(domain, generator):
     steps = recordings.shape[2]
     observation = {name: value[0, :, :steps] for name, value in recordings.observation().items()}
     told = {name: mask[0] for name, mask in recordings.told.items()}
-    belief = gone_through(human, {}, observation, told, recordings.actions[0].clamp(min=0))
-    found = human.act({}, belief, human.action_values(belief))
+    belief = gone_through(human, ONLY, observation, told, recordings.actions[0].clamp(min=0))
+    found = human.act(ONLY, belief, human.action_values(belief))
     real = recordings.mask[0]
     torch.testing.assert_close(found[real], expected[0][real], rtol=1e-4, atol=1e-5)
 
@@ -136,10 +139,55 @@ def test_what_the_setting_shows_anyway_can_be_told(generator):
     domain = human.domain
     now = domain.observe(domain.initial(1, generator))
     told = {name: torch.zeros_like(mask) for name, mask in domain.communicable(now).items()}
-    silent, _ = human.perceive({}, None, now, told, 0)
+    silent, _ = human.perceive(ONLY, None, now, told, 0)
     told["visual"] = domain.sought(now)
-    shown, _ = human.perceive({}, None, now, told, 0)
-    difference = human.evidence(shown, now) - human.evidence(silent, now)
+    shown, _ = human.perceive(ONLY, None, now, told, 0)
+    difference = (human.evidence(shown, now) - human.evidence(silent, now))[..., :-1]
     apart = (human.networks.weights["input"][0] - difference).abs().sum(-1)
     assert difference.abs().sum() > 0
     assert int((apart < 1e-4).sum()) == 1  # The weights of one input: that it was told.
+
+
+def test_an_ensemble_is_its_networks(generator):
+    """Each draw believes and does what its network alone would, whatever the others do."""
+    recordings = recorded("driving", generator)
+    world = get_domain("driving")
+    several = untrained(world, ("person-01",) * 3)
+    for value in several.weights.values():
+        value.data = torch.randn(value.shape, generator=generator)
+    human = NetworkPerson(SelfModel(world), several, "fog")
+    assert human.draws(4)[NETWORK].flatten().tolist() == [0, 1, 2, 0]
+    steps = recordings.shape[2]
+    observation = {name: value[0, :, :steps] for name, value in recordings.observation().items()}
+    told = {name: mask[0] for name, mask in recordings.told.items()}
+    actions = recordings.actions[0].clamp(min=0)
+    for number in range(3):
+        which = {NETWORK: torch.tensor([number])}
+        belief = gone_through(human, which, observation, told, actions)
+        found = human.act(which, belief, human.action_values(belief))
+        expected = several.only(number).log_probabilities(recordings)[0]
+        real = recordings.mask[0]
+        torch.testing.assert_close(found[real], expected[real], rtol=1e-4, atol=1e-5)
+    check_contract(human)
+
+
+def test_an_informed_network_reads_what_a_message_means(generator):
+    """A car that is told of is as one that was seen twice; that it was told is not to be read."""
+    world = get_domain("driving")
+    now = world.observe(world.initial(1, generator))
+    nothing = world.nothing_known(1)
+    told = {name: mask.clone() for name, mask in world.communicable(now).items()}
+    seen, heard, after = look(world, "informed", "fog", nothing, now, told)
+    assert not any(bool(mask.any()) for mask in heard.values())
+    assert torch.equal(seen["visual"], seen["verbal"] | told["visual"])
+    assert bool((seen["verbal"] == world.known(after)["verbal"]).all())
+    by_setting, told_of, same = look(world, "setting", "fog", nothing, now, told)
+    assert told_of is told and same is nothing
+    assert torch.equal(by_setting["visual"], world.visibility("fog", now)["visual"])
+    recordings = recorded("driving", generator)
+    plain, informed = (recorded_inputs(world, one, recordings) for one in ("setting", "informed"))
+    told_nothing = replace(
+        recordings, told={name: mask & False for name, mask in recordings.told.items()}
+    )
+    assert not torch.equal(plain, informed)
+    assert not torch.equal(informed, recorded_inputs(world, "informed", told_nothing))

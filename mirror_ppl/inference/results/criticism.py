@@ -105,13 +105,19 @@ def _says(name: str, more: bool) -> str:
     return f'does "{action}" {"more" if more else "less"} often than the model says'
 
 
-def base_rate(train: Demonstrations, test: Demonstrations, actions: int) -> Tensor:
-    """Nats of each held-out action ``[N']`` of one person by the shares of actions before.
+def action_shares(train: Demonstrations, actions: int) -> Tensor:
+    """How often people did each thing, whatever the state: their shares of actions ``[P, A]``.
 
     Half an action of each kind is added (Jeffreys's prior), so that none has probability 0.
     """
-    counts = torch.bincount(train.actions[train.mask], minlength=actions) + 1 / 2
-    return -(counts / counts.sum()).log()[test.actions[test.mask]]
+    done = torch.nn.functional.one_hot(train.actions.clamp(min=0), actions)
+    counts = (done * train.mask[..., None]).sum((1, 2)) + 1 / 2
+    return counts / counts.sum(-1, True)
+
+
+def base_rate(train: Demonstrations, test: Demonstrations, actions: int) -> Tensor:
+    """Nats of each held-out action ``[N']`` of one person by the shares of actions before."""
+    return -action_shares(train, actions)[0].log()[test.actions[test.mask]]
 
 
 def no_implants(

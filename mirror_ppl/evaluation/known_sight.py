@@ -1,0 +1,74 @@
+"""The human model of somebody of whom it is known what they see: what inference can add at most."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from pyro.distributions import Categorical
+from pyro.poutine.messenger import Messenger
+from torch import Tensor
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains.base import Domain
+from mirror_ppl.errors import InputError
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.implants import ASSUMES, SIGHT
+from mirror_ppl.models.self_model import SelfModel
+
+ROUNDING = 1e-4
+"""Distances that differ by less are the same."""
+
+
+class KnownSight(HumanModel):
+    """Somebody of whom it is known what they see and take for granted, by site; see `truth`."""
+
+    known: Mapping[str, Tensor] = MappingProxyType({})
+
+    def prior(self) -> dict[str, Tensor]:
+        """As of everybody, but for what is known."""
+        with FixedSites(self.known):
+            return super().prior()
+
+
+class FixedSites(Messenger):
+    """Sites with finite support have one value for certain, the index of it ``[]`` by name."""
+
+    def __init__(self, values: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.values = values
+
+    def _pyro_sample(self, message: Any) -> None:
+        if message["name"] in self.values:
+            chances = message["fn"].probs
+            only = torch.zeros_like(chances)
+            only[..., int(self.values[message["name"]])] = 1.0
+            message["fn"] = Categorical(only)
+
+
+def known_sight(self_model: SelfModel, person: Demonstrations) -> KnownSight:
+    """The human model of one simulated person, given what they truly see and take for granted.
+
+    Raises:
+        InputError: the recording does not tell.
+    """
+    truth = {
+        name: value
+        for name, value in person.truth.items()
+        if name.startswith((SIGHT, ASSUMES)) and not bool(value.isnan().any())
+    }
+    if not truth:
+        raise InputError(f"of people of {person.domain} it is not known what they see")
+    human = KnownSight(self_model)
+    human.known = {name: _place_of(human.domain, name, value[0]) for name, value in truth.items()}
+    return human
+
+
+def _place_of(domain: Domain, site: str, value: Tensor) -> Tensor:
+    """Which of its values a site has."""
+    if not site.startswith(SIGHT):
+        return value.long()
+    bins = torch.tensor(domain.reach_bins).to(value)
+    return (bins <= value + ROUNDING).sum() - 1
