@@ -40,6 +40,8 @@ COMMUNICATORS = (
     "oracle",
 )
 """Everything that can be paired with people, in the order in which it is shown."""
+REFERENCES = ("none", "all", "nearest", "oracle")
+"""Those of them that learn nothing of people, and are compared with those that do."""
 RATES_FROM = "mirror"
 """Whose rate of items ``random`` has."""
 

@@ -15,7 +15,7 @@ import torch
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, UnknownNameError
-from mirror_ppl.evaluation.assistance import PlannerOptions, play, speaker
+from mirror_ppl.evaluation.assistance import REFERENCES, PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learned import Plannable
 from mirror_ppl.evaluation.learners import (
     ALSO_PLANNABLE,
@@ -46,8 +46,6 @@ CODE = (
     "data/assets/*guide*.safetensors",
 )
 """Files whose change makes earlier results worthless."""
-REFERENCES = ("none", "all", "nearest", "oracle")
-"""Communicators that learn nothing of people."""
 BEGINNINGS = 100
 """Rounds whose beginnings tell whether a setting hides anything."""
 EVERYTHING = "-everything"

@@ -9,19 +9,24 @@ from typing import Any
 import torch
 
 from mirror_ppl.domains import Domain, Observation, get_domain
+from mirror_ppl.evaluation.assistance import REFERENCES
 from mirror_ppl.evaluation.study_summary import (
+    POOLED,
+    POOLING,
     Claim,
     Interval,
     ModelResult,
     Paired,
     Place,
     Share,
+    Way,
     few_against_many,
     floors,
     means_table,
     relevance,
     shares_table,
     summarize_study,
+    ways_to_oracle,
 )
 from mirror_ppl.evaluation.tables import Rows, TextTable
 from mirror_ppl.plots.picture import Picture
@@ -70,11 +75,11 @@ def _prediction(rows: Rows) -> Report:
 
 
 def _assistance(rows: Rows) -> Report:
-    results = summarize_study(rows, "net")
+    results, ways = summarize_study(rows, "net"), ways_to_oracle(rows)
     return Report(
-        _tables(results, "net return of a round: more is better", {}),
+        [*_tables(results, "net return of a round: more is better", {}), *_ways(ways)],
         [],
-        {"net": results},
+        {"net": results, "way_to_oracle": ways},
         plot_curves(means_table(results), "net return of a round"),
     )
 
@@ -118,20 +123,24 @@ def _tables(
         numbers = sorted({one.rounds for one in here})
         by = {(one.model, one.rounds): one for one in here}
         number = max(one.people for one in here)
+        names = dict.fromkeys(one.model for one in here)
+        pooling = [name for name in names if name in POOLING and POOLED in names]
         caption = f"mean over people ({number}), by rounds learned from"
         if any(one.mirror for one in here):
             caption += (
                 "; below it how far mirror is ahead with as many (of who learns nothing: with "
-                "the most), the 90% interval of that over people, and in how many of them (ties "
+                "the most"
+                + (f"; of {', '.join(pooling)}: {POOLED}" if pooling else "")
+                + "), the 90% interval of that over people, and in how many of them (ties "
                 "count half)"
             )
         if place in floor:
             caption += f"; people's own entropy: {floor[place]:.3f}"
         rows = tuple(
             (model, *(_entry(by.get((model, rounds)), number) for rounds in numbers))
-            for model in dict.fromkeys(one.model for one in here)
+            for model in names
         )
-        heads = ("model", *("-" if number == 0 else _counted(number) for number in numbers))
+        heads = ("model", *map(_counted, numbers))
         tables.append(TextTable(f"{', '.join(place)}: {title}", caption, heads, rows))
     return tables
 
@@ -158,6 +167,36 @@ def difference(ahead: Interval, digits: int) -> str:
     return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]"
 
 
+def _ways(ways: Sequence[Way]) -> list[TextTable]:
+    """One a place."""
+    tables = []
+    for place in dict.fromkeys(one.place for one in ways):
+        here = [one for one in ways if one.place == place]
+        numbers = sorted({one.rounds for one in here})
+        by = {(one.model, one.rounds): one for one in here}
+        rows = tuple(
+            (model, *(_way(by.get((model, rounds))) for rounds in numbers))
+            for model in dict.fromkeys(one.model for one in here)
+        )
+        caption = (
+            f"share [90% interval over people, {max(one.people for one in here)}] by rounds "
+            "learned from; below it the net return that was gained by learning from them"
+        )
+        title = f"{', '.join(place)}: way from silence to the oracle, in net return"
+        tables.append(TextTable(title, caption, ("model", *map(_counted, numbers)), rows))
+    return tables
+
+
+def _way(one: Way | None) -> str:
+    if one is None:
+        return ""
+    text = "-"
+    if one.share is not None:
+        mean, low, high = (100 * part for part in (one.share.mean, one.share.low, one.share.high))
+        text = f"{mean:.0f}% [{low:.0f}, {high:.0f}]"
+    return text if one.learned is None else f"{text}\n{difference(one.learned, 2)}"
+
+
 def _shares(shares: Sequence[Share], title: str) -> TextTable:
     names = list(dict.fromkeys(one.modality for one in shares))
     cells: dict[tuple[str, int], dict[str, str]] = {}
@@ -170,7 +209,7 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
             text += f"\n{_ahead(one.mirror, 2)}"
         cells.setdefault((one.model, one.rounds), {})[one.modality] = text
     rows = tuple(
-        (model, "-" if rounds == 0 else str(rounds), *(own[name] for name in names))
+        (model, "-" if model in REFERENCES else str(rounds), *(own[name] for name in names))
         for (model, rounds), own in cells.items()
     )
     caption = "relevant share [90% interval over people] of the communicated items"
@@ -187,7 +226,7 @@ def _text(one: Interval) -> str:
 
 
 def _counted(number: int) -> str:
-    return f"{number} round" + ("s" if number > 1 else "")
+    return f"{number or 'no'} round" + ("" if number == 1 else "s")
 
 
 REPORTS: dict[str, Callable[[Rows], Report]] = {

@@ -15,11 +15,17 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from mirror_ppl.evaluation.assistance import REFERENCES
 from mirror_ppl.evaluation.tables import Rows
 
 RESAMPLES = 2000
 LEVELS = (0.05, 0.95)
-FIRST = "mirror"
+FIRST, POOLED = "mirror", "mirror-pooled"
+"""What others are compared with; the second where they pool people, too."""
+POOLING = ("bc-pooled", "bc-informed-pooled", "sqil-pooled", "logistic")
+"""What learns of a person from others."""
+NONE, ORACLE = "none", "oracle"
+"""Where the way to the oracle begins and ends."""
 BASELINES = ("bc", "bc-everything", "sqil", "sqil-everything", "logistic")
 """With whom MIRROR is compared: those of the paper, and pooled logistic regression."""
 
@@ -66,8 +72,9 @@ class ModelResult:
         rounds: how many; 0 if it learns nothing.
         measured: the mean over people.
         people: how many.
-        mirror: how far MIRROR with the same rounds is ahead, or with the most where the model
-            learns nothing; ``None`` where there is none.
+        mirror: how far MIRROR with the same rounds is ahead (``mirror-pooled`` of models that pool
+            people, if it is there), or with the most where the model learns nothing; ``None`` where
+            there is none.
     """
 
     place: Place
@@ -87,6 +94,28 @@ class Claim:
     baseline: str
     baseline_rounds: int
     paired: Paired
+
+
+@dataclass(frozen=True)
+class Way:
+    """How far a model comes on the way from silence to the oracle.
+
+    Attributes:
+        place: where.
+        model: its name.
+        rounds: that it learned from.
+        people: how many.
+        share: of the way, 1 for all of it, of mean net returns; ``None`` without these two.
+        learned: net return that learning from rounds gained over its prior alone; ``None`` of what
+            has none.
+    """
+
+    place: Place
+    model: str
+    rounds: int
+    people: int
+    share: Interval | None
+    learned: Interval | None
 
 
 @dataclass(frozen=True)
@@ -162,6 +191,32 @@ def few_against_many(
             ahead = _both(values[place, FIRST, few], values[place, baseline, many], sign)
             if ahead is not None:
                 found.append(Claim(place, few, baseline, many, ahead))
+    return found
+
+
+def ways_to_oracle(rows: Rows) -> list[Way]:
+    """How far each model comes on the way to the oracle; the bootstrap draws people.
+
+    Args:
+        rows: of a study of assistance.
+    """
+    values, found = _by_model(rows, "net"), []
+    for (place, model, rounds), own in values.items():
+        ends = [values.get((place, name, 0), {}) for name in (NONE, ORACLE)]
+        who = [one for one in own if all(one in end for end in ends)]
+        share = None
+        if who:
+            net, none, oracle = (np.array([part[one] for one in who]) for part in (own, *ends))
+            drawn = _drawn(len(who))
+            ways = (oracle - none)[drawn].mean(1)
+            if (ways > 0).all():
+                low, high = np.quantile((net - none)[drawn].mean(1) / ways, LEVELS)
+                mean = (net - none).mean() / (oracle - none).mean()
+                share = Interval(float(mean), float(low), float(high))
+        prior, learned = values.get((place, model, 0), {}), None
+        if rounds and (both := _both(own, prior, 1)) is not None:
+            learned = both.ahead
+        found.append(Way(place, model, rounds, len(own), share, learned))
     return found
 
 
@@ -258,8 +313,10 @@ def _mirror(
     """Values of MIRROR that a model is compared with; none for itself."""
     if model == FIRST:
         return {}
-    most = max((n for where, name, n in values if (where, name) == (place, FIRST)), default=0)
-    return values.get((place, FIRST, rounds or most), {})
+    if model in REFERENCES:
+        rounds = max((n for where, name, n in values if (where, name) == (place, FIRST)), default=0)
+    pooled = values.get((place, POOLED, rounds)) if model in POOLING else None
+    return pooled or values.get((place, FIRST, rounds), {})
 
 
 def _place(row: dict) -> Place:

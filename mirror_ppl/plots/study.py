@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,6 +21,8 @@ Place = tuple[str, str, str]
 GREEN, VERMILION, SKY = "#009E73", "#D55E00", "#56B4E9"
 STYLES: dict[str, tuple[str, str, str]] = {
     "mirror": (BLUE, "-", "o"),
+    "mirror-pooled": (BLUE, "-.", "*"),
+    "mirror-known-sight": (BLUE, ":", "H"),
     "mirror-amortized": (SKY, "-", "s"),
     "mirror-svi": (SKY, "--", "D"),
     "mirror-nuts": (SKY, ":", "p"),
@@ -30,11 +33,18 @@ STYLES: dict[str, tuple[str, str, str]] = {
     "no-implants": (PURPLE, ":", "<"),
     "bc": (ORANGE, "-", "X"),
     "bc-everything": (ORANGE, ":", "x"),
+    "bc-informed": (ORANGE, "-.", ">"),
+    "bc-pooled": (ORANGE, "--", "8"),
+    "bc-informed-pooled": (ORANGE, "--", ">"),
     "sqil": (VERMILION, "-", "d"),
     "sqil-everything": (VERMILION, ":", "x"),
+    "sqil-informed": (VERMILION, "-.", ">"),
+    "sqil-pooled": (VERMILION, "--", "8"),
     "logistic": (GREEN, "-", "h"),
+    "base-rate": (GREEN, ":", "1"),
     "none": (GREY, ":", ""),
     "all": (GREY, "--", ""),
+    "nearest": (GREY, "-.", ""),
     "oracle": (BLACK, "--", ""),
 }
 """Colour, line and mark of each model."""
@@ -42,6 +52,8 @@ OTHER_LINES, OTHER_MARK = ("-", "--", "-.", ":"), "."
 """Of models of one's own."""
 OFF_SCALE = 4.0
 """Spans of the curves beyond which a level is named in words."""
+NO_ROUNDS = 0.4
+"""Where on the logarithmic scale no rounds are."""
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
 
@@ -68,8 +80,8 @@ def plot_curves(
 
     Args:
         means: a row for each place (``domain``, ``setting``, ``population``), ``model`` and number
-            of ``rounds``, with columns ``mean``, ``low`` and ``high``; models that learn from 0
-            rounds are level lines.
+            of ``rounds``, with columns ``mean``, ``low`` and ``high``; models that learn from no
+            rounds at all are level lines.
         label: what is measured.
         floor: what cannot be surpassed, by place (a tuple of the three), if it is known.
         by_ratio: the measure is shown by its logarithm, so that what is near the floor can be told
@@ -86,9 +98,9 @@ def plot_curves(
             ax.text(0.02, 0.02 + 0.06 * number, text, transform=ax.transAxes, fontsize=8)
         if floor is not None and place in floor:
             ax.axhline(floor[place], color=BLACK, lw=1, ls=":", label="people's own entropy")
-        ticks = sorted({*here["rounds"]} - {0})
+        ticks = sorted({*here.loc[~_is_level(here), "rounds"]})
         ax.set_xscale("log")
-        ax.set_xticks(ticks, [str(number) for number in ticks])
+        ax.set_xticks([max(number, NO_ROUNDS) for number in ticks], [str(one) for one in ticks])
         ax.minorticks_off()
         if by_ratio:
             _logarithmic(ax)
@@ -110,9 +122,15 @@ def _panels(table: pd.DataFrame) -> tuple[Picture, Sequence[Axes]]:
     return figure, figure.subplots(1, number, squeeze=False)[0]
 
 
+def _is_level(here: pd.DataFrame) -> pd.Series:
+    """Which rows are of models that learn from no rounds whatever there are."""
+    return here.groupby("model")["rounds"].transform("max") == 0
+
+
 def _far(here: pd.DataFrame) -> pd.DataFrame:
     """Which levels are farther from the curves than ``OFF_SCALE`` times their span."""
-    curves, levels = here.loc[here["rounds"] > 0], here.loc[here["rounds"] == 0]
+    level = _is_level(here)
+    curves, levels = here.loc[~level], here.loc[level]
     low, high = curves["low"].min(), curves["high"].max()
     away = OFF_SCALE * (high - low)
     # Where there are no curves, nothing is far from them: comparisons with NaN are false.
@@ -133,8 +151,9 @@ def _curve(ax: Axes, own: pd.DataFrame, look: Look) -> None:
     if rounds[-1] == 0:
         ax.axhline(mean[0], color=colour, ls=line, lw=1.2, label=label)
         return
-    ax.plot(rounds, mean, color=colour, ls=line, marker=mark, ms=5, label=label)
-    ax.fill_between(rounds, own["low"], own["high"], color=colour, alpha=0.12, lw=0)
+    place = np.maximum(rounds, NO_ROUNDS)
+    ax.plot(place, mean, color=colour, ls=line, marker=mark, ms=5, label=label)
+    ax.fill_between(place, own["low"], own["high"], color=colour, alpha=0.12, lw=0)
 
 
 def plot_relevance(shares: pd.DataFrame) -> Picture:

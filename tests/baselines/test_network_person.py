@@ -154,7 +154,7 @@ def test_an_ensemble_is_its_networks(generator):
     world = get_domain("driving")
     several = untrained(world, ("person-01",) * 3)
     for value in several.weights.values():
-        value.data = torch.randn(value.shape, generator=generator)
+        value.data = 0.3 * torch.randn(value.shape, generator=generator)
     human = NetworkPerson(SelfModel(world), several, "fog")
     assert human.draws(4)[NETWORK].flatten().tolist() == [0, 1, 2, 0]
     steps = recordings.shape[2]

@@ -17,7 +17,9 @@ from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
 from mirror_ppl.errors import OptionError
 from mirror_ppl.evaluation import learners, study
-from mirror_ppl.evaluation.learners import LEARNERS, PLANNABLE, TEST, Group, learn
+from mirror_ppl.evaluation.assistance import REFERENCES
+from mirror_ppl.evaluation.learned import SAME_DRAWS
+from mirror_ppl.evaluation.learners import ASKED_FOR, LEARNERS, PLANNABLE, TEST, Group, learn
 from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
 from mirror_ppl.evaluation.study_report import REPORTS
 from mirror_ppl.evaluation.study_summary import (
@@ -135,7 +137,7 @@ def test_baselines_know_what_rewards_tell_of_the_world():
     assert person.human.networks.people == ("person-02",)
     assert person.number == 3
     more = learn("bc", group, 1, 0).person(1, 64)  # pyright: ignore[reportAttributeAccessIssue]
-    assert more.number == learners.SAME_DRAWS < 64
+    assert more.number == SAME_DRAWS < 64
     world = planning_domain(person.human, person.draws)
     assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
     assert world.rules != OLD_RULES  # pyright: ignore[reportAttributeAccessIssue]
@@ -246,7 +248,7 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
 
 
 def test_what_fails_is_told_and_the_rest_is_shown(tmp_path, capsys, monkeypatch):
-    def broken(group, rounds, seed):
+    def broken(group, rounds, seed, members):
         raise RuntimeError("this one cannot learn")
 
     monkeypatch.setitem(LEARNERS, "bc", broken)
@@ -316,13 +318,13 @@ def test_by_default_everything_is_compared():
     for domain in DOMAINS:
         for setting in get_domain(domain).settings:
             own = [c for c in cells if (c.group.domain, c.group.setting) == (domain, setting)]
-            expected = {*LEARNERS} - {"mirror-nuts"}
+            expected = {*LEARNERS} - {"mirror-nuts", *ASKED_FOR}
             if domain == "bomb_defusal":
                 expected -= {"mirror-svi"}
             if not study._has_guide(domain):
                 expected -= {"mirror-amortized"}
             if domain != "driving":
-                expected -= {"sqil-everything"}
+                expected -= {"sqil-everything", "sqil-pooled"}
             if setting not in ("fog", "smoke"):  # nothing is hidden: they would be the same
                 expected -= {"bc-everything", "sqil-everything"}
             assert {cell.model for cell in own} == expected
@@ -330,12 +332,15 @@ def test_by_default_everything_is_compared():
             assert len(own) == len(set(own))
     cells = evaluate._cells(evaluate.Options("assistance", domain=DOMAINS))
     assert {cell.group.setting for cell in cells} == {worst(domain) for domain in DOMAINS}
-    assert {cell.model for cell in cells} == {*PLANNABLE, "none", "all", "oracle"}
+    assert {cell.model for cell in cells} == {*PLANNABLE, *REFERENCES}
+    # Who has a prior says something of people of whom nothing is recorded.
+    from_nothing = {cell.model for cell in cells if not cell.rounds} - {*REFERENCES}
+    assert from_nothing == {"mirror", "perceptual-only", "policy-only", "no-implants"}
     # What learns nothing is played once, whatever learners plan with.
-    assert {cell.draws for cell in cells if cell.model in study.REFERENCES} == {0}  # pyright: ignore
+    assert {cell.draws for cell in cells if cell.model in REFERENCES} == {0}  # pyright: ignore
     # Relevance is of what assistance plays, after the most rounds.
     told = evaluate._cells(evaluate.Options("relevance", domain=DOMAINS))
-    assert set(told) == {cell for cell in cells if cell.rounds in (0, 20)}
+    assert set(told) == {cell for cell in cells if cell.rounds == 20 or cell.model in REFERENCES}
 
 
 def test_results_depend_on_the_code_that_made_them():
@@ -358,7 +363,7 @@ def test_results_depend_on_the_code_that_made_them():
 
 
 def test_every_model_has_a_look_of_its_own():
-    models = {*LEARNERS, "mirror-kl", "none", "all", "oracle"}
+    models = {*LEARNERS, "mirror-kl", *REFERENCES}
     assert models == set(STYLES)
     assert len({STYLES[name] for name in LEARNERS}) == len(LEARNERS)
 

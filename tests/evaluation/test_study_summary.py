@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mirror_ppl.evaluation.study_summary import (
+    Interval,
     Place,
     few_against_many,
     floors,
@@ -11,6 +12,7 @@ from mirror_ppl.evaluation.study_summary import (
     paired,
     relevance,
     summarize_study,
+    ways_to_oracle,
 )
 
 FOG = Place("driving", "fog", "paper")
@@ -79,6 +81,45 @@ def test_who_learns_nothing_is_compared_with_the_most_rounds():
     assert none.mirror.ahead.mean == 3.0
 
 
+def test_who_has_a_prior_is_compared_with_as_little():
+    rows = [row("mirror", 5, net=1.0), row("mirror", 0, net=0.5), row("no-implants", 0, net=-2.0)]
+    found = summarize_study(rows, "net")[-1].mirror
+    assert found is not None
+    assert found.ahead.mean == 2.5
+
+
+def test_who_pools_is_compared_with_mirror_pooled():
+    rows = [row("mirror", 1, nll=0.3), row("mirror-pooled", 1, nll=0.2)]
+    rows += [row("logistic", 1, nll=0.25), row("bc", 1, nll=0.25)]
+    mirror, pooled, logistic, bc = summarize_study(rows, "nll", -1)
+    assert mirror.mirror is None
+    assert [one.mirror.ahead.mean for one in (pooled, logistic, bc)] == pytest.approx(  # pyright: ignore
+        [-0.1, 0.05, -0.05]
+    )
+
+
+def test_the_way_to_the_oracle_and_what_was_learned_of_people_on_it():
+    """Of 4 between silence and the oracle: 2 with nothing learned, 3 after five rounds."""
+    rows = []
+    for person in "ab":
+        for model, rounds, net in (
+            ("none", 0, -5.0),
+            ("oracle", 0, -1.0),
+            ("mirror", 0, -3.0),
+            ("mirror", 5, -2.0),
+        ):
+            rows.append(row(model, rounds, person, net=net))
+    ways = {(one.model, one.rounds): one for one in ways_to_oracle(rows)}
+    assert ways["mirror", 0].share == Interval(0.5, 0.5, 0.5)
+    assert ways["mirror", 5].share == Interval(0.75, 0.75, 0.75)
+    assert ways["mirror", 0].learned is None
+    assert ways["mirror", 5].learned == Interval(1.0, 1.0, 1.0)
+    assert ways["oracle", 0].share == Interval(1.0, 1.0, 1.0)
+    assert ways["none", 0].share == Interval(0.0, 0.0, 0.0)
+    # Without an oracle there is no way to it.
+    assert all(one.share is None for one in ways_to_oracle(rows[:1] + rows[2:4]))
+
+
 def test_places_are_apart():
     clear = Place("driving", "clear", "paper")
     rows = [row("mirror", 1, nll=0.1), row("bc", 1, nll=0.3, place=clear)]
@@ -93,7 +134,7 @@ def test_few_rounds_of_mirror_are_against_the_most_of_baselines():
         row("mirror", 1, nll=0.25),
         row("bc", 1, nll=0.9),
         row("bc", 20, nll=0.35),
-        row("logistic", 20, nll=0.0),
+        row("policy-only", 20, nll=0.0),
     ]
     (claim,) = few_against_many(rows, "nll", -1)
     assert (claim.rounds, claim.baseline, claim.baseline_rounds) == (1, "bc", 20)
