@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from mirror_ppl.baselines.inputs import look, network_inputs
+from mirror_ppl.baselines.inputs import Sight, look, network_inputs
 from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.domains.base import Domain, Observation, Visibility
 from mirror_ppl.errors import HumanModelError
@@ -65,7 +65,7 @@ class NetworkPerson(HumanModel, WorldKnowledge):
             raise HumanModelError(
                 f"networks of {networks.domain.name}, expected {self_model.domain.name}"
             )
-        self.sight = networks.sight
+        self.sight: Sight = networks.sight
         self.networks = networks
         number = len(networks.people)
         alone = (networks.only(place) for place in range(number))

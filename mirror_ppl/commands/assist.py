@@ -21,8 +21,8 @@ from mirror_ppl.limits import check_numbers
 from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
-    from mirror_ppl.evaluation.assistance import Played
     from mirror_ppl.evaluation.assistance_cells import Pairing
+    from mirror_ppl.evaluation.played import Played
     from mirror_ppl.inference.results.posterior_file import PosteriorFile
 
 FAR_BELOW = -10

@@ -325,6 +325,25 @@ class Communicator:
         message = channels.message(flags)
         return Decision(message, flags, gain, domain, now, found, chosen, self._world)
 
+    def after(self, past: RoundSoFar) -> Communicator:
+        """The communicator for the next round of the same person.
+
+        It has learned which channels reach them (:mod:`mirror_ppl.communication.hearing`): whoever
+        does not react to messages is soon left in peace.
+
+        Args:
+            past: the round in which they were assisted, with its last action and observation.
+
+        Raises:
+            InputError: as of :meth:`plan`.
+        """
+        past = require_kind(past, RoundSoFar, "the round").to(self.person.device)
+        past.check(self.person.human.domain)
+        person = self.person.after(past)
+        return Communicator(
+            person, self.objective, self.search, self.min_standard_errors, self.seed
+        )
+
     def _silence(self, now: Observation, allowed: Tensor, over: bool = False) -> Decision:
         """Where there is nothing to choose."""
         none = torch.zeros_like(allowed)

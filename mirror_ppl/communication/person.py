@@ -92,6 +92,26 @@ class Person:
         """
         if not self.human.has_round_latents:
             return self
+        values, log_prior = self._attending(past)
+        log_chances = self._log_chances(values, past) + log_prior
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(past.time)
+            chosen = torch.multinomial(log_chances.softmax(-1), 1).squeeze(-1)
+        own = {name: value[chosen] for name, value in values.items()}
+        person = copy(self)
+        person.percepts, person.percept = self._distinct_percepts(
+            {**self._discrete, **own}, self.number
+        )
+        person.percept_count = int(person.percept.max()) + 1
+        return person
+
+    def after(self, past: RoundSoFar) -> Person:
+        """The person after a round in which they were assisted; nothing is learned from it here."""
+        del past
+        return self
+
+    def _attending(self, past: RoundSoFar) -> tuple[dict[str, Tensor], Tensor]:
+        """Values of attention ``[G]`` that stand for all in a round, and log priors ``[S, G]``."""
         so_far = {name: value[: past.time] for name, value in past.observation.items()}
         facts = {
             name: fact.view(1, 1) for name, fact in self.human.covariates(past.observation).items()
@@ -100,25 +120,15 @@ class Person:
         values = self._attention_of_any_round
         if facts or explanations:
             values = self._attention.values(None, 0, facts, explanations)
-        log_chances = self._log_chances(values.values, past)
         with self._conditioned():
-            log_chances = log_chances + log_weighted_latents(
+            log_prior = log_weighted_latents(
                 self.human,
                 self.implants,
                 {name: value[None, None] for name, value in values.values.items()},
                 values.log_weights[None, None],
                 facts,
             ).view(-1, len(values))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(past.time)
-            chosen = torch.multinomial(log_chances.softmax(-1), 1).squeeze(-1)
-        own = {name: value[chosen] for name, value in values.values.items()}
-        person = copy(self)
-        person.percepts, person.percept = self._distinct_percepts(
-            {**self._discrete, **own}, self.number
-        )
-        person.percept_count = int(person.percept.max()) + 1
-        return person
+        return values.values, log_prior
 
     @cached_property
     def _attention(self) -> Proposal:

@@ -6,12 +6,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+from mirror_ppl.checks import real_number
 from mirror_ppl.communication.communicator import Communicator
+from mirror_ppl.communication.hearing import hearing
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.rollouts import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.search import Automatic
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.models.implants import LEAST_PROBABILITY
 from mirror_ppl.models.world_knowledge import planning_domain
 
 
@@ -27,6 +30,8 @@ class PlannerOptions:
         items: most items of a message, see :class:`Automatic`.
         min_standard_errors: standard errors that a gain must exceed, see :class:`Communicator`.
         terminal_value: see :class:`ExpectedUtility`.
+        hears: probability that messages of a modality reach the person, before anything was told
+            (:mod:`mirror_ppl.communication.hearing`); 1 takes it for granted.
         kl_weight: units of reward that mirror-kl gives for a nat.
         kl_measure: what mirror-kl measures, see :class:`Divergence`.
     """
@@ -40,6 +45,10 @@ class PlannerOptions:
     kl_weight: float = 1.0
     kl_measure: str = "kl"
     terminal_value: bool = False
+    hears: float = 0.9
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hears", real_number(self.hears, "hears", LEAST_PROBABILITY, 1.0))
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
@@ -111,6 +120,7 @@ def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) ->
     """
     if name not in PLANNERS:
         raise UnknownNameError.of("planner", name, PLANNERS)
+    person = hearing(person, options.hears)
     objective = PLANNERS[name](person, options)
     search = Automatic(options.patience, items=options.items)
     if getattr(objective, "one_step", False):

@@ -7,23 +7,24 @@ them are differences in what they said.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from mirror_ppl.communication import rules
-from mirror_ppl.communication.communicator import Decision
+from mirror_ppl.communication.communicator import Communicator, Decision
+from mirror_ppl.communication.hearing import HearingPerson
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward
+from mirror_ppl.domains.base import Domain, Observation, map_state
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.oracle import Oracle
+from mirror_ppl.evaluation.played import Played, Tally
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
 from mirror_ppl.people import draw_starts
 from mirror_ppl.people.base import SimulatedPeople, act
@@ -44,42 +45,6 @@ REFERENCES = ("none", "all", "nearest", "oracle")
 """Those of them that learn nothing of people, and are compared with those that do."""
 RATES_FROM = "mirror"
 """Whose rate of items ``random`` has."""
-
-
-@dataclass(frozen=True)
-class Played:
-    """R rounds of one person with one communicator.
-
-    Attributes:
-        task: reward of the task, ``[R]``.
-        cost: of the messages, ``[R]``.
-        mishaps: steps in which went wrong what the domain calls a mishap, ``[R]``.
-        items: communicated items by modality, ``[R]`` each.
-        relevant: those of them that were relevant, by notion of relevance and modality, ``[R]``.
-        chances: items that could have been communicated, by modality, summed over rounds.
-        steps: of all rounds, as long as they were under way: decisions.
-        milliseconds: mean time of a decision.
-        log: what was decided, one entry a decision, if asked for.
-    """
-
-    task: list[float]
-    cost: list[float]
-    mishaps: list[int]
-    items: dict[str, list[int]]
-    relevant: dict[str, dict[str, list[int]]]
-    chances: dict[str, int]
-    steps: int
-    milliseconds: float
-    log: list[dict[str, Any]] = field(default_factory=list)
-
-    @property
-    def net(self) -> np.ndarray:
-        """Task reward less cost, ``[R]``."""
-        return np.asarray(self.task) - np.asarray(self.cost)
-
-    def rates(self) -> dict[str, float]:
-        """Share of the communicable items that were communicated, by modality."""
-        return {name: sum(items) / max(self.chances[name], 1) for name, items in self.items.items()}
 
 
 @dataclass(frozen=True)
@@ -118,6 +83,10 @@ class Listener:
     driver: SimulatedPeople
     start: Start
     person: Person | None = None
+
+    def round(self, number: int) -> Listener:
+        """The same person in one of their rounds alone."""
+        return replace(self, start=self.start.round(number))
 
 
 def listeners(
@@ -178,14 +147,36 @@ def speaker(
     if name not in COMMUNICATORS:
         raise UnknownNameError.of("communicator", name, COMMUNICATORS)
     assert listener.person is not None
-    planner = planner_of(name, listener.person, options, seed)
+    return Planning(planner_of(name, listener.person, options, seed))
 
-    def say(rounds: Sequence[RoundSoFar], truth: Truth) -> tuple[Tensor, list[Decision]]:
+
+class Planning:
+    """A planner that speaks to one person, and learns which channels reach them.
+
+    Attributes:
+        planner: for the present round.
+    """
+
+    def __init__(self, planner: Communicator) -> None:
+        self.planner = planner
+
+    def __call__(
+        self, rounds: Sequence[RoundSoFar], truth: Truth
+    ) -> tuple[Tensor, list[Decision] | None]:
+        """What to say in each of R rounds."""
         del truth
-        decisions = [planner.plan(past) for past in rounds]
+        decisions = [self.planner.plan(past) for past in rounds]
         return torch.stack([decision.flags for decision in decisions]), decisions
 
-    return say
+    def learn(self, past: RoundSoFar) -> None:
+        """Go on to the next round."""
+        self.planner = self.planner.after(past)
+
+    @property
+    def hears(self) -> dict[str, float]:
+        """Probability that messages of each modality reach the person; nothing if it is given."""
+        person = self.planner.person
+        return person.hears if isinstance(person, HearingPerson) else {}
 
 
 def _oracle(listener: Listener) -> Say:
@@ -198,84 +189,43 @@ def _oracle(listener: Listener) -> Say:
     return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
 
 
-class _Tally:
-    """What R rounds add up to, see `Played`."""
-
-    def __init__(self, domain: Domain, channels: Channels, rounds: int) -> None:
-        self.domain, self.channels = domain, channels
-        self.task, self.cost = torch.zeros(rounds), torch.zeros(rounds)
-        self.mishaps = torch.zeros(rounds, dtype=torch.long)
-        self.items = {m.name: torch.zeros_like(self.mishaps) for m in self.domain.modalities}
-        self.relevant: dict[str, dict[str, Tensor]] = {}
-        self.chances = dict.fromkeys(self.items, 0)
-        self.steps = 0
-
-    def add_messages(self, observation: Observation, flags: Tensor, under_way: Tensor) -> None:
-        """Count messages ``[R, N]`` of a step, and what could have been communicated."""
-        self.steps += int(under_way.sum())
-        self.cost += self.channels.cost(flags)
-        messages, may = self.channels.split(flags), self.domain.communicable(observation)
-        for name, mask in messages.items():
-            self.items[name] += mask.sum(-1)
-            self.chances[name] += int(may[name][0, under_way].sum())
-        for notion, masks in self.domain.relevance(observation).items():
-            counts = self.relevant.setdefault(
-                notion, {name: torch.zeros_like(count) for name, count in self.items.items()}
-            )
-            for name, mask in messages.items():
-                counts[name] += (mask & masks[name][0]).sum(-1)
-
-    def add_rewards(self, terms: Mapping[str, Tensor]) -> None:
-        """Add rewards ``[1, R]`` of a step, by term."""
-        self.task += total_reward(terms)[0]
-        self.mishaps += (terms[self.domain.mishap[0]][0] < 0).long()
-
-    def played(self, seconds: float, log: list[dict[str, Any]]) -> Played:
-        """The rounds, of which decisions took so many seconds."""
-        return Played(
-            self.task.tolist(),
-            self.cost.tolist(),
-            self.mishaps.tolist(),
-            _lists(self.items),
-            {notion: _lists(counts) for notion, counts in self.relevant.items()},
-            self.chances,
-            self.steps,
-            1000 * seconds / self.steps,
-            log,
-        )
-
-
-def _lists(counts: Mapping[str, Tensor]) -> dict[str, list[int]]:
-    return {name: count.tolist() for name, count in counts.items()}
-
-
 @torch.no_grad()
 def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
     """Let one person play their rounds while somebody speaks to them.
+
+    A planner learns from each round before the next one; for all others they are played at once.
 
     Args:
         listener: the person, and their rounds.
         say: who speaks.
         keep_log: whether to keep every decision.
     """
+    if not isinstance(say, Planning):
+        return _play(listener, say, keep_log)[0]
+    parts = []
+    for number in range(listener.start.luck.shape[1]):
+        played, (past,) = _play(listener.round(number), say, keep_log)
+        say.learn(past)
+        parts.append(played)
+    return replace(Played.joined(parts), hears=say.hears)
+
+
+def _play(listener: Listener, say: Say, keep_log: bool) -> tuple[Played, list[RoundSoFar]]:
+    """All rounds at once, and how they went."""
     domain, driver, start = listener.domain, listener.driver, listener.start
     channels, number = Channels(domain), start.luck.shape[1]
-    tally, seconds, log = _Tally(domain, channels, number), 0.0, []
+    tally, seconds, log = Tally(domain, channels, number), 0.0, []
     state, memory = start.state, driver.start(number, fate=start.fate)
-    rounds: list[RoundSoFar] = []
-    messages, action = {}, torch.zeros(number, dtype=torch.long)
+    now = _now(domain, state, number)
+    rounds = [RoundSoFar.begin(domain, one) for one in now]
     for step in range(domain.horizon):
         observation = domain.observe(state)
-        now = [{name: value[0, r] for name, value in observation.items()} for r in range(number)]
-        rounds = (
-            [past.then(_row(messages, r), action[r], now[r]) for r, past in enumerate(rounds)]
-            if rounds
-            else [RoundSoFar.begin(domain, one) for one in now]
-        )
         began = perf_counter()
         flags, decisions = say(rounds, Truth(step, state, memory))
         seconds += perf_counter() - began
         under_way = ~domain.over(state)[0]
+        if not under_way.any():
+            break
         flags = flags & under_way[:, None]
         messages = channels.split(flags)
         probability, memory = driver.step(memory, observation, channels.split(flags[None]))
@@ -292,7 +242,15 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
                 if under_way[r]
             ]
         state = following
-    return tally.played(seconds, log)
+        now = _now(domain, state, number)
+        rounds = [past.then(_row(messages, r), action[r], now[r]) for r, past in enumerate(rounds)]
+    return tally.played(seconds, log), rounds
+
+
+def _now(domain: Domain, state: Any, number: int) -> list[Observation]:
+    """What there is to observe in each of R rounds."""
+    observation = domain.observe(state)
+    return [{name: value[0, r] for name, value in observation.items()} for r in range(number)]
 
 
 def audit(decision: Decision, most: int = 5) -> dict[str, Any]:

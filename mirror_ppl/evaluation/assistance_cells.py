@@ -15,11 +15,11 @@ from mirror_ppl.evaluation.assistance import (
     RATES_FROM,
     Listener,
     PlannerOptions,
-    Played,
     listeners,
     play,
     speaker,
 )
+from mirror_ppl.evaluation.played import Played
 from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.jobs import JsonFormat, Runner
 from mirror_ppl.likelihood.contract import check_contract

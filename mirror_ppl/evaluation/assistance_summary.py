@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mirror_ppl.evaluation.assistance import Played
+from mirror_ppl.evaluation.played import Played
 
 RESAMPLES = 2000
 LEVELS = (0.05, 0.95)

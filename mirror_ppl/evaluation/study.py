@@ -40,7 +40,7 @@ CODE = (
     *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
     *(f"{name}/**/*.py" for name in ("inference", "likelihood", "models", "people")),
     *(f"evaluation/{name}.py" for name in ("assistance", "known_sight", "learned", "learners")),
-    *(f"evaluation/{name}.py" for name in ("oracle", "reachable_oracle", "study")),
+    *(f"evaluation/{name}.py" for name in ("oracle", "played", "reachable_oracle", "study")),
     "cross_entropy.py",
     "row_hashing.py",
     "data/assets/*guide*.safetensors",

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.bomb_defusal import BombDefusalHuman
-from mirror_ppl.models.family import AnyKind, HardOfHearing, Late, Preferring
+from mirror_ppl.models.family import HardOfHearing, Late, OneOfKinds, Preferring
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.variants import NoImplants
 from mirror_ppl.models.view import View
@@ -77,10 +75,10 @@ class BombDefusalHardOfHearing(HardOfHearing, BombDefusalHuman):
     spans = BombDefusalHuman.spans
 
 
-class BombDefusalAnyKind(AnyKind, BombDefusalHuman):
+class BombDefusalAnyKind(OneOfKinds, Late, Preferring, BombDefusalHuman):
     """Searches and guesses; of which kind they are is open."""
 
-    value_names = MappingProxyType({**BombDefusalHuman.value_names, **AnyKind.value_names})
+    kinds = ("mirror", "late", "preferring")
 
 
 def _everything(observation: Observation) -> Visibility:

@@ -41,6 +41,7 @@ from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.distributions import NormalizedCategorical
 from mirror_ppl.models.handlers import AtStep, MaskObserved
 from mirror_ppl.models.networks import Gaussian, log_softmax_of_few
+from mirror_ppl.models.perception import perceived_by
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
@@ -235,23 +236,8 @@ class HumanModel(nn.Module):
         Returns:
             The view of this step, and the knowledge after it.
         """
-        domain = self.domain
         sees = partial(self.sees, implants, step=step)
-        visible = {name: mask | told[name] for name, mask in sees(observation).items()}
-        knowledge = domain.learn(knowledge, observation, visible, sees)
-        visible = {name: visible[name] | mask for name, mask in domain.known(knowledge).items()}
-        items, imagined = domain.assume(knowledge, observation)
-        if not items:
-            return View(visible), knowledge
-        taken = {name: torch.zeros_like(mask) for name, mask in visible.items()}
-        for assumption, about in items.items():
-            site = implant_priors.ASSUMES + assumption
-            if site not in implants:  # open to them, as it is to the robot
-                continue
-            makes = implants[site][..., None] == 1
-            for name, mask in about.items():
-                taken[name] = taken[name] | (mask & makes & ~visible[name])
-        return View(visible, taken, imagined), knowledge
+        return perceived_by(sees, self.domain, implants, knowledge, observation, told)
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
         """What a view ``[..., K]`` of an observation tells the encoder, ``[..., H]``."""

@@ -11,7 +11,14 @@ from torch import Tensor
 from mirror_ppl.domains.base import Observation, Visibility, by_eye
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import implants as implant_priors
-from mirror_ppl.models.family import AnyKind, HardOfHearing, Late, Preferring
+from mirror_ppl.models.family import (
+    AnyKind,
+    Forgetting,
+    HardOfHearing,
+    Late,
+    Noticing,
+    Preferring,
+)
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel
 
@@ -118,6 +125,8 @@ VARIANTS: dict[str, type[HumanModel]] = {
     "policy-only": PolicyOnly,
     "no-implants": NoImplants,
     "late": Late,
+    "noticing": Noticing,
+    "forgetting": Forgetting,
     "preferring": Preferring,
     "hard-of-hearing": HardOfHearing,
     "all": AnyKind,

@@ -50,7 +50,9 @@ class View:
 
         def stacked(parts: Sequence[Mapping[str, Tensor]], behind: int) -> dict[str, Tensor]:
             return {
-                name: joined([part[name] for part in parts], -2 if name == "ego" else -1 - behind)
+                name: joined(
+                    [part[name] for part in parts], -2 if name.endswith("ego") else -1 - behind
+                )
                 for name in parts[0]
             }
 

@@ -46,6 +46,17 @@ class Start:
             None if self.gossip is None else self.gossip[people],
         )
 
+    def round(self, number: int) -> Start:
+        """One of the rounds alone."""
+        own = slice(number, number + 1)
+        return Start(
+            map_state(lambda part: part[:, own], self.state),
+            self.scenario[:, own],
+            self.luck[:, own],
+            None if self.fate is None else self.fate[:, own],
+            None if self.gossip is None else self.gossip[:, own],
+        )
+
 
 @dataclass(frozen=True)
 class Recording:

@@ -122,9 +122,9 @@ def _panels(table: pd.DataFrame) -> tuple[Picture, Sequence[Axes]]:
     return figure, figure.subplots(1, number, squeeze=False)[0]
 
 
-def _is_level(here: pd.DataFrame) -> pd.Series:
+def _is_level(here: pd.DataFrame) -> np.ndarray:
     """Which rows are of models that learn from no rounds whatever there are."""
-    return here.groupby("model")["rounds"].transform("max") == 0
+    return here.groupby("model")["rounds"].transform("max").to_numpy() == 0
 
 
 def _far(here: pd.DataFrame) -> pd.DataFrame:

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from mirror_ppl.evaluation.assistance import Played
 from mirror_ppl.evaluation.assistance_summary import compare, summarize_assistance
+from mirror_ppl.evaluation.played import Played
 
 
 def rounds_of(task, cost, items=0, relevant=0, milliseconds=1.0):

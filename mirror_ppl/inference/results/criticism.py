@@ -29,7 +29,7 @@ from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
-from mirror_ppl.models.family import KIND, AnyKind
+from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
@@ -183,10 +183,10 @@ def criticize(
     }
 
 
-def models_of(human: AnyKind, kind: Tensor) -> dict[str, float]:
+def models_of(human: OneOfKinds, kind: Tensor) -> dict[str, float]:
     """Posterior probability of each model of a family, of draws ``[S]`` of one person's kind.
 
-    See :class:`mirror_ppl.models.family.AnyKind`.
+    See :class:`mirror_ppl.models.family.OneOfKinds`.
     """
     names = human.value_names[KIND]
     often = torch.bincount(kind.long().flatten(), minlength=len(names)) / kind.numel()

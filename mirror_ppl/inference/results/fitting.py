@@ -21,7 +21,7 @@ from mirror_ppl.inference.results.description import Description, describe
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.likelihood.contract import check_contract
-from mirror_ppl.models.family import KIND, AnyKind
+from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import in_units
 from mirror_ppl.models.recorded import check_rounds
@@ -192,7 +192,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         if posterior.effective is not None:
             person["effective_draws"] = round(float(posterior.effective[number]), 1)
         person["check"] = predicted.checks[number]
-        if isinstance(human, AnyKind):
+        if isinstance(human, OneOfKinds):
             person["check"]["models"] = models_of(human, posterior.draws[KIND][:, number])
         if unidentified is not None:
             person["identifiability"] = unidentified.of(number, scenarios)

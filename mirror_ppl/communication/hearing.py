@@ -1,0 +1,136 @@
+"""Which channels reach somebody: found out while they are assisted, where recordings leave it open.
+
+Of people who were recorded without messages nothing is known of that but a prior, which their
+posterior does not depend on. So each draw gets, beside what it has, whether messages of each
+modality reach the person (:class:`mirror_ppl.models.family.HardOfHearing`), from::
+
+    p(hears | psi, rounds so far)  ~  p(hears) prod_t p(a_t | psi, hears, a_{1:t-1}, told_{1:t})
+
+over the rounds in which they were assisted (:meth:`HearingPerson.after`) and the present one so
+far. What these rounds say of the other implants is left to the next fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from copy import copy
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.communication.person import Person
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.models.family.hearing import HEARS, HardOfHearing
+from mirror_ppl.models.human import HumanModel
+
+
+class HearingPerson(Person):
+    """A person of whom it is open which channels reach them.
+
+    Args:
+        human: the model of people.
+        draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or what becomes one.
+        hears: probability that messages of a modality reach them, before anything was told; of a
+            model that infers it, one draw among all that are given.
+
+    Raises:
+        HumanModelError, InputError: as of `Person`.
+    """
+
+    def __init__(self, human: HumanModel, draws: Mapping[str, Tensor], hears: float) -> None:
+        own = Person(human, draws)
+        names = [HEARS + modality.name for modality in human.domain.modalities]
+        patterns = torch.tensor([*product((0, 1), repeat=len(names))], device=own.device)
+        self.patterns = dict(zip(names, patterns.T, strict=True))
+        chances = []
+        for name, pattern in self.patterns.items():
+            chance, given = hears, own.draws.get(name)
+            if given is not None:
+                chance = (float(given.sum()) + hears) / (own.number + 1)
+            chances.append(torch.where(pattern == 1, chance, 1 - chance))
+        # [S, H], of each draw and pattern; from the second round on they differ by draw.
+        self.log_hears = torch.stack(chances).log().sum(0).expand(own.number, -1)
+        generator = torch.Generator().manual_seed(0)
+        self.ladder = (torch.randperm(own.number, generator=generator) + 0.5) / own.number
+        self.ladder = self.ladder.to(own.device)
+        super().__init__(_open(human), own.draws | self._drawn(self.log_hears))
+
+    def in_round(self, past: RoundSoFar) -> Person:
+        """The person in a round under way, with what reaches them as their actions tell it."""
+        found = copy(self)
+        found._take(self._drawn(self._after(past)))
+        return Person.in_round(found, past)
+
+    @torch.no_grad()
+    def after(self, past: RoundSoFar) -> HearingPerson:
+        """The same person after a round in which they were assisted."""
+        found = copy(self)
+        found.log_hears = self._after(past)
+        found._take(self._drawn(found.log_hears))
+        return found
+
+    @property
+    def hears(self) -> dict[str, float]:
+        """Probability that messages of each modality reach them, over all draws."""
+        chances = self.log_hears.softmax(-1).mean(0)
+        return {
+            name.removeprefix(HEARS): float(chances @ pattern.to(chances))
+            for name, pattern in self.patterns.items()
+        }
+
+    def _after(self, past: RoundSoFar) -> Tensor:
+        """Log-probability ``[S, H]`` of each pattern, up to a constant, after what was done."""
+        said = any(bool(mask[: past.time].any()) for mask in past.told.values())
+        if not said or not past.time:
+            return self.log_hears
+        return (self.log_hears + self._log_likelihoods(past)).log_softmax(-1)
+
+    def _log_likelihoods(self, past: RoundSoFar) -> Tensor:
+        """Of what was done so far in a round under each pattern, ``[S, H]``."""
+        if not self.human.has_round_latents:
+            return self._log_chances(self.patterns, past)
+        attention, log_chances = self._attending(past)
+        number, patterns = len(next(iter(attention.values()))), len(self.log_hears[0])
+        values = {name: value.repeat(patterns) for name, value in attention.items()}
+        values |= {name: own.repeat_interleave(number) for name, own in self.patterns.items()}
+        found = self._log_chances(values, past).unflatten(-1, (patterns, number))
+        return (found + log_chances[:, None]).logsumexp(-1)
+
+    def _drawn(self, log_chances: Tensor) -> dict[str, Tensor]:
+        """A pattern for each draw, as often of each as it is probable, ``[S, 1, 1]`` by site."""
+        steps = log_chances.softmax(-1).cumsum(-1)
+        chosen = (self.ladder[:, None] > steps).sum(-1).clamp(max=steps.shape[-1] - 1)
+        return {name: pattern[chosen][:, None, None] for name, pattern in self.patterns.items()}
+
+    def _take(self, hears: Mapping[str, Tensor]) -> None:
+        self.draws = {**self.draws, **hears}
+        self._discrete = {
+            **self._discrete,
+            **{name: value.flatten() for name, value in hears.items()},
+        }
+        self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
+        self.percept_count = int(self.percept.max()) + 1
+
+
+def hearing(person: Person, hears: float) -> Person:
+    """Somebody of whom it is open which channels reach them; as they are if all do for certain.
+
+    Args:
+        person: the person.
+        hears: see :class:`HearingPerson`.
+    """
+    known = hears >= 1 - math.ulp(1.0) and not isinstance(person.human, HardOfHearing)
+    if known or isinstance(person, HearingPerson) or not person.human.domain.modalities:
+        return person
+    return HearingPerson(person.human, person.draws, hears)
+
+
+def _open(human: HumanModel) -> HumanModel:
+    """The same model, but for the sites of what reaches people, which it has besides."""
+    if isinstance(human, HardOfHearing):
+        return human
+    own, kind = copy(human), type(human)
+    own.__class__ = type(kind.__name__, (HardOfHearing, kind), {"spans": kind.spans})
+    return own

@@ -1,0 +1,129 @@
+"""Rounds that somebody played while they were spoken to: rewards, messages, what was relevant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mirror_ppl.communication.messages import Channels
+from mirror_ppl.domains.base import Domain, Observation, total_reward
+
+
+@dataclass(frozen=True)
+class Played:
+    """R rounds of one person with one communicator.
+
+    Attributes:
+        task: reward of the task, ``[R]``.
+        cost: of the messages, ``[R]``.
+        mishaps: steps in which went wrong what the domain calls a mishap, ``[R]``.
+        items: communicated items by modality, ``[R]`` each.
+        relevant: those of them that were relevant, by notion of relevance and modality, ``[R]``.
+        chances: items that could have been communicated, by modality, summed over rounds.
+        steps: of all rounds, as long as they were under way: decisions.
+        milliseconds: mean time of a decision.
+        log: what was decided, one entry a decision, if asked for.
+        hears: in the end, probability that messages of each modality reach the person; nothing of
+            who does not ask.
+    """
+
+    task: list[float]
+    cost: list[float]
+    mishaps: list[int]
+    items: dict[str, list[int]]
+    relevant: dict[str, dict[str, list[int]]]
+    chances: dict[str, int]
+    steps: int
+    milliseconds: float
+    log: list[dict[str, Any]] = field(default_factory=list)
+    hears: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Played]) -> Played:
+        """Rounds that were played one after the other."""
+        first, steps = parts[0], sum(one.steps for one in parts)
+
+        def listed(name: str) -> list:
+            return [value for one in parts for value in getattr(one, name)]
+
+        return cls(
+            listed("task"),
+            listed("cost"),
+            listed("mishaps"),
+            {name: [n for one in parts for n in one.items[name]] for name in first.items},
+            {
+                notion: {
+                    name: [n for one in parts for n in one.relevant[notion][name]] for name in own
+                }
+                for notion, own in first.relevant.items()
+            },
+            {name: sum(one.chances[name] for one in parts) for name in first.chances},
+            steps,
+            sum(one.milliseconds * one.steps for one in parts) / steps,
+            [entry | {"round": place} for place, one in enumerate(parts) for entry in one.log],
+        )
+
+    @property
+    def net(self) -> np.ndarray:
+        """Task reward less cost, ``[R]``."""
+        return np.asarray(self.task) - np.asarray(self.cost)
+
+    def rates(self) -> dict[str, float]:
+        """Share of the communicable items that were communicated, by modality."""
+        return {name: sum(items) / max(self.chances[name], 1) for name, items in self.items.items()}
+
+
+class Tally:
+    """What R rounds add up to, see `Played`."""
+
+    def __init__(self, domain: Domain, channels: Channels, rounds: int) -> None:
+        self.domain, self.channels = domain, channels
+        self.task, self.cost = torch.zeros(rounds), torch.zeros(rounds)
+        self.mishaps = torch.zeros(rounds, dtype=torch.long)
+        self.items = {m.name: torch.zeros_like(self.mishaps) for m in self.domain.modalities}
+        self.relevant: dict[str, dict[str, Tensor]] = {}
+        self.chances = dict.fromkeys(self.items, 0)
+        self.steps = 0
+
+    def add_messages(self, observation: Observation, flags: Tensor, under_way: Tensor) -> None:
+        """Count messages ``[R, N]`` of a step, and what could have been communicated."""
+        self.steps += int(under_way.sum())
+        self.cost += self.channels.cost(flags)
+        messages, may = self.channels.split(flags), self.domain.communicable(observation)
+        for name, mask in messages.items():
+            self.items[name] += mask.sum(-1)
+            self.chances[name] += int(may[name][0, under_way].sum())
+        for notion, masks in self.domain.relevance(observation).items():
+            counts = self.relevant.setdefault(
+                notion, {name: torch.zeros_like(count) for name, count in self.items.items()}
+            )
+            for name, mask in messages.items():
+                counts[name] += (mask & masks[name][0]).sum(-1)
+
+    def add_rewards(self, terms: Mapping[str, Tensor]) -> None:
+        """Add rewards ``[1, R]`` of a step, by term."""
+        self.task += total_reward(terms)[0]
+        self.mishaps += (terms[self.domain.mishap[0]][0] < 0).long()
+
+    def played(self, seconds: float, log: list[dict[str, Any]]) -> Played:
+        """The rounds, of which decisions took so many seconds."""
+        return Played(
+            self.task.tolist(),
+            self.cost.tolist(),
+            self.mishaps.tolist(),
+            _lists(self.items),
+            {notion: _lists(counts) for notion, counts in self.relevant.items()},
+            self.chances,
+            self.steps,
+            1000 * seconds / self.steps,
+            log,
+        )
+
+
+def _lists(counts: Mapping[str, Tensor]) -> dict[str, list[int]]:
+    return {name: count.tolist() for name, count in counts.items()}

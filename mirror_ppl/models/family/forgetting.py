@@ -1,0 +1,93 @@
+"""People who forget what they saw and heard."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.family.several import NOW, SeveralBeliefs, joined
+from mirror_ppl.models.human import Implants
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.view import View
+
+FORGETS = "forgets"
+"""Site of how probably somebody forgets at a step all that was before it."""
+FORGOT = ("forgot 0", "forgot 1", "forgot 2")
+"""Beliefs of somebody who forgot all before this step, before the last one, and the one before."""
+AFRESH = "afresh"
+"""The view of somebody who knows nothing from before."""
+
+
+class Forgetting(SeveralBeliefs):
+    """Forgets with a probability at each step what was seen and heard before it::
+
+        forgets_p ~ Beta(1, 1)
+        zH_t^m    what is believed of this step and the m before it alone: m = 0, 1, 2
+        a_t       ~ sum_m forgets (1 - forgets)^m p(a | zH_t^m) + (1 - forgets)^3 p(a | zH_t)
+
+    Who has not forgotten for more than two steps has forgotten nothing.
+    """
+
+    def __init__(self, self_model: SelfModel) -> None:
+        super().__init__(self_model)
+        if len(self.domain.reach_bins) <= 1:
+            raise HumanModelError(
+                f"forgetting: in {self.domain.name} what was found stays in view, and there is "
+                "nothing to forget"
+            )
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """That of somebody who knows nothing from before, too."""
+        return (*super().views, AFRESH)
+
+    @property
+    def beliefs(self) -> tuple[str, ...]:
+        """Those of somebody who forgot, too."""
+        return (*super().beliefs, *FORGOT)
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample the implants of every person; ``forgets`` is how probably they forget."""
+        one = next(self.self_model.parameters()).new_ones(())
+        return super().prior() | {FORGETS: pyro.sample(FORGETS, dist.Beta(one, one))}
+
+    def perceive(
+        self,
+        implants: Implants,
+        knowledge: Any,
+        observation: Observation,
+        told: Visibility,
+        step: int,
+    ) -> tuple[View, Any]:
+        """What a person sees and knows, and what they see alone."""
+        nothing = self.domain.nothing_known(1, device=observation["ego"].device)
+        afresh, _ = super().perceive(implants, nothing, observation, told, step)
+        view, after = super().perceive(implants, knowledge, observation, told, step)
+        return joined({NOW: view, AFRESH: afresh}), after
+
+    def after(self, before, evidence, action, still) -> dict[str, Tensor]:
+        """The beliefs after one step; of who forgot just now, as at the first step of a round."""
+        found = super().after(before, evidence, action, still)
+        begins = torch.full_like(action, len(self.domain.actions))
+        nothing = torch.zeros_like(before[NOW])
+        found[FORGOT[0]] = self.inferred(nothing, evidence[AFRESH], begins, still)
+        for name, own in zip(FORGOT[1:], FORGOT, strict=False):
+            later = self.inferred(before[own], evidence[AFRESH], action, still)
+            first = (action == len(self.domain.actions))[..., None]
+            found[name] = torch.where(first, found[FORGOT[0]], later)
+        return found
+
+    def shares(self, implants: Implants) -> dict[str, Tensor]:
+        """Of what is done now, so much is done by somebody who forgot."""
+        found, forgets = super().shares(implants), implants[FORGETS]
+        left = found[NOW]
+        for name in FORGOT:
+            found[name] = left * forgets
+            left = left - found[name]
+        return found | {NOW: left}

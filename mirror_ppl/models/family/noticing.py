@@ -1,0 +1,93 @@
+"""People who notice what is in reach with a probability."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.errors import HumanModelError
+from mirror_ppl.models.family.several import NOW, SeveralBeliefs, joined
+from mirror_ppl.models.human import Implants
+from mirror_ppl.models.perception import perceived_by
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.view import View
+
+NOTICES = "notices"
+"""Site of how probably somebody notices at a step what is in reach."""
+MISSED = ("missed 1", "missed 2")
+"""Beliefs of somebody who noticed nothing at this step; and at the one before."""
+UNNOTICED = "unnoticed"
+"""The view of somebody who notices nothing: what they are told, and what they know already."""
+
+
+class Noticing(SeveralBeliefs):
+    """Notices what is in reach with a probability at each step, and else keeps to what is known::
+
+        notices_p ~ Beta(1, 1)
+        zH_t^m    what is believed if nothing was noticed for m steps: 1, or 2 and more
+        a_t       ~ sum_m notices (1 - notices)^m p(a | zH_t^m)
+
+    Who notices again is taken to notice all that is in reach. Messages are always noticed.
+    """
+
+    def __init__(self, self_model: SelfModel) -> None:
+        super().__init__(self_model)
+        if len(self.domain.reach_bins) <= 1:
+            raise HumanModelError(
+                f"noticing: in {self.domain.name} it does not count how far away things are, and "
+                'the model "mirror" says itself when they are noticed'
+            )
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """That of somebody who notices nothing, too."""
+        return (*super().views, UNNOTICED)
+
+    @property
+    def beliefs(self) -> tuple[str, ...]:
+        """Those of somebody who noticed nothing, too."""
+        return (*super().beliefs, *MISSED)
+
+    def prior(self) -> dict[str, Tensor]:
+        """Sample the implants of every person; ``notices`` is how probably they notice."""
+        one = next(self.self_model.parameters()).new_ones(())
+        return super().prior() | {NOTICES: pyro.sample(NOTICES, dist.Beta(one, one))}
+
+    def perceive(
+        self,
+        implants: Implants,
+        knowledge: Any,
+        observation: Observation,
+        told: Visibility,
+        step: int,
+    ) -> tuple[View, Any]:
+        """What a person sees if they notice it, and if not."""
+
+        def nothing(seen: Observation) -> Visibility:
+            return {
+                name: torch.zeros(value.shape[:-1], dtype=torch.bool, device=value.device)
+                for name, value in seen.items()
+                if name != "ego"
+            }
+
+        view, after = super().perceive(implants, knowledge, observation, told, step)
+        missed, _ = perceived_by(nothing, self.domain, implants, knowledge, observation, told)
+        return joined({NOW: view, UNNOTICED: missed}), after
+
+    def after(self, before, evidence, action, still) -> dict[str, Tensor]:
+        """The beliefs after one step, of which nothing was noticed, or of two."""
+        found = super().after(before, evidence, action, still)
+        for name, own in zip(MISSED, (NOW, *MISSED), strict=False):
+            found[name] = self.inferred(before[own], evidence[UNNOTICED], action, still)
+        return found
+
+    def shares(self, implants: Implants) -> dict[str, Tensor]:
+        """Of what is done now, so much is done by somebody who noticed nothing."""
+        found, notices = super().shares(implants), implants[NOTICES]
+        once, more = (found[NOW] * (1 - notices) * part for part in (notices, 1 - notices))
+        return found | {NOW: found[NOW] * notices} | dict(zip(MISSED, (once, more), strict=True))

@@ -1,0 +1,165 @@
+"""People who act on one of several beliefs: with which probability on which is up to them.
+
+The program stays what it is; a belief is several of the robot's, one behind the other::
+
+    zH_t = (zH_t^1, ..., zH_t^N)                             each as the robot would infer it
+    a_t  ~ sum_i w_i(psi) p(a | zH_t^i, psi)                 which one is drawn anew at every step
+
+As which belief somebody acts on at a step is summed out there, nothing has to be inferred of each
+step. Of those at different steps it says that they do not depend on each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Observation
+from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.models.implants import LEAST_PROBABILITY
+from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.models.view import View
+
+NOW = "now"
+"""The name of the belief, and of the view, that people have in the package's own model."""
+DRAWS = 3
+"""Dimensions of a site's values where there are several draws of them: ``[S, P, 1]``."""
+
+
+class SeveralBeliefs(HumanModel):
+    """Acts on one of several beliefs, by chance at every step.
+
+    Derive from it, and say what other :attr:`views` and beliefs there are (:meth:`after`), and how
+    probable it is that they are acted on (:meth:`shares`), each beside what ``super()`` says.
+    """
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views from which beliefs are inferred."""
+        return (NOW,)
+
+    @property
+    def beliefs(self) -> tuple[str, ...]:
+        """Names of the N beliefs."""
+        return (NOW,)
+
+    def after(
+        self,
+        before: Mapping[str, Tensor],
+        evidence: Mapping[str, Tensor],
+        action: Tensor,
+        still: Tensor | None,
+    ) -> dict[str, Tensor]:
+        """Each belief after one step ``[..., Z]``.
+
+        Args:
+            before: those of the step before, ``[..., Z]`` by name.
+            evidence: that of each view, ``[..., H]``.
+            action: what was done in between, and
+            still: where nothing came up, as of :meth:`believe`.
+        """
+        return {NOW: self.inferred(before[NOW], evidence[NOW], action, still)}
+
+    def shares(self, implants: Implants) -> dict[str, Tensor]:
+        """How probably each belief is acted on, ``[..., P, 1]``; they add up to 1."""
+        del implants
+        return {NOW: next(self.self_model.parameters()).new_ones(())}
+
+    @property
+    def belief_size(self) -> int:
+        """Beliefs of the robot's size, one behind the other: ``N Z``."""
+        return len(self.beliefs) * super().belief_size
+
+    def evidence(self, view: View, observation: Observation) -> Tensor:
+        """Of one view behind the other, ``[..., V H]``."""
+        each = parted(view)
+        parts = [
+            super(SeveralBeliefs, self).evidence(each[name], observation) for name in self.views
+        ]
+        return torch.cat(torch.broadcast_tensors(*parts), -1)
+
+    def believe(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
+    ) -> Tensor:
+        """All beliefs after one step."""
+        before = dict(zip(self.beliefs, belief.chunk(len(self.beliefs), -1), strict=True))
+        of_views = dict(zip(self.views, evidence.chunk(len(self.views), -1), strict=True))
+        found = self.after(before, of_views, action, still)
+        return torch.cat([found[name] for name in self.beliefs], -1)
+
+    def inferred(
+        self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None
+    ) -> Tensor:
+        """The belief that the robot would infer of another one ``[..., Z]``."""
+        found = super().believe(belief, evidence, action, still)
+        return found.mean if isinstance(found, Gaussian) else found
+
+    def action_values(self, belief: Tensor) -> Tensor:
+        """Action values ``[..., N A]`` at each of the beliefs."""
+        apart = belief.unflatten(-1, (len(self.beliefs), -1))
+        return super().action_values(apart).flatten(-2)
+
+    def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
+        """Log-probabilities of actions ``[..., P, B, A]``, over all that may be acted on."""
+        number, shares, each = len(self.beliefs), self.shares(implants), []
+        for name, own, worth in zip(
+            self.beliefs, belief.chunk(number, -1), values.chunk(number, -1), strict=True
+        ):
+            each.append(self._acting_on(shares[name], implants, own, worth))
+        found = [part for part in each if part is not None]
+        if len(found) == 1:
+            return found[0]
+        return torch.logsumexp(torch.stack(torch.broadcast_tensors(*found)), 0)
+
+    def _acting_on(
+        self, share: Tensor, implants: Implants, belief: Tensor, values: Tensor
+    ) -> Tensor | None:
+        """``log w_i + log p(a | zH^i)``; ``None`` if nobody ever acts on that belief."""
+        if share.dim() != DRAWS or share.requires_grad:
+            safe = share[..., None].clamp(min=LEAST_PROBABILITY)
+            return torch.log(safe) + super().act(implants, belief, values)
+        # Many of the draws of implants never act on it: that is where the time would go.
+        rows = (share > 0).flatten(1).any(-1).nonzero().squeeze(-1)
+        if not len(rows):
+            return None
+
+        def chosen(value: Tensor) -> Tensor:
+            of_draws = value.dim() >= DRAWS and len(value) == len(share)
+            return value[rows] if of_draws else value
+
+        belief, values = (
+            part[rows] if part.dim() > DRAWS and len(part) == len(share) else part
+            for part in (belief, values)
+        )
+        some = {name: chosen(value) for name, value in implants.items()}
+        found = torch.log(share[rows])[..., None] + super().act(some, belief, values)
+        if len(rows) == len(share):
+            return found
+        everybody = found.new_full((len(share), *found.shape[1:]), -torch.inf)
+        return everybody.index_copy(0, rows, found)
+
+
+def joined(views: Mapping[str, View]) -> View:
+    """Several views as one, which is the first with all masks of the others beside its own."""
+    first = next(iter(views.values()))
+
+    def together(kind: str) -> dict[str, Tensor]:
+        return {
+            name if number == 0 else f"{place}: {name}": value
+            for number, (place, view) in enumerate(views.items())
+            for name, value in getattr(view, kind).items()
+        }
+
+    return View(together("visible"), together("taken"), together("imagined"), first.still)
+
+
+def parted(view: View) -> dict[str, View]:
+    """The views that were joined, by name."""
+    found: dict[str, dict[str, dict[str, Tensor]]] = {}
+    for kind in ("visible", "taken", "imagined"):
+        for name, value in getattr(view, kind).items():
+            place, _, own = name.rpartition(": ")
+            found.setdefault(place or NOW, {}).setdefault(kind, {})[own] = value
+    return {place: View(**parts, still=view.still) for place, parts in found.items()}
