@@ -19,7 +19,7 @@ STUDIES ?= $(patsubst benchmarks/%.py,%,$(sort $(wildcard benchmarks/[a-z]*.py))
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo check test bench results format clean
+.PHONY: help venv demo check test bench results tables format clean
 .DELETE_ON_ERROR:
 
 help: ## List these commands
@@ -60,6 +60,9 @@ results: $(STAMP) ## The paper's comparisons in all domains; hours; results in r
 		$(BIN)/python -m mirror_ppl.evaluate $$study \
 			--domain driving search_rescue bomb_defusal --out runs/results || worst=$$?; \
 	done; exit $$worst
+
+tables: $(STAMP) ## Pages and tables of docs/results.md from the rows in docs/results
+	$(BIN)/python -m benchmarks.tables
 
 format: $(STAMP) ## Sort imports, apply safe fixes, format
 	$(BIN)/ruff check --fix-only .

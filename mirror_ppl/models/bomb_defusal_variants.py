@@ -78,7 +78,7 @@ class BombDefusalHardOfHearing(HardOfHearing, BombDefusalHuman):
 class BombDefusalAnyKind(OneOfKinds, Late, Preferring, BombDefusalHuman):
     """Searches and guesses; of which kind they are is open."""
 
-    kinds = ("mirror", "late", "preferring")
+    family = ("mirror", "late", "preferring")
 
 
 def _everything(observation: Observation) -> Visibility:

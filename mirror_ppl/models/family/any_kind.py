@@ -48,19 +48,19 @@ class OneOfKinds(HumanModel):
     Derive from it and from the models, which differ from the package's own in one respect each.
     """
 
-    kinds: ClassVar[tuple[str, ...]]
+    family: ClassVar[tuple[str, ...]]
     """Names of the models, ``mirror`` first."""
     stratified_by = KIND
 
     @property
     def value_names(self) -> Mapping[str, Sequence[str]]:
         """What the kinds are called."""
-        return {**super().value_names, KIND: self.kinds}
+        return {**super().value_names, KIND: self.family}
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person, of all kinds, and their kind."""
-        other = (1 - USUAL) / (len(self.kinds) - 1)
-        chances = torch.tensor([USUAL, *[other] * (len(self.kinds) - 1)])
+        other = (1 - USUAL) / (len(self.family) - 1)
+        chances = torch.tensor([USUAL, *[other] * (len(self.family) - 1)])
         chances = chances.to(next(self.self_model.parameters()))
         return super().prior() | {KIND: pyro.sample(KIND, dist.Categorical(chances))}
 
@@ -70,11 +70,11 @@ class OneOfKinds(HumanModel):
         for site, value in implants.items():
             kind, usual = SITES.get(PREFERS if site.startswith(PREFERS) else site, ("", 0.0))
             if kind:
-                own[site] = torch.where(implants[KIND] == self.kinds.index(kind), value, usual)
+                own[site] = torch.where(implants[KIND] == self.family.index(kind), value, usual)
         return super().act(own, belief, values)
 
 
 class AnyKind(OneOfKinds, Late, Noticing, Forgetting, Preferring):
     """People of any kind of the family."""
 
-    kinds = (MIRROR, "late", "noticing", "forgetting", "preferring")
+    family = (MIRROR, "late", "noticing", "forgetting", "preferring")

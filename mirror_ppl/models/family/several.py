@@ -118,8 +118,9 @@ class SeveralBeliefs(HumanModel):
     ) -> Tensor | None:
         """``log w_i + log p(a | zH^i)``; ``None`` if nobody ever acts on that belief."""
         if share.dim() != DRAWS or share.requires_grad:
-            safe = share[..., None].clamp(min=LEAST_PROBABILITY)
-            return torch.log(safe) + super().act(implants, belief, values)
+            # The gradient of the logarithm of 0 is no number.
+            safe = share.clamp(min=LEAST_PROBABILITY) if share.requires_grad else share
+            return torch.log(safe)[..., None] + super().act(implants, belief, values)
         # Many of the draws of implants never act on it: that is where the time would go.
         rows = (share > 0).flatten(1).any(-1).nonzero().squeeze(-1)
         if not len(rows):
