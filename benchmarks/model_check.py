@@ -23,7 +23,7 @@ import mirror_ppl
 from mirror_ppl.arviz import az
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.models import HumanModel, Implants
-from mirror_ppl.models.family import KINDS, Late
+from mirror_ppl.models.family import AnyKind, Forgetting, Late
 from mirror_ppl.models.implants import reach, sight_sites
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
@@ -35,8 +35,10 @@ SHOWN = 3
 """People of each kind in the picture."""
 
 
-class Noticing(HumanModel):
-    """What is in reach is noticed half of the time, by chance at every step; to simulate only."""
+class NoticesHalf(HumanModel):
+    """Each thing in reach is noticed half of the time, by chance at every step; not the program of
+    the family, but people as others would write them.
+    """
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """Half of what is in reach."""
@@ -72,7 +74,8 @@ def kinds(self_model: SelfModel) -> dict[str, tuple[HumanModel, dict[str, float]
     return {
         "as modelled": (own, {}),
         "a step late": (Late(self_model), {"late": 0.99}),
-        "notices half": (Noticing(self_model), {}),
+        "notices half": (NoticesHalf(self_model), {}),
+        "mostly forgets": (Forgetting(self_model), {"forgets": 0.8}),
         "dislikes switching": (Staying(self_model), {}),
         "another goal": (OtherGoal(self_model), {}),
         "a fifth at random": (own, {"lapse": 0.2}),
@@ -86,6 +89,7 @@ class Options:
     Attributes:
         seed: of people and rounds.
         people: of each kind.
+        kinds: of people, all unless given.
         human_models: that are fitted.
         out: file for the table; printed alone unless given.
         picture: file for the checks of the first three of each kind.
@@ -93,6 +97,7 @@ class Options:
 
     seed: int = 0
     people: int = 20
+    kinds: tuple[str, ...] = ()
     human_models: tuple[str, ...] = ("mirror", "all")
     out: Path | None = None
     picture: Path | None = None
@@ -114,7 +119,12 @@ def found(fit: mirror_ppl.Fit, truth: Tensor) -> dict[str, float]:
     rates = {"held": held.mean(), "held_of_ok": held[check["verdict"] == "ok"].mean()}
     models = [own["check"].get("models", {}) for own in fit.summary["people"]]
     best = pd.Series([max(one, key=one.__getitem__, default="") for one in models]).value_counts()
-    return {"people": len(held)} | counts | rates | {name: best.get(name, 0) for name in KINDS}
+    return (
+        {"people": len(held)}
+        | counts
+        | rates
+        | {name: best.get(name, 0) for name in AnyKind.family}
+    )
 
 
 def main(options: Options) -> None:
@@ -122,7 +132,9 @@ def main(options: Options) -> None:
     torch.set_num_threads(1)
     self_model, _ = load_self_model(shipped_weights("driving"))
     rows, shown = [], []
-    for kind, (human, known) in kinds(self_model).items():
+    every = kinds(self_model)
+    for kind in options.kinds or every:
+        human, known = every[kind]
         drawn = draw_prior(human, options.people, 1, options.seed)
         implants = {name: value[0] for name, value in drawn.items()}
         implants |= {name: torch.full((options.people, 1), value) for name, value in known.items()}
@@ -133,13 +145,13 @@ def main(options: Options) -> None:
             fit = mirror_ppl.infer(recordings, human=fitted, seed=options.seed, train_rounds=20)
             rows.append({"kind": kind, "human_model": fitted} | found(fit, truth))
             header = len(rows) == 1
+            if options.out is not None:  # so that what is done is kept
+                pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.3f")
             print(pd.DataFrame(rows[-1:]).to_string(index=False, header=header), flush=True)
             if fitted == options.human_models[0]:
                 first = fit.data["model_check"].isel(person=slice(SHOWN))
                 names = [f"{kind} {number + 1}" for number in range(len(first["person"]))]
                 shown.append(first.assign_coords(person=names))
-    if options.out is not None:
-        pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.3f")
     if options.picture is not None:
         joined = az.InferenceData(model_check=xr.concat(shown, "person"))
         options.picture.write_bytes(plot_model_check(joined).content())

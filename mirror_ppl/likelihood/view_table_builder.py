@@ -60,6 +60,8 @@ FEW_ROUNDS = 2
 """So many rounds are gone through as they come."""
 GROWTH = 3
 """With screening, so many times the rounds before are gone through at once, at most."""
+KINDS_MERGE = 32
+"""Policies that tell moments apart where people are of several kinds, of all of them together."""
 PROPOSING_POLICIES = 64
 """Draws from the prior by which attention is proposed where nothing is screened."""
 TEMPERATURE = 4.0
@@ -398,9 +400,9 @@ class ViewTableBuilder:
         return kept, place
 
     def _merging(self, screening: Screening) -> dict[str, Tensor]:
-        """The policies that tell moments apart: as many of each kind of people."""
+        """The policies that tell moments apart: twice as many in all where people are of kinds."""
         kinds = len(self.score) // screening.policies
-        number = kinds * screening.merge_policies
+        number = kinds * (screening.merge_policies if kinds == 1 else KINDS_MERGE // kinds)
         return {name: policy[:number] for name, policy in self.policies.items()}
 
     def _log_likelihoods(

@@ -11,7 +11,7 @@ step. Of those at different steps it says that they do not depend on each other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -21,11 +21,14 @@ from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.implants import LEAST_PROBABILITY
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
 NOW = "now"
 """The name of the belief, and of the view, that people have in the package's own model."""
 DRAWS = 3
 """Dimensions of a site's values where there are several draws of them: ``[S, P, 1]``."""
+MANY_DRAWS = 64
+"""Draws from which on it pays to find out which beliefs are the same."""
 
 
 class SeveralBeliefs(HumanModel):
@@ -103,43 +106,58 @@ class SeveralBeliefs(HumanModel):
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of actions ``[..., P, B, A]``, over all that may be acted on."""
-        number, shares, each = len(self.beliefs), self.shares(implants), []
-        for name, own, worth in zip(
-            self.beliefs, belief.chunk(number, -1), values.chunk(number, -1), strict=True
-        ):
-            each.append(self._acting_on(shares[name], implants, own, worth))
-        found = [part for part in each if part is not None]
-        if len(found) == 1:
-            return found[0]
-        return torch.logsumexp(torch.stack(torch.broadcast_tensors(*found)), 0)
-
-    def _acting_on(
-        self, share: Tensor, implants: Implants, belief: Tensor, values: Tensor
-    ) -> Tensor | None:
-        """``log w_i + log p(a | zH^i)``; ``None`` if nobody ever acts on that belief."""
-        if share.dim() != DRAWS or share.requires_grad:
+        shares = self.shares(implants)
+        parts = [part.chunk(len(self.beliefs), -1) for part in (belief, values)]
+        each = [(shares[name], *own) for name, *own in zip(self.beliefs, *parts, strict=True)]
+        if all(share.dim() == DRAWS and not share.requires_grad for share, *_ in each[1:]):
+            return self._act_of_draws(implants, each)
+        found = []
+        for share, own, worth in each:
             # The gradient of the logarithm of 0 is no number.
             safe = share.clamp(min=LEAST_PROBABILITY) if share.requires_grad else share
-            return torch.log(safe)[..., None] + super().act(implants, belief, values)
-        # Many of the draws of implants never act on it: that is where the time would go.
-        rows = (share > 0).flatten(1).any(-1).nonzero().squeeze(-1)
-        if not len(rows):
-            return None
+            found.append(torch.log(safe)[..., None] + super().act(implants, own, worth))
+        return torch.logsumexp(torch.stack(torch.broadcast_tensors(*found)), 0)
 
-        def chosen(value: Tensor) -> Tensor:
-            of_draws = value.dim() >= DRAWS and len(value) == len(share)
-            return value[rows] if of_draws else value
+    def _act_of_draws(
+        self, implants: Implants, each: Sequence[tuple[Tensor, Tensor, Tensor]]
+    ) -> Tensor:
+        """The same of S draws of implants: of each belief, of those that ever act on it.
 
-        belief, values = (
-            part[rows] if part.dim() > DRAWS and len(part) == len(share) else part
-            for part in (belief, values)
-        )
-        some = {name: chosen(value) for name, value in implants.items()}
-        found = torch.log(share[rows])[..., None] + super().act(some, belief, values)
-        if len(rows) == len(share):
-            return found
-        everybody = found.new_full((len(share), *found.shape[1:]), -torch.inf)
-        return everybody.index_copy(0, rows, found)
+        That is a few of them where draws are of people of several kinds, and it is where the time
+        goes.
+        """
+        number = max(len(share) for share, *_ in each if share.dim())
+        found = None
+        for share, belief, values in each:
+            share = share.expand(number, *each[-1][0].shape[1:])
+            rows = (share > 0).flatten(1).any(-1).nonzero().squeeze(-1)
+            if not len(rows):
+                continue
+            own, place = [belief, values], None
+            if number >= MANY_DRAWS and belief.dim() == DRAWS and len(belief) == 1:
+                # Beliefs that differ together are few one by one.
+                first, place = distinct_rows(as_whole_numbers(belief[0]))
+                own = [part[:, first] for part in own]
+            own = [part[rows] if _is_of(part, number, DRAWS + 1) else part for part in own]
+            some = {
+                name: value[rows] if _is_of(value, number, DRAWS) else value
+                for name, value in implants.items()
+            }
+            part = torch.log(share[rows])[..., None] + super().act(some, own[0], own[1])
+            part = part if place is None else part.index_select(-2, place)
+            if found is None:
+                found = part.new_full((number, *part.shape[1:]), -torch.inf)
+            if len(rows) == number:
+                found = torch.logaddexp(found, part)
+            else:
+                found[rows] = torch.logaddexp(found[rows], part)
+        assert found is not None
+        return found
+
+
+def _is_of(value: Tensor, draws: int, dimensions: int) -> bool:
+    """Whether a value is of so many draws, with at least so many dimensions."""
+    return value.dim() >= dimensions and len(value) == draws
 
 
 def joined(views: Mapping[str, View]) -> View:
