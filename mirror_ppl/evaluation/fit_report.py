@@ -11,9 +11,12 @@ from mirror_ppl.console import console_for_tables
 from mirror_ppl.inference.results.criticism import OK, UNCHECKED
 from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
+from mirror_ppl.models.family import KIND, model_of
 from mirror_ppl.models.implants import NOTICES
 from mirror_ppl.models.loading import MIRROR, model_name
 
+OTHERS = "-"
+"""In the place of implants of another model than the person's."""
 FEW = 20
 """Effective draws below which a pooled posterior is coarse."""
 MOST_DOUBTED = 20
@@ -38,7 +41,8 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     _show_people(
         summary,
         f"What each person {what} and how they decide: {summary['domain']}, {summary['setting']}",
-        "median [90% interval] truth, if known",
+        "median [90% interval] truth, if known"
+        + ("; -: of another model than the most probable one" if KIND in sites else ""),
     )
     _show_predictions(summary["people"])
     people, wrong = summary["people"], summary["contradictions"]
@@ -108,8 +112,11 @@ def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
     """What was inferred of each person."""
     people, newcomer = summary["people"], summary.get("newcomer")
     columns = []
-    for name in people[0]["implants"]:
-        cells = [_cell(person["implants"][name]) for person in people]
+    for name in sorted(people[0]["implants"], key=lambda name: name != KIND):
+        cells = [
+            _cell(person["implants"][name]) if _is_own(name, person) else OTHERS
+            for person in people
+        ]
         if newcomer is not None:
             cells.append(_cell(newcomer[name] | {"truth": None}))
         columns.append([name.replace("sight_", "").replace("_", " "), *cells])
@@ -117,6 +124,12 @@ def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
     if newcomer is not None:
         who.append("newcomer")
     _show_blocks(title, who, columns, caption, None if newcomer is None else len(people))
+
+
+def _is_own(site: str, person: dict[str, Any]) -> bool:
+    """Whether a site is not one of a model that is less probable of a person than another."""
+    kind = person["implants"].get(KIND, {}).get("most_probable")
+    return kind is None or model_of(site) in ("", kind)
 
 
 def _show_blocks(

@@ -58,9 +58,11 @@ ACTIONS = {
     "policy-only": CHOICE | RESIDUAL,
     "no-implants": CHOICE,
     "late": CHOICE | RESIDUAL | {"late"},
+    "noticing": CHOICE | RESIDUAL | {"notices"},
+    "forgetting": CHOICE | RESIDUAL | {"forgets"},
     "preferring": CHOICE | RESIDUAL,
     "hard-of-hearing": CHOICE | RESIDUAL,
-    "all": CHOICE | RESIDUAL | {"late", "kind"},
+    "all": CHOICE | RESIDUAL | {"late", "notices", "forgets", "kind"},
 }
 KNOWING = ("mirror", "policy-only", "late", "preferring", "hard-of-hearing", "all")
 BELIEVED = {("bomb_defusal", name): RULES for name in KNOWING}
@@ -72,11 +74,13 @@ def robots():
     return {name: SelfModel(get_domain(name)) for name in WORLD_NAMES}
 
 
+NOT_IN_BOMBS = ("one-radius", "noticing", "forgetting")
+"""Models of how far away things are."""
 WORLDS = [
     (world, name)
     for world in WORLD_NAMES
     for name in VARIANTS
-    if (world, name) != ("bomb_defusal", "one-radius")
+    if (world, name) not in {("bomb_defusal", own) for own in NOT_IN_BOMBS}
 ]
 
 
@@ -91,7 +95,10 @@ def test_shipped_models_depend_on_what_is_written_in_them(world, name, robots):
     assert with_parents(found.prior) == prior
     assert with_parents(found.round_latents) == latents
     preferred = {"shares_goal", *human.preferences} if isinstance(human, Preferring) else set()
-    assert found.actions == ACTIONS[name] | BELIEVED.get((world, name), set()) | preferred
+    expected = ACTIONS[name] | BELIEVED.get((world, name), set()) | preferred
+    if world == "bomb_defusal":
+        expected -= {"notices", "forgets"}
+    assert found.actions == expected
     assert bool(found.round_latents) == human.has_round_latents
     # What follows for engines.
     read = perceived_sites(human)

@@ -41,8 +41,8 @@ def test_variants_keep_the_contract(self_model, name):
     human = load_human_model(name, self_model)
     check_contract(human)
     assert human.domain.name == "driving"
-    beliefs = 2 if name in ("late", "all") else 1  # that of the step before, too
-    assert human.belief_size == beliefs * self_model.latent
+    beliefs = {"late": 2, "noticing": 3, "forgetting": 4, "all": 7}
+    assert human.belief_size == beliefs.get(name, 1) * self_model.latent
 
 
 def test_the_sites_of_each(self_model):
@@ -57,14 +57,16 @@ def test_the_sites_of_each(self_model):
         "policy-only": POLICY,
         "no-implants": choice,
         "late": sights | assumed | POLICY | {"late"},
+        "noticing": sights | assumed | POLICY | {"notices"},
+        "forgetting": sights | assumed | POLICY | {"forgets"},
         "preferring": sights | assumed | POLICY | PREFERENCES,
         "hard-of-hearing": sights | assumed | POLICY | {"hears_visual", "hears_verbal"},
-        "all": sights | assumed | POLICY | PREFERENCES | {"late", "kind"},
+        "all": sights | assumed | POLICY | PREFERENCES | {"late", "notices", "forgets", "kind"},
     }
     found = {name: set(sample_sites(VARIANTS[name](self_model), 1)) for name in VARIANTS}
     assert found == expected
     read = {name: len(perceived_sites(VARIANTS[name](self_model))) for name in VARIANTS}
-    assert list(read.values()) == [6, 3, 2, 6, 0, 0, 6, 6, 8, 6]
+    assert list(read.values()) == [6, 3, 2, 6, 0, 0, 6, 6, 6, 6, 8, 6]
 
 
 def scores(human, rounds, policy, combinations=None):

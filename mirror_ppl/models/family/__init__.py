@@ -3,7 +3,7 @@
 Each is a file of its own, to fit, simulate and calibrate; :class:`AnyKind` is all of them at once.
 """
 
-from mirror_ppl.models.family.any_kind import KIND, AnyKind, OneOfKinds
+from mirror_ppl.models.family.any_kind import KIND, AnyKind, OneOfKinds, model_of
 from mirror_ppl.models.family.forgetting import FORGETS, Forgetting
 from mirror_ppl.models.family.hearing import HEARS, HardOfHearing
 from mirror_ppl.models.family.late import LATE, Late
@@ -27,4 +27,5 @@ __all__ = [
     "OneOfKinds",
     "Preferring",
     "SeveralBeliefs",
+    "model_of",
 ]

@@ -42,6 +42,11 @@ SITES = {
 which it is the package's own."""
 
 
+def model_of(site: str) -> str:
+    """The model of the family that adds a site; none, an empty name, if they share it."""
+    return SITES.get(PREFERS if site.startswith(PREFERS) else site, ("", 0.0))[0]
+
+
 class OneOfKinds(HumanModel):
     """People whose kind is unknown: it is inferred together with the other implants.
 
@@ -68,8 +73,8 @@ class OneOfKinds(HumanModel):
         """Log-probabilities of actions ``[..., P, B, A]``, as their kind has it."""
         own = dict(implants)
         for site, value in implants.items():
-            kind, usual = SITES.get(PREFERS if site.startswith(PREFERS) else site, ("", 0.0))
-            if kind:
+            if kind := model_of(site):
+                _, usual = SITES[PREFERS if site.startswith(PREFERS) else site]
                 own[site] = torch.where(implants[KIND] == self.family.index(kind), value, usual)
         return super().act(own, belief, values)
 
