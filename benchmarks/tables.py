@@ -2,19 +2,20 @@
 
     python -m benchmarks.tables
 
-Reads ``docs/results/<world>_<study>.csv``, which `python -m mirror_ppl.evaluate` wrote, and writes
-the page and the picture of each, and the tables in docs/results.md between the lines
+Reads ``docs/results/<world>_prediction.csv`` and ``..._assistance.csv``, rows that `python -m
+mirror_ppl.evaluate` wrote, and writes the page and the picture of each (and of relevance, which is
+in the rows of assistance), and the tables in docs/results.md between the lines
 ``<!-- <world> <study> -->`` and ``<!-- end -->``. The same rows give the same pages.
 """
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import pandas as pd
-
+from mirror_ppl.evaluation.assistance import REFERENCES
 from mirror_ppl.evaluation.study_report import REPORTS, difference
 from mirror_ppl.evaluation.study_summary import (
     POOLED,
@@ -29,36 +30,60 @@ from mirror_ppl.evaluation.tables import Rows, page
 
 DOCS = Path(__file__).parents[1] / "docs"
 RESULTS = DOCS / "results"
+WORDS, WHOLE = ("domain", "setting", "population", "person", "model"), ("seed", "rounds")
+"""Columns that are no numbers, and that are whole ones."""
 BLOCK = re.compile(r"<!-- (\w+) (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
 def rows_of(path: Path) -> Rows:
-    """Rows of a study, numbers as numbers; what a row lacks is left out."""
-    table = pd.read_csv(path, float_precision="round_trip", dtype={"person": str})
-    return [
-        {name: value for name, value in row.items() if not pd.isna(value)} | _floor(row)
-        for row in table.to_dict("records")
-    ]
+    """Rows of a study; what a row lacks is left out, but for people's entropy, which is unknown."""
+    with path.open(newline="") as file:
+        return [
+            {name: _value(name, text) for name, text in row.items() if text or name == "floor"}
+            for row in csv.DictReader(file)
+        ]
 
 
-def _floor(row: dict) -> dict:
-    """The person's own entropy is unknown of some: that is no number, and still a column."""
-    return {"floor": None} if "floor" in row and pd.isna(row["floor"]) else {}
+def _value(name: str, text: str) -> str | int | float | None:
+    if name in WORDS:
+        return text
+    if name in WHOLE or name.startswith("items_"):
+        return int(text)
+    return float(text) if text else None
 
 
-def study_page(path: Path) -> str:
+def studies() -> dict[str, Rows]:
+    """Rows of each study that is kept, by the name of its page."""
+    found = {}
+    for path in sorted(RESULTS.glob("*_prediction.csv")):
+        found[path.stem] = rows_of(path)
+    for path in sorted(RESULTS.glob("*_assistance.csv")):
+        rows = found[path.stem] = rows_of(path)
+        most = max(row["rounds"] for row in rows)
+        last = [row for row in rows if row["rounds"] == most or row["model"] in REFERENCES]
+        found[path.stem.replace("assistance", "relevance")] = last
+    return found
+
+
+def study_page(name: str, rows: Rows) -> str:
     """The page of a study, from its rows."""
-    report = REPORTS[path.stem.rpartition("_")[2]](rows_of(path))
-    return page(report.sentences, report.tables)
+    world, _, study = name.rpartition("_")
+    kept = name.replace("relevance", "assistance")
+    report = REPORTS[study](rows)
+    return (
+        f"# {world.replace('_', ' ').capitalize()}: {study}\n\n"
+        f"Made by `make tables` from [its rows]({kept}.csv); what it means stands on [the page of "
+        f"results](../results.md).\n\n{page(report.sentences, report.tables)}"
+    )
 
 
 def results_page(text: str) -> str:
     """docs/results.md with the tables of all studies whose rows are kept."""
+    kept = studies()
 
     def block(found: re.Match[str]) -> str:
         world, study = found.groups()
-        lines = TABLES[study](rows_of(RESULTS / f"{world}_{study}.csv"))
-        return f"<!-- {world} {study} -->\n{lines}\n<!-- end -->"
+        return f"<!-- {world} {study} -->\n{TABLES[study](kept[f'{world}_{study}'])}\n<!-- end -->"
 
     return BLOCK.sub(block, text)
 
@@ -156,15 +181,15 @@ TABLES = {"prediction": _prediction, "assistance": _assistance}
 
 def main() -> None:
     """Write all of them."""
-    for path in sorted(RESULTS.glob("*.csv")):
-        if path.stem.rpartition("_")[2] in REPORTS:
-            path.with_suffix(".md").write_text(study_page(path))
-            report = REPORTS[path.stem.rpartition("_")[2]](rows_of(path))
-            path.with_suffix(".png").write_bytes(report.picture.content())
-            print(f"{path.with_suffix('.md')}: from {path.name}")
+    for name, rows in studies().items():
+        path = RESULTS / f"{name}.md"
+        path.write_text(study_page(name, rows))
+        picture = REPORTS[name.rpartition("_")[2]](rows).picture
+        path.with_suffix(".png").write_bytes(picture.content())
+        print(path)
     own = DOCS / "results.md"
     own.write_text(results_page(own.read_text()))
-    print(f"{own}: its tables")
+    print(own)
 
 
 if __name__ == "__main__":

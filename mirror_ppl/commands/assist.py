@@ -68,6 +68,9 @@ class Options:
     enumerate_above: float | None = None
     """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
     course a draw; 0.1 in driving and 0.4 in the other domains unless given."""
+    hears: float = 0.9
+    """Probability that messages of a channel reach a person, before anything was told: what they do
+    after messages tells. 1 takes it for granted."""
     kl_weight: float = 1.0
     """Units of reward that mirror-kl gives for a nat."""
     kl_measure: str = "kl"
@@ -103,6 +106,8 @@ class Options:
             raise OptionError(
                 f"--min-standard-errors must be at least 0, not {self.min_standard_errors}"
             )
+        if not 0 < self.hears <= 1:
+            raise OptionError(f"--hears must be above 0 and at most 1, not {self.hears}")
         if not 0 < self.kl_weight < math.inf:
             raise OptionError(f"--kl-weight must be a positive number, not {self.kl_weight}")
         if self.kl_measure not in ("kl", "squared"):
@@ -169,6 +174,7 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
         enumerate_above=options.enumerate_above,
         patience=options.patience,
         min_standard_errors=options.min_standard_errors,
+        hears=options.hears,
         kl_weight=options.kl_weight,
         kl_measure=options.kl_measure,
     )
