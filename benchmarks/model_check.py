@@ -123,7 +123,7 @@ def found(fit: mirror_ppl.Fit, truth: Tensor) -> dict[str, float]:
         {"people": len(held)}
         | counts
         | rates
-        | {name: best.get(name, 0) for name in AnyKind.family}
+        | {name: best.get(name, 0) for name in AnyKind.members}
     )
 
 

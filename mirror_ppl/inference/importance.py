@@ -9,6 +9,7 @@ import torch
 
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.engine import Engine, Inferred, Job
+from mirror_ppl.inference.kinds import infer_kinds, models_by_kind
 from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
 from mirror_ppl.likelihood.densities import adds_to_prior
@@ -32,9 +33,12 @@ def infer_by_importance(
         first_pass: weighted draws of what the rounds of a person say, and which engine they are
             from; adaptive importance sampling unless given.
     """
+    estimated = has_evidence(job.human) and not job.rounds.measurements
+    models = models_by_kind(job.human) if first_pass is None and estimated else {}
+    if models:
+        return infer_kinds(job, models, infer_by_importance)
     first_pass = first_pass or _by_importance
     people, found, drawn = job.rounds.num_people, [], []
-    estimated = has_evidence(job.human) and not job.rounds.measurements
     with torch.random.fork_rng(devices=[]):
         builders = person_builders(job.human, job.rounds, job.screening)
         for person in range(people):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import torch
 from torch import Tensor
 
@@ -78,7 +80,13 @@ class BombDefusalHardOfHearing(HardOfHearing, BombDefusalHuman):
 class BombDefusalAnyKind(OneOfKinds, Late, Preferring, BombDefusalHuman):
     """Searches and guesses; of which kind they are is open."""
 
-    family = ("mirror", "late", "preferring")
+    members = MappingProxyType(
+        {
+            "mirror": BombDefusalHuman,
+            "late": BombDefusalLate,
+            "preferring": BombDefusalPreferring,
+        }
+    )
 
 
 def _everything(observation: Observation) -> Visibility:

@@ -42,7 +42,7 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds, simulate_from_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
-KINDS = AnyKind.family
+KINDS = tuple(AnyKind.members)
 WORLDS = ("driving", "search_rescue", "bomb_defusal")
 
 
@@ -68,7 +68,7 @@ def chances(human, implants, belief):
     [
         (world, kind)
         for world in WORLDS
-        for kind in (BombDefusalAnyKind if world == "bomb_defusal" else AnyKind).family
+        for kind in (BombDefusalAnyKind if world == "bomb_defusal" else AnyKind).members
     ],
 )
 def test_of_each_kind_all_is_that_model(world, kind):

@@ -12,6 +12,7 @@ Implants of the other models keep their prior.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import ClassVar
 
 import pyro
@@ -53,9 +54,14 @@ class OneOfKinds(HumanModel):
     Derive from it and from the models, which differ from the package's own in one respect each.
     """
 
-    family: ClassVar[tuple[str, ...]]
-    """Names of the models, ``mirror`` first."""
+    members: ClassVar[Mapping[str, type[HumanModel]]]
+    """The models by name, ``mirror`` first."""
     stratified_by = KIND
+
+    @property
+    def family(self) -> tuple[str, ...]:
+        """Names of the models."""
+        return tuple(self.members)
 
     @property
     def value_names(self) -> Mapping[str, Sequence[str]]:
@@ -82,4 +88,12 @@ class OneOfKinds(HumanModel):
 class AnyKind(OneOfKinds, Late, Noticing, Forgetting, Preferring):
     """People of any kind of the family."""
 
-    family = (MIRROR, "late", "noticing", "forgetting", "preferring")
+    members = MappingProxyType(
+        {
+            MIRROR: HumanModel,
+            "late": Late,
+            "noticing": Noticing,
+            "forgetting": Forgetting,
+            "preferring": Preferring,
+        }
+    )

@@ -1,0 +1,97 @@
+"""People of several kinds, each kind inferred by its own human model: Bayesian model averaging.
+
+The program of :class:`mirror_ppl.models.family.OneOfKinds` has a site for the kind, on which no
+other site of the prior depends, and implants of other kinds do not matter to what somebody does.
+So its posterior is exactly a mixture of the posteriors of the models by themselves::
+
+    p(kind | rounds)        ~  p(kind) p(rounds | kind)
+    p(implants | rounds)    =  sum_kind p(kind | rounds) p(implants | kind, rounds)
+
+in which implants of other kinds have their prior. Each model has fewer beliefs than all together,
+and its proposal is adapted to it alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.inference.engine import Inferred, Job
+from mirror_ppl.models.family import KIND, OneOfKinds
+from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.prior import draw_prior, sample_sites
+
+LITTLE = 0.01
+"""Probability of a kind up to which it does not matter how well it was inferred."""
+
+
+def models_by_kind(human: HumanModel) -> dict[str, HumanModel]:
+    """The human models of the kinds of people; none of a model that adds something of its own."""
+    own = isinstance(human, OneOfKinds) and "members" in vars(type(human))
+    if not own or {name for name in vars(human) if callable(getattr(type(human), name, None))}:
+        return {}
+    found = {}
+    for name, kind in human.members.items():
+        # With whatever the model has learned of the world.
+        found[name] = copy(human)
+        found[name].__class__ = kind
+    return found
+
+
+def infer_kinds(
+    job: Job, models: dict[str, HumanModel], infer: Callable[[Job], Inferred]
+) -> Inferred:
+    """Infer people by each model, and mix what was found by how probable each is of a person.
+
+    Args:
+        job: what to infer.
+        models: of the kinds.
+        infer: infers by one of them, and estimates evidences.
+    """
+    people = job.rounds.num_people
+    found = [infer(replace(job, human=model)) for model in models.values()]
+    with torch.random.fork_rng(devices=[]):
+        chances = sample_sites(job.human, 1)[KIND]["fn"].probs.flatten()
+    evidences = torch.stack([_evidence(one) for one in found], -1)  # [P, K]
+    log_joint = evidences + chances.log().to(evidences)
+    shares = log_joint.softmax(-1)
+    drawn = []
+    for person in range(people):
+        seed = (job.seed + 1) * 1_000_003 + job.first + person
+        own = draw_prior(job.human, 1, job.draws, seed % 2**32)
+        own[KIND] = _kinds(shares[person], job.draws, seed).view(-1, 1, 1).to(own[KIND])
+        for kind, one in enumerate(found):
+            rows = (own[KIND].flatten() == kind).nonzero().squeeze(-1)
+            for site, value in one.draws.items():
+                own[site][rows] = value[rows, person : person + 1].to(own[site])
+        drawn.append(own)
+    joined = {name: torch.cat([own[name] for own in drawn], 1) for name in drawn[0]}
+    weights = torch.stack([_pareto(one) for one in found], -1)
+    return Inferred(
+        joined,
+        weights.masked_fill(shares < LITTLE, -torch.inf).amax(-1),
+        log_joint.logsumexp(-1),
+        engines=found[0].engines,
+    )
+
+
+def _evidence(found: Inferred) -> Tensor:
+    assert found.log_evidence is not None
+    return found.log_evidence.double()
+
+
+def _pareto(found: Inferred) -> Tensor:
+    assert found.pareto_k is not None
+    return found.pareto_k
+
+
+def _kinds(shares: Tensor, number: int, seed: int) -> Tensor:
+    """So many kinds, each as often as it is probable, in any order."""
+    generator = torch.Generator().manual_seed(seed)
+    ladder = (torch.arange(number) + torch.rand((), generator=generator)) / number
+    kinds = torch.searchsorted(shares.cpu().cumsum(0), ladder.double()).clamp(max=len(shares) - 1)
+    return kinds[torch.randperm(number, generator=generator)]

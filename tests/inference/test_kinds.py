@@ -1,0 +1,71 @@
+"""People of several kinds: a mixture of what each model says by itself."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mirror_ppl.inference import importance
+from mirror_ppl.inference.engine import Job
+from mirror_ppl.inference.kinds import models_by_kind
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.models.family import KIND, LATE, AnyKind, Late
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.simulation import simulate_from_prior
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+
+@pytest.fixture(scope="module")
+def job():
+    human = AnyKind(load_self_model(shipped_weights("driving"), "driving")[0])
+    rounds = simulate_from_prior(human, 1, 2, "fog", 100)
+    return Job(human, rounds, 200, importance.ImportanceOptions(), 1, Screening())
+
+
+def test_kinds_are_weighed_by_evidence_and_implants_are_those_of_each(job):
+    """Systematic draws: of 200 as many as the probability says, to within one."""
+    models = models_by_kind(job.human)
+    alone = {
+        name: importance.infer_by_importance(replace(job, human=model))
+        for name, model in models.items()
+    }
+    found = importance.infer_by_importance(job)
+    evidence = torch.stack([one.log_evidence for one in alone.values()], -1).double()  # pyright: ignore
+    prior = torch.tensor([0.6, 0.1, 0.1, 0.1, 0.1], dtype=torch.double)
+    joint = evidence + prior.log()
+    torch.testing.assert_close(found.log_evidence, joint.logsumexp(-1), atol=1e-6, rtol=1e-6)
+    for person, shares in enumerate(joint.softmax(-1)):
+        kinds = found.draws[KIND][:, person].flatten()
+        often = torch.bincount(kinds, minlength=5)
+        assert (often - 200 * shares).abs().max() < 1.01
+        for kind, own in enumerate(alone.values()):
+            rows = kinds == kind
+            for site, value in own.draws.items():
+                torch.testing.assert_close(
+                    found.draws[site][rows, person], value[rows, person], rtol=0, atol=0
+                )
+        # Lateness of those who are of another kind is as before: Beta(4, 1) has the mean .8 and
+        # the standard deviation .163.
+        others = found.draws[LATE][kinds != 1, person]
+        assert abs(float(others.mean()) - 0.8) < 4 * 0.163 / len(others) ** 0.5
+
+
+def test_each_kind_is_its_model_with_what_was_learned_of_the_world():
+    robot, _ = load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")
+    human = load_human_model("all", robot)
+    human.rule_logits = torch.arange(3)  # pyright: ignore[reportAttributeAccessIssue]
+    models = models_by_kind(human)
+    assert {name: type(one) for name, one in models.items()} == dict(human.members)  # pyright: ignore
+    assert all(one.rule_logits is human.rule_logits for one in models.values())  # pyright: ignore
+
+
+def test_what_adds_something_of_its_own_is_inferred_as_one_program(job):
+    class More(AnyKind):
+        def prior(self):
+            return super().prior()
+
+    assert models_by_kind(More(job.human.self_model)) == {}
+    assert models_by_kind(Late(job.human.self_model)) == {}
+    changed = AnyKind(job.human.self_model)
+    object.__setattr__(changed, "prior", job.human.prior)
+    assert models_by_kind(changed) == {}
