@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -24,6 +25,7 @@ from mirror_ppl.inference.engine import Inferred, Job
 from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior, sample_sites
+from mirror_ppl.progress import Report
 
 LITTLE = 0.01
 """Probability of a kind up to which it does not matter how well it was inferred."""
@@ -53,7 +55,11 @@ def infer_kinds(
         infer: infers by one of them, and estimates evidences.
     """
     people = job.rounds.num_people
-    found = [infer(replace(job, human=model)) for model in models.values()]
+    found = []
+    for place, model in enumerate(models.values()):
+        # Each person as often as there are models, so that progress goes one way.
+        report = partial(_report, job.report, place, len(models))
+        found.append(infer(replace(job, human=model, report=report)))
     with torch.random.fork_rng(devices=[]):
         chances = sample_sites(job.human, 1)[KIND]["fn"].probs.flatten()
     evidences = torch.stack([_evidence(one) for one in found], -1)  # [P, K]
@@ -77,6 +83,12 @@ def infer_kinds(
         log_joint.logsumexp(-1),
         engines=found[0].engines,
     )
+
+
+def _report(
+    report: Report, place: int, models: int, what: str, done: int, of: int, unit: str
+) -> None:
+    report(what, place * of + done, models * of, unit)
 
 
 def _evidence(found: Inferred) -> Tensor:

@@ -7,10 +7,10 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_models import SHIPPED
 from pyro import poutine
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.domains import DOMAINS
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.sampler import Sampler
@@ -46,7 +46,7 @@ def rounds():
 
 @pytest.mark.parametrize(
     ("world", "name"),
-    [(w, n) for w in DOMAINS for n in VARIANTS if (w, n) != ("bomb_defusal", "one-radius")],
+    SHIPPED,
 )
 def test_models_that_ship_agree(world, name):
     check_agreement(load_human_model(name, load_self_model(shipped_weights(world))[0]))

@@ -10,6 +10,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_models import SHIPPED
 from example_programs import ENUMERATED, PROGRAMS
 from pyro import poutine
 from pyro.infer import TraceEnum_ELBO, config_enumerate
@@ -24,7 +25,6 @@ from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
-from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 STEPS = {"driving": 3, "search_rescue": 3, "bomb_defusal": 4}
@@ -32,12 +32,6 @@ STEPS = {"driving": 3, "search_rescue": 3, "bomb_defusal": 4}
 HORIZONS = {("search_rescue", "per-item"): 1, ("bomb_defusal", "per-item"): 2}
 """Where that of the longest round would be too much to go through: nine and six items, each of
 which is noticed at one of so many steps or never."""
-SHIPPED = [
-    (world, name)
-    for world in STEPS
-    for name in VARIANTS
-    if (world, name) != ("bomb_defusal", "one-radius")  # refused: distances do not count there
-]
 DRAWS = 2
 
 

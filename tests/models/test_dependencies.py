@@ -7,6 +7,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_models import SHIPPED
 from example_person import self_model
 from paths import EXAMPLES
 
@@ -28,7 +29,6 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import scalar_sites
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.toy import ToyHuman, toy_posterior
-from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.people import simulate
 
 sys.path.insert(0, str(EXAMPLES))
@@ -74,17 +74,7 @@ def robots():
     return {name: SelfModel(get_domain(name)) for name in WORLD_NAMES}
 
 
-NOT_IN_BOMBS = ("one-radius", "noticing", "forgetting")
-"""Models of how far away things are."""
-WORLDS = [
-    (world, name)
-    for world in WORLD_NAMES
-    for name in VARIANTS
-    if (world, name) not in {("bomb_defusal", own) for own in NOT_IN_BOMBS}
-]
-
-
-@pytest.mark.parametrize(("world", "name"), WORLDS)
+@pytest.mark.parametrize(("world", "name"), SHIPPED)
 def test_shipped_models_depend_on_what_is_written_in_them(world, name, robots):
     human = load_human_model(name, robots[world])
     prior, latents = PARENTS.get((world, name), ({}, {}))

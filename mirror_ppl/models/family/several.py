@@ -101,11 +101,12 @@ class SeveralBeliefs(HumanModel):
 
     def action_values(self, belief: Tensor) -> Tensor:
         """Action values ``[..., N A]`` at each of the beliefs."""
-        apart = belief.unflatten(-1, (len(self.beliefs), -1))
+        number = len(self.beliefs)
+        apart = belief.unflatten(-1, (number, belief.shape[-1] // number))
         rows = apart.flatten(0, -2)
         first, place = distinct_rows(as_whole_numbers(rows.detach()))
         values = super().action_values(rows[first])[place]
-        return values.view(*apart.shape[:-1], -1).flatten(-2)
+        return values.view(*apart.shape[:-1], values.shape[-1]).flatten(-2)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Log-probabilities of actions ``[..., P, B, A]``, over all that may be acted on."""
