@@ -33,8 +33,9 @@ LITTLE = 0.01
 
 def models_by_kind(human: HumanModel) -> dict[str, HumanModel]:
     """The human models of the kinds of people; none of a model that adds something of its own."""
-    own = isinstance(human, OneOfKinds) and "members" in vars(type(human))
-    if not own or {name for name in vars(human) if callable(getattr(type(human), name, None))}:
+    if not isinstance(human, OneOfKinds) or "members" not in vars(type(human)):
+        return {}
+    if any(callable(getattr(type(human), name, None)) for name in vars(human)):
         return {}
     found = {}
     for name, kind in human.members.items():
