@@ -244,6 +244,8 @@ def test_posteriors_of_something_else_are_refused(posterior, tmp_path, capsys, a
         (("--discount", "nan"), "--discount must be above 0 and at most 1, not nan"),
         (("--enumerate-above", "-1"), "--enumerate-above must be from 0 to 1, not -1.0"),
         (("--min-standard-errors", "-1"), "--min-standard-errors must be at least 0, not -1.0"),
+        (("--hears", "0"), "--hears must be above 0 and at most 1, not 0.0"),
+        (("--hears", "1.5"), "--hears must be above 0 and at most 1, not 1.5"),
         (("--kl-weight", "0"), "--kl-weight must be a positive number, not 0.0"),
         (("--kl-weight", "inf"), "--kl-weight must be a positive number, not inf"),
         (("--seed", "-1"), "--seed must be at least 0, not -1"),
