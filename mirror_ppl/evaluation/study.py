@@ -16,7 +16,7 @@ import torch
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.evaluation.assistance import REFERENCES, PlannerOptions, play, speaker
-from mirror_ppl.evaluation.learned import Plannable
+from mirror_ppl.evaluation.learned import Plannable, Trained
 from mirror_ppl.evaluation.learners import (
     ALSO_PLANNABLE,
     ASKED_FOR,
@@ -127,7 +127,9 @@ def assist(cell: Assistance) -> Rows:
     group, learned = cell.group, None
     if cell.model not in REFERENCES:
         learned = cast(Plannable, learn(cell.model, group, cell.rounds, group.seed, MEMBERS))
-    options, rows = PlannerOptions.of(group.domain), []
+    # Networks learn from recordings whether people react to messages, and get no more to find out.
+    taken_for_granted = 1.0 if isinstance(learned, Trained) else None
+    options, rows = PlannerOptions.of(group.domain, hears=taken_for_granted), []
     for number, listener in enumerate(group.listeners(cell.played)):
         if learned is not None:
             listener = replace(listener, person=learned.person(number, cell.draws))

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from mirror_ppl.communication.hearing import HearingPerson, hearing
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.planners import PlannerOptions
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import get_domain
+from mirror_ppl.evaluation import study
+from mirror_ppl.evaluation.assistance import speaker
 from mirror_ppl.evaluation.learners import TEST, VALIDATION, Group, learn
 from mirror_ppl.evaluation.reachable_oracle import _small_messages
 from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
@@ -98,6 +101,20 @@ def test_net_returns_are_less_the_cost_of_messages_the_oracles_too():
     }
     expected = (net["nearest"] - net["none"]) / (net["oracle"] - net["none"])
     assert way.share is not None and way.share.mean == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("name", "asks"), [("bc", False), ("no-implants", True)])
+def test_planners_of_networks_find_out_nothing_about_hearing(name, asks, monkeypatch):
+    """As the page of the communicator says; human models ask, with the usual probability."""
+    people = []
+
+    def nobody_speaks(objective, listener, options, seed):
+        people.append(hearing(listener.person, options.hears))
+        return speaker("none", listener, options, seed)
+
+    monkeypatch.setattr(study, "speaker", nobody_speaks)
+    assist(Assistance(GROUP, name, 1, 1, 4))
+    assert [isinstance(one, HearingPerson) for one in people] == [asks, asks]
 
 
 @pytest.mark.parametrize("name", ["search_rescue", "bomb_defusal"])
