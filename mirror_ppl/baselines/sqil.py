@@ -145,10 +145,10 @@ class SoftQ(RecurrentNetworks):
         inputs, actions = [], []
         for _ in range(domain.horizon):
             observation = domain.observe(state)
-            seen = self.visible(setting, observation)
-            heard = {name: torch.zeros_like(mask) for name, mask in seen.items()}
+            can_be = domain.communicable(observation)
+            heard = {name: torch.zeros_like(may) for name, may in can_be.items()}
             if told is not None and told.any():
-                for name, may in domain.communicable(observation).items():
+                for name, may in can_be.items():
                     luck = [torch.rand(may.shape[1:], generator=own) for own in generators]
                     heard[name] = may & (torch.stack(luck) < told[:, None, None])
             seen, heard, knowledge = look(

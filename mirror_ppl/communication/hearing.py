@@ -12,7 +12,6 @@ far. What these rounds say of the other implants is left to the next fit.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from copy import copy
 from itertools import product
@@ -61,7 +60,7 @@ class HearingPerson(Person):
         """The person in a round under way, with what reaches them as their actions tell it."""
         found = copy(self)
         found._take(self._drawn(self._after(past)))
-        return Person.in_round(found, past)
+        return super(HearingPerson, found).in_round(past)
 
     @torch.no_grad()
     def after(self, past: RoundSoFar) -> HearingPerson:
@@ -121,8 +120,8 @@ def hearing(person: Person, hears: float) -> Person:
         person: the person.
         hears: see :class:`HearingPerson`.
     """
-    known = hears >= 1 - math.ulp(1.0) and not isinstance(person.human, HardOfHearing)
-    if known or isinstance(person, HearingPerson) or not person.human.domain.modalities:
+    known = hears == 1.0 and not isinstance(person.human, HardOfHearing)
+    if known or isinstance(person, HearingPerson):
         return person
     return HearingPerson(person.human, person.draws, hears)
 

@@ -402,7 +402,7 @@ class ViewTableBuilder:
     def _merging(self, screening: Screening) -> dict[str, Tensor]:
         """The policies that tell moments apart: twice as many in all where people are of kinds."""
         kinds = len(self.score) // screening.policies
-        number = kinds * (screening.merge_policies if kinds == 1 else KINDS_MERGE // kinds)
+        number = kinds * (screening.merge_policies if kinds == 1 else max(1, KINDS_MERGE // kinds))
         return {name: policy[:number] for name, policy in self.policies.items()}
 
     def _log_likelihoods(

@@ -51,7 +51,8 @@ class View:
         def stacked(parts: Sequence[Mapping[str, Tensor]], behind: int) -> dict[str, Tensor]:
             return {
                 name: joined(
-                    [part[name] for part in parts], -2 if name.endswith("ego") else -1 - behind
+                    [part[name] for part in parts],
+                    -2 if name.rpartition(": ")[2] == "ego" else -1 - behind,
                 )
                 for name in parts[0]
             }

@@ -113,7 +113,9 @@ class SeveralBeliefs(HumanModel):
         shares = self.shares(implants)
         parts = [part.chunk(len(self.beliefs), -1) for part in (belief, values)]
         each = [(shares[name], *own) for name, *own in zip(self.beliefs, *parts, strict=True)]
-        if all(share.dim() == DRAWS and not share.requires_grad for share, *_ in each[1:]):
+        if each[1:] and all(
+            share.dim() == DRAWS and not share.requires_grad for share, *_ in each[1:]
+        ):
             return self._act_of_draws(implants, each)
         found = []
         for share, own, worth in each:
