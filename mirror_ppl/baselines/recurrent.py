@@ -24,10 +24,9 @@ from mirror_ppl.baselines.inputs import (
     each_step,
     input_size,
     recorded_inputs,
-    visible_items,
 )
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains import Domain, Observation, Visibility, require_known
+from mirror_ppl.domains import Domain, require_known
 from mirror_ppl.errors import DemonstrationsError
 
 LAYER = "layer_"
@@ -61,10 +60,6 @@ class RecurrentNetworks(nn.Module):
     def hidden(self) -> int:
         """H, the number of the GRU's units."""
         return self.weights["recurrent"].shape[1]
-
-    def visible(self, setting: str, observation: Observation) -> Visibility:
-        """Which items a setting lets the networks read, ``[..., K]`` for each modality."""
-        return visible_items(self.domain, self.sight, setting, observation)
 
     def inputs(self, demonstrations: Demonstrations) -> StepInputs:
         """What the networks read at each step of recorded rounds."""
