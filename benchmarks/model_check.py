@@ -10,6 +10,7 @@ the 90% interval holds, of all people and of those with the verdict ``ok``; with
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,16 +88,16 @@ class Options:
     """What is measured.
 
     Attributes:
-        seed: of people and rounds.
-        people: of each kind.
+        seeds: of people and rounds.
+        people: of each kind and seed.
         kinds: of people, all unless given.
         human_models: that are fitted.
-        out: file for the table; printed alone unless given.
+        out: file for the table; what is there is not done again. Printed alone unless given.
         picture: file for the checks of the first three of each kind.
     """
 
-    seed: int = 0
-    people: int = 20
+    seeds: tuple[int, ...] = (0, 1, 2, 3)
+    people: int = 5
     kinds: tuple[str, ...] = ()
     human_models: tuple[str, ...] = ("mirror", "all")
     out: Path | None = None
@@ -127,31 +128,50 @@ def found(fit: mirror_ppl.Fit, truth: Tensor) -> dict[str, float]:
     )
 
 
+def together(rows: pd.DataFrame) -> pd.DataFrame:
+    """Counts of all seeds, and rates over all of their people."""
+    rows = rows.assign(
+        held=rows["held"] * rows["people"], held_of_ok=rows["held_of_ok"].fillna(0) * rows["ok"]
+    )
+    sums = rows.drop(columns="seed").groupby(["kind", "human_model"], sort=False).sum()
+    return sums.assign(
+        held=sums["held"] / sums["people"], held_of_ok=sums["held_of_ok"] / sums["ok"]
+    ).round(3)
+
+
 def main(options: Options) -> None:
     """Run the study."""
     torch.set_num_threads(1)
     self_model, _ = load_self_model(shipped_weights("driving"))
-    rows, shown = [], []
+    kept = pd.read_csv(options.out) if options.out and options.out.exists() else pd.DataFrame()
+    rows, shown = kept.to_dict("records"), []
+    done = {(row["kind"], row["seed"], row["human_model"]) for row in rows}
     every = kinds(self_model)
-    for kind in options.kinds or every:
+    for kind, seed in itertools.product(options.kinds or every, options.seeds):
         human, known = every[kind]
-        drawn = draw_prior(human, options.people, 1, options.seed)
+        drawn = draw_prior(human, options.people, 1, seed)
         implants = {name: value[0] for name, value in drawn.items()}
         implants |= {name: torch.full((options.people, 1), value) for name, value in known.items()}
-        generator = torch.Generator().manual_seed(options.seed)
+        generator = torch.Generator().manual_seed(seed)
         recordings = play_rounds(human, implants, 26, "fog", generator)
         truth = reach(human.domain, implants)[:, 0]
         for fitted in options.human_models:
-            fit = mirror_ppl.infer(recordings, human=fitted, seed=options.seed, train_rounds=20)
-            rows.append({"kind": kind, "human_model": fitted} | found(fit, truth))
-            header = len(rows) == 1
-            if options.out is not None:  # so that what is done is kept
-                pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.3f")
-            print(pd.DataFrame(rows[-1:]).to_string(index=False, header=header), flush=True)
-            if fitted == options.human_models[0]:
+            pictured = options.picture is not None and seed == options.seeds[0]
+            pictured &= fitted == options.human_models[0]
+            if (kind, seed, fitted) in done and not pictured:
+                continue
+            fit = mirror_ppl.infer(recordings, human=fitted, seed=seed, train_rounds=20)
+            if pictured:
                 first = fit.data["model_check"].isel(person=slice(SHOWN))
                 names = [f"{kind} {number + 1}" for number in range(len(first["person"]))]
                 shown.append(first.assign_coords(person=names))
+            if (kind, seed, fitted) in done:
+                continue
+            rows.append({"kind": kind, "seed": seed, "human_model": fitted} | found(fit, truth))
+            if options.out is not None:  # so that what is done is kept
+                pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.3f")
+            print(pd.DataFrame(rows[-1:]).to_string(index=False), flush=True)
+    print(together(pd.DataFrame(rows)).to_string())
     if options.picture is not None:
         joined = az.InferenceData(model_check=xr.concat(shown, "person"))
         options.picture.write_bytes(plot_model_check(joined).content())
