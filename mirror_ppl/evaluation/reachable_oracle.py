@@ -18,7 +18,7 @@ from torch import Tensor
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.people.base import SimulatedPeople
-from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, row_numbers
 
 MOST_ITEMS = 2
 """Items of the largest messages that are looked at: there is always another step to say more."""
@@ -214,4 +214,4 @@ def _numbers(parts: Any, dimensions: int) -> Tensor:
 def _names(person: SimulatedPeople, state: Any, memory: Any) -> Tensor:
     """A whole number ``[n]`` for each state of world and mind, equal where both are."""
     rows = torch.cat([_numbers(state, 1), _numbers(person.kept(memory), 1)], -1)
-    return rows @ random_keys(rows.shape[1], rows.device, kind=2)
+    return row_numbers(rows, 2)

@@ -22,7 +22,7 @@ from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, overrides
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
-from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
+from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, row_numbers
 
 CHUNK = 4096
 """Beliefs that are inferred at once; bounds memory."""
@@ -71,7 +71,7 @@ class Memory:
         if overrides(human, "evidence"):
             symbols = observation  # it may read whatever there is
         rows = torch.cat([as_whole_numbers(value).flatten(2) for value in symbols.values()], -1)
-        observed = rows @ random_keys(rows.shape[-1], rows.device, 1)
+        observed = row_numbers(rows, 1)
         return cls(observed, observed.new_zeros(0, 3), observed.new_zeros(0))
 
 
@@ -147,7 +147,7 @@ class BeliefState:
         key = torch.stack([view.numbers().expand(number, steps), observed], -1)
         if view.still is not None:
             key = torch.where(view.still[..., None], NOT_SHOWN, key)
-        key = key @ random_keys(2, key.device)  # [n, T]
+        key = row_numbers(key)  # [n, T]
         action = torch.stack([one.action for one in transitions], -1)
         # People with the same belief who then do the same and are shown the same count as one.
         one, same = distinct_rows(torch.cat([self.belief[:, None], action, key], -1))

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import mirror_ppl
+from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.people import simulate
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
@@ -12,14 +13,14 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU he
 @pytest.mark.parametrize("engine", ["importance", "amortized", "svi"])
 def test_a_fit_on_a_gpu_finds_what_one_on_the_processor_finds(engine):
     people = simulate("driving", "fog", "paper", 2, 8, 100)
-    means, errors = [], []
-    for device in ("cpu", "cuda"):
-        fit = mirror_ppl.infer(people, engine=engine, device=device, draws=200)
-        site = fit.data.posterior["visual_threshold"].to_numpy()
-        means.append(site.mean((0, 1)))
-        errors.append(site.std((0, 1)))
-    # Standard errors are a fourteenth of the deviation; half leaves room for SVI's optimizer.
-    assert (abs(means[0] - means[1]) < 0.5 * errors[0] + 1e-3).all()
+    fits = [
+        mirror_ppl.infer(people, engine=engine, device=device, draws=200, train_rounds=6)
+        for device in ("cpu", "cuda")
+    ]
+    for site in sight_sites(fits[0].human.domain):
+        one, other = (fit.data.posterior[site].to_numpy() for fit in fits)
+        # Standard errors are a fourteenth of the deviation; half leaves room for SVI's optimizer.
+        assert (abs(one.mean((0, 1)) - other.mean((0, 1))) < 0.5 * one.std((0, 1)) + 1e-3).all()
 
 
 @pytest.mark.parametrize("domain", ["driving", "search_rescue", "bomb_defusal"])
@@ -33,3 +34,10 @@ def test_every_world_is_inferred_on_a_gpu(domain):
     people = simulate(domain, people=1, rounds=3)
     fit = mirror_ppl.infer(people, device="cuda", draws=50, train_rounds=2)
     assert len(fit.summary["people"]) == 1
+
+
+@pytest.mark.parametrize("how", [{"pooling": "partial"}, {"human": "all"}])
+def test_whatever_is_inferred_is_inferred_on_a_gpu(how):
+    people = simulate("driving", people=2, rounds=3)
+    fit = mirror_ppl.infer(people, device="cuda", draws=50, train_rounds=2, **how)
+    assert len(fit.summary["people"]) == 2
