@@ -260,7 +260,7 @@ class Driving:
                 observation["verbal"][..., :2] != visual
             ).any((-1, -2)),
             "relative_speed has to be -1, 0 or 1": (
-                ~torch.isin(observation["verbal"][..., 2], torch.tensor([-1.0, 0.0, 1.0]))
+                observation["verbal"][..., 2] != observation["verbal"][..., 2].round().clamp(-1, 1)
             ).any(-1),
         }
 

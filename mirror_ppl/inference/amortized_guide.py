@@ -5,6 +5,7 @@ It reads what rounds say of some ways to decide, see :mod:`mirror_ppl.inference.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 
 import pyro
@@ -125,7 +126,7 @@ class AmortizedGuide(nn.Module):
         """Whether it learned to read evidence about ways at these places ``[W, D]``."""
         if self.ways.shape != places.shape:
             return False
-        own = torch.as_tensor(self.prior(self.ways))
+        own = torch.as_tensor(self.prior(self.ways)).cpu()
         return torch.allclose(own, places.to(own), atol=1e-3)
 
     def mixture_parameters(self, log_evidence: Tensor, steps: Tensor) -> Tensor:
@@ -184,7 +185,12 @@ def sample_scalars(
 
 
 def reference_places(human: HumanModel, number: int = WAYS) -> Tensor:
-    """Places ``[W, D]`` of ways from the prior; always the same of a human model."""
+    """Places ``[W, D]`` of ways from the prior; always the same of a human model.
+
+    They are on the processor: a GPU has other random numbers.
+    """
+    if next(human.parameters()).device.type != "cpu":
+        human = copy.deepcopy(human).to("cpu")
     return unconstrained(scalar_sites(human), draw_prior(human, 1, number, Screening.seed))
 
 

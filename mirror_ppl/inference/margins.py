@@ -69,10 +69,10 @@ class PriorMargins(Transform):
         return 1
 
     def _call(self, x: Tensor) -> Tensor:
-        return _interpolated(x, self.normal, self.knots)[0]
+        return _interpolated(x, self.normal.to(x.device), self.knots.to(x.device))[0]
 
     def _inverse(self, y: Tensor) -> Tensor:
-        return _interpolated(y, self.knots, self.normal)[0]
+        return _interpolated(y, self.knots.to(y.device), self.normal.to(y.device))[0]
 
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
         """Log of the stretch ``[...]`` of all dimensions together."""
@@ -105,9 +105,9 @@ class PriorDependence(Transform):
 
     def _conditionals(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Means m and log scales ``[..., D]``; those of each d read only what is before it."""
-        terms = _quadratic(y)
+        terms, mean, scale = _quadratic(y), self.mean.to(y.device), self.log_scale.to(y.device)
         limit = MOST_LOG_SCALE
-        return terms @ self.mean.T, (terms @ self.log_scale.T).clamp(-limit, limit)
+        return terms @ mean.T, (terms @ scale.T).clamp(-limit, limit)
 
     def _call(self, x: Tensor) -> Tensor:
         y = torch.zeros_like(x)

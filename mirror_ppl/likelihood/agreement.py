@@ -212,7 +212,7 @@ def _put_together(
 ) -> Tensor:
     """Log densities ``[S]`` of the same, of the parts that engines compute."""
     read = perceived_sites(human)
-    number, every = DRAWS, torch.arange(DRAWS)
+    number, every = DRAWS, torch.arange(DRAWS, device=rounds.actions.device)
     policy = {name: value for name, value in draws.items() if name not in read}
     grid = {name: draws[name].flatten() for name in read}
     total = log_correction(human, read, policy, 1)[:, 0].expand(number)

@@ -221,7 +221,7 @@ class Sequential(Compiled):
         nodes, number = self._run(draws), len(next(iter(draws.values())))
         of_people = [node for node in nodes.values() if not _of_rounds(node)]
         shape = (number, self.people, self.rounds.shape[1])
-        total = torch.zeros(shape)
+        total = torch.zeros(shape, device=self.rounds.actions.device)
         for node in nodes.values():
             if _of_rounds(node):
                 total = total + log_prob(node)
@@ -232,7 +232,7 @@ class Sequential(Compiled):
         """Log-probabilities ``[S, P, B, T, A]`` of actions, given what was done before them."""
         number = len(next(iter(draws.values())))
         shape = (number, *self.rounds.shape[:2])
-        so_far, found = torch.zeros(shape), []
+        so_far, found = torch.zeros(shape, device=self.rounds.actions.device), []
         for name, node in self._run(draws).items():
             if node["is_observed"] and name.startswith(f"{ACTION}_"):
                 logits = node["fn"].logits
@@ -306,10 +306,10 @@ def _over_latents(values: Tensor, dimensions: int) -> Tensor:
 
 def _added(nodes: Iterable[Mapping[str, Any]], number: int, people: int) -> Tensor:
     """Log densities of nodes of each person, ``[S, P]``."""
-    total = torch.zeros(number, people, 1)
+    total: Tensor | int = 0
     for node in nodes:
         total = total + log_prob(node)
-    return total.squeeze(-1)
+    return torch.as_tensor(total).expand(number, people, 1).squeeze(-1)
 
 
 @torch.no_grad()

@@ -90,7 +90,7 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
         raise AssetError(f"{path}: does not fit this program ({error})") from error
     if not guide.reads(places):
         raise AssetError(f"{path}: is for another prior; train a guide for this one")
-    return guide.eval(), card
+    return guide.eval().to(next(human.parameters()).device), card
 
 
 def network_for(engine: str, path: Path | None, human: HumanModel) -> AmortizedGuide | None:

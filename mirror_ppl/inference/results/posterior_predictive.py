@@ -52,7 +52,9 @@ def predict_rounds(
         own, recorded = of_people(draws, some), rounds.part(some)
         # Only what some draw sees is looked at: exact views, without screening or merging.
         candidates = [
-            combination_number({site: own[site][:, person, 0] for site in sizes}, sizes).unique()
+            combination_number({site: own[site][:, person, 0] for site in sizes}, sizes)
+            .unique()
+            .to(rounds.actions.device)  # also where there are no sites
             for person in range(len(some))
         ]
         table = build_view_table(human, recorded, candidates, likely=own, values=PREDICTED_VALUES)
