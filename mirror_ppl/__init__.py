@@ -26,12 +26,24 @@ if _TYPE_CHECKING:
         Fit,
         HumanModel,
         RoundSoFar,
+        World,
+        add_domain,
         infer,
         load_recordings,
         worlds,
     )
 
-__all__ = ["Communicator", "Fit", "HumanModel", "RoundSoFar", "infer", "load_recordings", "worlds"]
+__all__ = [
+    "Communicator",
+    "Fit",
+    "HumanModel",
+    "RoundSoFar",
+    "World",
+    "add_domain",
+    "infer",
+    "load_recordings",
+    "worlds",
+]
 
 _register("mirror_ppl/Driving-v0", "mirror_ppl.domains.driving_environment:DrivingEnv")
 _register("mirror_ppl/SearchRescue-v0", "mirror_ppl.domains.rescue_environment:SearchRescueEnv")

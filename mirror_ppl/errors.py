@@ -64,6 +64,10 @@ class DemonstrationsError(MirrorError):
     """
 
 
+class DomainError(MirrorError):
+    """Raised for a world that cannot be loaded or breaks its contract."""
+
+
 class HumanModelError(MirrorError):
     """Raised for a human model that cannot be loaded or breaks its contract.
 

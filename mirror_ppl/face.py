@@ -22,7 +22,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.console import usable_device
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.domains import DOMAINS as worlds
-from mirror_ppl.domains import get_domain, require_known
+from mirror_ppl.domains import World, add_domain, domain_of, get_domain, require_known
 from mirror_ppl.errors import InputError, UnreliableWeights
 from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
@@ -39,7 +39,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import PEOPLE
+from mirror_ppl.people import populations_of
 from mirror_ppl.plots.fit import FILES, FitPlots
 from mirror_ppl.progress import Report, Stages, silent
 from mirror_ppl.timing import clocked, stage
@@ -48,7 +48,17 @@ from mirror_ppl.training.guide_file import network_for
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Communicator", "Fit", "HumanModel", "RoundSoFar", "infer", "load_recordings", "worlds"]
+__all__ = [
+    "Communicator",
+    "Fit",
+    "HumanModel",
+    "RoundSoFar",
+    "World",
+    "add_domain",
+    "infer",
+    "load_recordings",
+    "worlds",
+]
 
 KEPT = ("means", "draws")
 """What may be kept of predictions."""
@@ -264,7 +274,8 @@ def load_recordings(
 
     Args:
         path: the file.
-        domain: of the shipped recordings, ``driving`` unless given. Of a file it is checked.
+        domain: of the shipped recordings, ``driving`` unless given. Of a file it is checked; a
+            world of your own is made known by ``path/to/file.py:Class``, whose code is run.
         setting: of the shipped recordings, the one in which people see less unless given. Of a
             file it is checked.
         population: of the shipped recordings, ``paper`` unless given.
@@ -274,6 +285,7 @@ def load_recordings(
         DemonstrationsError: the file is missing or damaged, or breaks the format.
         UnknownNameError: there is no such domain, setting or population.
     """
+    domain = None if domain is None else get_domain(domain).name
     if path is not None:
         recorded = load_demonstrations(path)
         for name, given in (("domain", domain), ("setting", setting)):
@@ -286,7 +298,7 @@ def load_recordings(
     domain = "driving" if domain is None else domain
     settings = get_domain(domain).settings
     setting = require_known(setting or settings[-1], "setting", settings, domain)
-    populations = PEOPLE[domain].populations
+    populations = populations_of(domain)
     population = require_known(population or "paper", "population", populations, domain)
     return load_demonstrations(asset_path(f"{domain}_{setting}_{population}.nc"))
 
@@ -294,6 +306,7 @@ def load_recordings(
 def infer(  # noqa: PLR0913 - everything a fit can depend on
     recordings: Demonstrations | str | Path = SHIPPED,
     *,
+    domain: World | type[World] | str | None = None,
     human: HumanModel | type[HumanModel] | str | None = None,
     engine: str = "auto",
     pooling: str = "none",
@@ -319,6 +332,8 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     Args:
         recordings: rounds of P people, or a file of them; simulated people that ship unless given
             (people are chosen by ``recordings.select_people``).
+        domain: the world that the recordings are of, if it is one of your own: it, its class, or
+            ``path/to/file.py:Class``, whose code is run.
         human: the human model: an object or a class, one of the package's names (such as
             ``one-radius``) or ``path/to/file.py:Class``; the package's own for the domain unless
             given.
@@ -359,8 +374,12 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     """
     if recordings is None:
         raise InputError("recordings are None; leave them out to fit the people that ship")
+    world = None if domain is None else domain_of(domain).name
     if not isinstance(recordings, Demonstrations):
-        recordings = load_recordings(None if recordings == SHIPPED else recordings)
+        path = None if recordings == SHIPPED else recordings
+        recordings = load_recordings(path, domain=world)
+    if world not in (None, recordings.domain):
+        raise InputError(f"domain is {world}, but the recordings are of {recordings.domain}")
     where = usable_device(device)
     engine = engine_name(engine)
     if isinstance(settings, Mapping):

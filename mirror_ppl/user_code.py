@@ -2,10 +2,58 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import sys
 import traceback
 from pathlib import Path
+from typing import TypeVar
 
+from mirror_ppl.errors import MirrorError
+
+Base = TypeVar("Base")
 _FILES: set[Path] = set()
+
+
+def class_in_file(path: Path, name: str, base: type[Base], error: type[MirrorError]) -> type[Base]:
+    """Import a file of a user and return a class that it defines.
+
+    Args:
+        path: the file.
+        name: of the class.
+        base: from which it has to be derived.
+        error: raised if it cannot be had.
+
+    Raises:
+        MirrorError: ``error``; the file or class is missing, does not import, or is another one.
+    """
+    if not os.path.isfile(path):
+        there = "is not a regular file" if os.path.exists(path) else "there is no such file"
+        raise error(f"{path}: {there}")
+    module_name = f"_{base.__name__.lower()}_of_{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise error(f"{path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    remember_file(path)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as fault:
+        raise error(f"{path} does not import: {describe(fault, path)}") from fault
+    chosen = getattr(module, name, None)
+    if isinstance(chosen, type) and issubclass(chosen, base):
+        return chosen
+    classes = [
+        key
+        for key, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, base) and value is not base
+    ]
+    package = base.__module__.rpartition(".")[0]
+    raise error(
+        f"{path} has no class {name} derived from {package}.{base.__name__}; "
+        f"it has: {', '.join(classes) or 'none'}"
+    )
 
 
 def remember_file(path: Path) -> None:

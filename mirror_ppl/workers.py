@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from mirror_ppl.domains import World, add_domain, added_worlds
 from mirror_ppl.errors import HumanModelError, MirrorError, OptionError, WorkerError
 from mirror_ppl.user_code import describe, passed_user_code, remember_file, remembered_files
 
@@ -57,8 +58,8 @@ def run_tasks(
         own: dict[str, Any] = {}
         if here:
             own = {"backend": "loky", "initializer": _end_with, "initargs": (os.getpid(),)}
-        files = _files_of_users()
-        calls = (delayed(partial(_in_worker, files, task))() for task in tasks)
+        files, worlds = _files_of_users(), added_worlds()
+        calls = (delayed(partial(_in_worker, files, worlds, task))() for task in tasks)
         results = Parallel(n_jobs=jobs, return_as="generator_unordered", **own)(calls)
         try:
             yield from cast(Iterator[Result], results)
@@ -115,9 +116,13 @@ def _files_of_users() -> tuple[Path, ...]:
     return files
 
 
-def _in_worker(files: Sequence[Path], task: Callable[[], Result]) -> Result:
+def _in_worker(
+    files: Sequence[Path], worlds: Sequence[World], task: Callable[[], Result]
+) -> Result:
     for file in files:
         remember_file(file)
+    for world in worlds:
+        add_domain(world)
     # One thread a process: the cores are shared by processes.
     import torch
 

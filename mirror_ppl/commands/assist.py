@@ -271,11 +271,10 @@ def _people(options: Options):
     """The posterior, and what its people were simulated with."""
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.inference.results.posterior_file import load_posterior
-    from mirror_ppl.people import PEOPLE
+    from mirror_ppl.people import populations_of
 
-    if options.domain is not None:
-        get_domain(options.domain)
-    posterior = load_posterior(options.posterior, options.domain)
+    given = None if options.domain is None else get_domain(options.domain).name
+    posterior = load_posterior(options.posterior, given)
     domain = posterior.attributes["domain"]
     settings = get_domain(domain).settings
     if options.setting is not None:
@@ -314,7 +313,7 @@ def _people(options: Options):
             f"{options.posterior}: is of people drawn from the {source['population']}, who cannot "
             "be played further; plan messages for them with mirror_ppl.Communicator"
         )
-    require_known(source["population"], "population", PEOPLE[domain].populations)
+    require_known(source["population"], "population", populations_of(domain))
     return posterior, source
 
 

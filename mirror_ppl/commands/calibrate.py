@@ -100,10 +100,11 @@ def main(options: Options) -> int:
 
     guide = told_engine(options.guide)
     settings = InferenceOptions(guide, options.draws)
-    known = get_domain(options.domain).settings
-    setting = require_known(options.setting or known[-1], "setting", known, options.domain)
-    weights = options.self_model or shipped_weights(options.domain)
-    self_model, _ = load_self_model(weights, options.domain)
+    domain = get_domain(options.domain)
+    known = domain.settings
+    setting = require_known(options.setting or known[-1], "setting", known, domain.name)
+    weights = options.self_model or shipped_weights(domain.name)
+    self_model, _ = load_self_model(weights, domain.name)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
     # What is so for everybody is learned first, as by a fit: people are drawn from what is open.

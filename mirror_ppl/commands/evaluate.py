@@ -173,7 +173,7 @@ def _cells(options: Options) -> list[Any]:
     from mirror_ppl.domains import get_domain
     from mirror_ppl.evaluation.learners import Group
     from mirror_ppl.evaluation.study import assistance_cells, prediction_cells
-    from mirror_ppl.people import PEOPLE
+    from mirror_ppl.people import populations_of
 
     domains = {name: get_domain(name).settings for name in dict.fromkeys(options.domain)}
     every = sorted({setting for settings in domains.values() for setting in settings})
@@ -184,7 +184,7 @@ def _cells(options: Options) -> list[Any]:
     told, rounds = _told(options), _rounds(options)
     cells: list[Any] = []
     for domain, settings in domains.items():
-        if options.population not in (known := PEOPLE[domain].populations):
+        if options.population not in (known := populations_of(domain)):
             raise UnknownNameError.of("population", options.population, known)
         usual = settings if predicting else settings[-1:]
         own = [name for name in options.setting if name in settings] if options.setting else usual

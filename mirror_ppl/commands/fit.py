@@ -184,9 +184,12 @@ def _recordings(options: Options) -> Demonstrations:
 
 
 def _all_recordings(options: Options) -> Demonstrations:
+    from mirror_ppl.domains import get_domain
     from mirror_ppl.face import load_recordings
 
     given = {name: getattr(options, name) for name in ("domain", "setting", "population")}
+    if options.domain is not None and options.demos is not None:
+        given["domain"] = get_domain(options.domain).name
     if options.demos is not None:
         recorded = load_recordings(options.demos)
         for name in ("domain", "setting"):

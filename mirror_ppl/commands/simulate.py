@@ -41,6 +41,9 @@ class Options:
     human_model: str | None = None
     """People drawn from the prior of a human model instead: one of the package's, such as late, or
     path/to/file.py:Class, whose code is run. What they see is up to their implants."""
+    self_model: Path | None = None
+    """Weights of the robot that people of a --human-model, and those of a world of your own, are
+    made of. Default: those that ship, or that python -m mirror_ppl.train wrote."""
     people: int = 10
     """How many people, at least 1."""
     rounds: int = 40
@@ -92,6 +95,7 @@ def main(options: Options) -> None:
                 device,
                 progress,
                 options.told,
+                options.self_model,
             )
         provenance = {**demonstrations.provenance, "command": _command(options)}
         path = save_demonstrations(options.out, replace(demonstrations, provenance=provenance))
@@ -100,18 +104,20 @@ def main(options: Options) -> None:
     reward = demonstrations.rewards.nansum(-1).mean().item()
     entropy = demonstrations.action_entropy.nanmean().item()
     population = demonstrations.provenance["population"]
-    print(f"{path}: {options.domain}, {setting}, population {population}")
+    print(f"{path}: {domain.name}, {setting}, population {population}")
     print(f"  people {options.people}, rounds of each {options.rounds}, seed {options.seed}")
     print(f"  mean reward of a round {reward:.3f}")
     print(f"  mean entropy of an action {entropy:.4f} nats")
 
 
 def _of_a_model(options: Options, setting: str, device: str) -> Demonstrations:
+    from mirror_ppl.domains import get_domain
     from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.simulation import simulate_from_prior
     from mirror_ppl.models.weights import load_self_model, shipped_weights
 
-    self_model, _ = load_self_model(shipped_weights(options.domain), options.domain)
+    domain = get_domain(options.domain).name
+    self_model, _ = load_self_model(options.self_model or shipped_weights(domain), domain)
     human = load_human_model(options.human_model, self_model).to(device)
     return simulate_from_prior(
         human, options.people, options.rounds, setting, options.seed, options.told

@@ -100,9 +100,9 @@ def main(options: Options) -> None:
     if options.card is not None:
         _show(_card(options.card))
         return
-    get_domain(options.domain)
+    domain = get_domain(options.domain).name
     name = options.what.replace("-", "_")
-    out = options.out or Path("runs") / f"{options.domain}_{name}.safetensors"
+    out = options.out or Path("runs") / f"{domain}_{name}.safetensors"
     inputs = {"--self-model": [options.self_model]}
     require_files_of_their_own({"--out": out}, inputs)
     checkpoint = out.with_suffix(".checkpoint")
@@ -118,7 +118,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
 
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.evaluation.self_model import self_model_quality
-    from mirror_ppl.models.sizes import PAPER, SIZES
+    from mirror_ppl.models.sizes import PAPER, SIZES, sizes_of
     from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
     from mirror_ppl.training.self_model import SelfModelOptions, train_self_model
@@ -128,11 +128,11 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
         modality.utterances for modality in get_domain(options.domain).modalities
     ):
         raise OptionError(f"--speech: nothing is put into words in {options.domain}")
-    sizes = {"shipped": SIZES, "paper": PAPER}[
-        require_known(options.sizes, "sizes", ("shipped", "paper"))
-    ][options.domain]
+    domain = get_domain(options.domain)
+    known = {"shipped": SIZES, "paper": PAPER}
+    sizes = sizes_of(domain, known[require_known(options.sizes, "sizes", tuple(known))])
     settings = SelfModelOptions.of(
-        options.domain,
+        domain.name,
         phases=options.phases,
         steps=options.steps,
         learning_rate=options.learning_rate,
@@ -140,7 +140,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
     generator = torch.Generator(usable_device(options.device)).manual_seed(options.seed)
     with Progress("train", settings.phases) as progress:
         self_model = train_self_model(
-            get_domain(options.domain).as_believed,
+            domain.as_believed,
             settings,
             generator,
             progress.update,
@@ -149,7 +149,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
             sizes,
         )
     # It was taught the world as it is believed to be, and lives in the world as it is.
-    self_model.domain = get_domain(options.domain)
+    self_model.domain = domain
     with Stages() as stages:
         quality = self_model_quality(
             self_model,
@@ -162,6 +162,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
 
 
 def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
+    from mirror_ppl.domains import get_domain
     from mirror_ppl.likelihood.contract import check_contract
     from mirror_ppl.models.loading import load_human_model
     from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -169,8 +170,9 @@ def _guide(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]:
     from mirror_ppl.training.guide import GuideOptions, train_guide
     from mirror_ppl.training.guide_file import save_guide
 
-    weights = options.self_model or shipped_weights(options.domain)
-    self_model, _ = load_self_model(weights, options.domain)
+    domain = get_domain(options.domain).name
+    weights = options.self_model or shipped_weights(domain)
+    self_model, _ = load_self_model(weights, domain)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
     # What is so for everybody is learned first, as by a fit: people are drawn from what is open.

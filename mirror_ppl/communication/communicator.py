@@ -25,6 +25,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility
+from mirror_ppl.domains.capabilities import offers
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.world_knowledge import planning_domain
 
@@ -218,6 +219,8 @@ class Decision:
         if self.over:
             return "the round is over"
         world, now = self.world, self.observation
+        if not offers(world, "reference_values"):
+            return f"none: what is best is not known exactly in {world.name}"
         values = world.reference_values(world.state_behind(now), ADVICE_DISCOUNT)
         notion = next(iter(world.relevance(now).values()))
         flags = Channels(world).join(notion)

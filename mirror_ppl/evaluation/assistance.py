@@ -134,7 +134,7 @@ def speaker(
     """
     domain = listener.domain
     if name == "oracle":
-        return _oracle(listener)
+        return _oracle(listener, options, seed)
     if name in ("none", "all", "nearest", "random"):
         generator = derived_generator(seed, "random messages")
         rule = {
@@ -179,8 +179,11 @@ class Planning:
         return person.hears if isinstance(person, HearingPerson) else {}
 
 
-def _oracle(listener: Listener) -> Say:
-    """The oracle of the listener's domain."""
+def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
+    """What knows the person exactly: the best messages, or of people as modelled a planner's."""
+    if (known := listener.driver.modelled()) is not None:
+        planner = planner_of("mirror", Person(*known), replace(options, hears=1.0), seed)
+        return Planning(planner)
     start = map_state(lambda part: part[0], listener.start.state)
     if isinstance(listener.driver, Drivers):
         oracle = Oracle(listener.driver, start)
@@ -230,6 +233,7 @@ def _play(listener: Listener, say: Say, keep_log: bool) -> tuple[Played, list[Ro
         messages = channels.split(flags)
         probability, memory = driver.step(memory, observation, channels.split(flags[None]))
         action = act(probability, start.luck[..., step])[0]
+        memory = driver.acted(memory, action[None])
         following = domain.transition(state, action[None])
         tally.add_messages(observation, flags, under_way)
         tally.add_rewards(domain.rewards(state, action[None], following))

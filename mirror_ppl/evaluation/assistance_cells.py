@@ -87,7 +87,12 @@ class Pairing:
     def listener(self, number: int, inferred: bool = True) -> Listener:
         """The person of that number, with their rounds, and what was inferred of them."""
         everybody = simulated_people(
-            self.domain.name, self.setting, self.population, self.people, self.people_seed
+            self.domain.name,
+            self.setting,
+            self.population,
+            self.people,
+            self.people_seed,
+            self_model=self.self_model,
         )
         listener = listeners(everybody, self.people, self.setting, self.rounds, self.seed)[number]
         if not inferred:

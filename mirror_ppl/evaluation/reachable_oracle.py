@@ -138,6 +138,8 @@ class ReachableOracle:
             lambda part: part[:, :, None].expand(-1, -1, number, *part.shape[2:]).flatten(0, 2),
             after,
         )
+        done = torch.arange(number).repeat(len(node) * minds)
+        next_memory = _at(person.acted(map_state(_one_person, next_memory), done[None]), 0)
         names = _names(person, next_state, next_memory)
         real = (chance > 0)[..., None].expand(-1, -1, number).flatten()
         place = real.nonzero().squeeze(-1)
@@ -195,7 +197,11 @@ def _small_messages(domain: Domain) -> Tensor:
     return every[first.sort().values]
 
 
-def _at(parts: Any, rows: Tensor) -> Any:
+def _one_person(part: Tensor) -> Tensor:
+    return part[None]
+
+
+def _at(parts: Any, rows: Tensor | int) -> Any:
     return map_state(lambda part: part[rows], parts)
 
 

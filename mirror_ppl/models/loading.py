@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import sys
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -24,7 +22,7 @@ from mirror_ppl.models.bomb_defusal_variants import (
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.variants import VARIANTS
-from mirror_ppl.user_code import describe, remember_file
+from mirror_ppl.user_code import class_in_file, describe
 
 MIRROR = "mirror"
 """The package's own model; which it is depends on the domain."""
@@ -88,31 +86,7 @@ def load_human_model(
             f"{', '.join(VARIANTS)}" + "".join(f'; perhaps you meant "{name}"' for name in close)
         )
     path = Path(path_text)
-    if not os.path.isfile(path):
-        there = "is not a regular file" if os.path.exists(path) else "there is no such file"
-        raise HumanModelError(f"{path}: {there}")
-    module_name = f"_human_model_{path.stem}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None or spec.loader is None:
-        raise HumanModelError(f"{path}: not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module
-    remember_file(path)
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        raise HumanModelError(f"{path} does not import: {describe(error, path)}") from error
-    chosen = getattr(module, name, None)
-    if not (isinstance(chosen, type) and issubclass(chosen, HumanModel)):
-        classes = [
-            key
-            for key, value in vars(module).items()
-            if isinstance(value, type) and issubclass(value, HumanModel) and value is not HumanModel
-        ]
-        raise HumanModelError(
-            f"{path} has no class {name} derived from mirror_ppl.models.HumanModel; "
-            f"it has: {', '.join(classes) or 'none'}"
-        )
+    chosen = class_in_file(path, name, HumanModel, HumanModelError)
     try:
         return chosen(self_model)
     except (Exception, SystemExit) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from mirror_ppl.domains.base import Domain
@@ -49,6 +50,6 @@ PAPER: dict[str, Sizes] = SIZES | {"bomb_defusal": replace(SIZES["bomb_defusal"]
 """The supplement's sizes by domain, whatever they cost."""
 
 
-def sizes_of(domain: Domain) -> Sizes:
+def sizes_of(domain: Domain, sizes: Mapping[str, Sizes] = SIZES) -> Sizes:
     """The sizes for a domain; those of driving for one that is not known here."""
-    return SIZES.get(domain.name, Sizes())
+    return sizes.get(domain.name, Sizes())

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mirror_ppl.checks import as_path
 from mirror_ppl.data import asset_path
-from mirror_ppl.domains import get_domain
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.errors import AssetError, MirrorError
 from mirror_ppl.files import json_text, read_whole, write_whole
 from mirror_ppl.models.self_model import SelfModel
@@ -29,12 +29,20 @@ HEADER = 8
 
 
 def shipped_weights(domain: str) -> Path:
-    """Path of the weights that ship for a domain.
+    """Path of the weights that ship for a domain, or that `train` writes for one of somebody's own.
 
     Raises:
-        AssetError: none ship.
+        AssetError: there are none.
     """
-    return asset_path(f"{domain}_self_model.safetensors")
+    name = f"{domain}_self_model.safetensors"
+    if domain in DOMAINS:
+        return asset_path(name)
+    if not (trained := Path("runs") / name).exists():
+        raise AssetError(
+            f"{trained}: there is no self-model of {domain} yet; make one with python -m "
+            "mirror_ppl.train --domain path/to/file.py:Class, or name its file with --self-model"
+        )
+    return trained
 
 
 def fingerprint(network: nn.Module) -> str:

@@ -1,13 +1,14 @@
 """Simulated people, and the recordings of them from which models of people are fitted.
 
-A domain's people are in a file of the domain's name; what a new domain has to add is an entry in
-``PEOPLE``.
+A domain's people are in a file of the domain's name, and an entry in ``PEOPLE``; those of a world
+that has none are as the robot itself, of limited sight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -17,6 +18,7 @@ from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import require_known
+from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.bomb_defusal import Defusers
 from mirror_ppl.people.bomb_participants import DEFUSER_POPULATIONS, simulated_defusers
@@ -26,6 +28,8 @@ from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_re
 from mirror_ppl.people.populations import POPULATIONS
 from mirror_ppl.people.recordings import Start, draw_starts, record, recorded
 from mirror_ppl.people.rescue_participants import RESCUE_POPULATIONS, simulated_firefighters
+from mirror_ppl.people.robot_like import POPULATIONS as ROBOT_LIKE
+from mirror_ppl.people.robot_like import RobotLike, simulated_robot_like
 from mirror_ppl.people.search_rescue import Firefighters
 from mirror_ppl.progress import Progress
 
@@ -58,6 +62,7 @@ def simulated_people(
     people: int,
     seed: int,
     device: torch.device | str = "cpu",
+    self_model: Path | None = None,
 ) -> SimulatedPeople:
     """The simulated people of a population, to be stepped by whoever wants to.
 
@@ -65,12 +70,26 @@ def simulated_people(
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
+        AssetError: people of a world of somebody's own need a self-model, and it is not there.
         InputError: fewer than one person, or no seed.
     """
-    own = PEOPLE[require_known(domain, "domain", tuple(PEOPLE))]
-    require_known(population, "population", own.populations, domain)
+    world = get_domain(domain)
+    require_known(population, "population", populations_of(domain), domain)
     people, seed = whole_number(people, "people", 1), seed_number(seed)
-    return own.simulated(setting, population, people, seed, device)
+    if world.name in PEOPLE:
+        return PEOPLE[world.name].simulated(setting, population, people, seed, device)
+    robot, _ = load_self_model(self_model or shipped_weights(world.name), world.name)
+    return simulated_robot_like(robot.to(device), setting, population, people, seed)
+
+
+def populations_of(domain: str) -> tuple[str, ...]:
+    """Who the simulated people of a domain may be.
+
+    Raises:
+        UnknownNameError: there is no such domain.
+    """
+    name = get_domain(domain).name
+    return PEOPLE[name].populations if name in PEOPLE else ROBOT_LIKE
 
 
 def simulate(  # noqa: PLR0913 - everything recordings can depend on
@@ -83,6 +102,7 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
     device: torch.device | str = "cpu",
     progress: Progress | None = None,
     told: float = 0.0,
+    self_model: Path | None = None,
 ) -> Demonstrations:
     """Record rounds of simulated people.
 
@@ -100,6 +120,8 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
         progress: is told of every step of the rounds.
         told: chance that an item that can be communicated is told, at each step and whoever it
             helps; nobody tells them anything unless given.
+        self_model: weights of the robot in a world of somebody's own, whose people infer and value
+            as it does (:mod:`mirror_ppl.people.robot_like`); those that `train` wrote, by default.
 
     Returns:
         P people with B rounds each, which end when all is done. Its truths are ``sight_...`` for
@@ -111,13 +133,15 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
 
     Raises:
         UnknownNameError: there is no such domain, setting, population or device.
+        AssetError: there is no self-model of a world of somebody's own.
         InputError: fewer than one person or round, no seed, or ``told`` is no probability.
     """
-    setting = get_domain(domain).settings[-1] if setting is None else setting
+    world = get_domain(domain)
+    setting = world.settings[-1] if setting is None else setting
     people, rounds = whole_number(people, "people", 1), whole_number(rounds, "rounds", 1)
     seed, told = seed_number(seed), real_number(told, "told", 0, 1)
     usable_device(str(device))
-    own = simulated_people(domain, setting, population, people, seed, device)
+    own = simulated_people(world.name, setting, population, people, seed, device, self_model)
     return recorded(own, setting, population, rounds, seed, device, progress, told)
 
 
@@ -133,6 +157,7 @@ __all__ = [
     "LearnedReward",
     "Memory",
     "PlanningDrivers",
+    "RobotLike",
     "SimulatedPeople",
     "Start",
     "TaskDrivers",
@@ -142,6 +167,7 @@ __all__ = [
     "learn_reward",
     "learned_reward",
     "log_policy",
+    "populations_of",
     "record",
     "remember",
     "simulate",

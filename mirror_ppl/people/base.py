@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state
+
+if TYPE_CHECKING:
+    from mirror_ppl.models.human import HumanModel
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,11 @@ class SimulatedPeople(ABC):
             probability[..., None, :],
         )
 
+    def acted(self, memory: Any, action: Tensor) -> Any:
+        """The memory once an action ``[P, ...]`` was chosen; people need not keep it in mind."""
+        del action
+        return memory
+
     def kept(self, memory: Any) -> Any:
         """Of a memory what is known and wanted, without the numbers that decide what is chance."""
         return memory
@@ -93,6 +101,13 @@ class SimulatedPeople(ABC):
     @abstractmethod
     def truth(self) -> dict[str, Tensor]:
         """What is true of each ``[P]``, by the names of the sites that infer it."""
+
+    def modelled(self) -> tuple[HumanModel, dict[str, Tensor]] | None:
+        """A human model, and values ``[1, P, 1, ...]`` of its sites with which it is these people.
+
+        ``None`` if they are of another kind.
+        """
+        return None
 
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility

@@ -145,6 +145,7 @@ def record(
         heard.append(_told(domain, observations[-1], gossip, under_way, told))
         probability, memory = people.step(memory, observations[-1], heard[-1])
         action = act(probability, luck)
+        memory = people.acted(memory, action)
         following = domain.transition(state, action)
         rewards.append(total_reward(domain.rewards(state, action, following)))
         state = following

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
+from mirror_ppl.domains.capabilities import offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
@@ -58,8 +59,8 @@ class SelfModelOptions:
             themselves. What people choose hangs on differences alone.
         kinds: share of rounds that are seen in full, with items dropped, and by limited sight; see
             `mirror_ppl.training.views`.
-        exact: whether somebody who knows all that counts learns the exact planner's values, and
-            not what a step leads to.
+        exact: whether somebody who knows all that counts learns the values of the exact planner,
+            where there is one, and not what a step leads to.
     """
 
     phases: int = 40
@@ -341,6 +342,9 @@ class _Trainer:
         length = options.length or domain.horizon
         plan = draw_views(domain, options.rounds, length, self.generator, options.kinds)
         epsilon = options.epsilon * options.epsilon_decay**self.phase
+        expert = options.beta * options.beta_decay**self.phase
+        if not offers(domain, "reference_values"):
+            expert = 0.0  # there is no exact planner: the policy is learned from outcomes alone
         self.starts.append(start)
         self.actions.append(
             drive(
@@ -350,7 +354,7 @@ class _Trainer:
                 length,
                 self.generator,
                 epsilon=max(epsilon, options.epsilon_floor),
-                expert=options.beta * options.beta_decay**self.phase,
+                expert=expert,
                 discount=options.discount,
             )
         )
