@@ -15,7 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from mirror_ppl.domains import World, add_domain, added_worlds
+from mirror_ppl.domains import World, added_worlds
+from mirror_ppl.domains.registry import know
 from mirror_ppl.errors import HumanModelError, MirrorError, OptionError, WorkerError
 from mirror_ppl.user_code import describe, passed_user_code, remember_file, remembered_files
 
@@ -122,7 +123,7 @@ def _in_worker(
     for file in files:
         remember_file(file)
     for world in worlds:
-        add_domain(world)
+        know(world)
     # One thread a process: the cores are shared by processes.
     import torch
 

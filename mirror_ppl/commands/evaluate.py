@@ -125,7 +125,7 @@ def main(options: Options) -> int:
     with results as folder, Progress(options.study, len(cells)) as progress:
         runner = Runner(
             folder / "parts",
-            identities(options.domain),
+            identities(cell.group.domain for cell in cells),
             options.jobs,
             options.scheduler,
             keep_going=True,
@@ -175,7 +175,8 @@ def _cells(options: Options) -> list[Any]:
     from mirror_ppl.evaluation.study import assistance_cells, prediction_cells
     from mirror_ppl.people import populations_of
 
-    domains = {name: get_domain(name).settings for name in dict.fromkeys(options.domain)}
+    worlds = [get_domain(name) for name in options.domain]
+    domains = {world.name: world.settings for world in worlds}
     every = sorted({setting for settings in domains.values() for setting in settings})
     for name in options.setting:
         if name not in every:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 from importlib.metadata import entry_points
 from pathlib import Path
 
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
+from mirror_ppl.domains.checking import require_sound
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.domains.search_rescue import SearchRescue
 from mirror_ppl.domains.world import World
-from mirror_ppl.errors import DomainError, UnknownNameError
+from mirror_ppl.errors import DomainError, UnknownNameError, shown
 from mirror_ppl.user_code import class_in_file, describe
 
 ENTRY_POINTS = "mirror_ppl.domains"
@@ -20,11 +22,39 @@ DOMAINS: dict[str, Domain] = {
 }
 """The package's own worlds by name."""
 _ADDED: dict[str, World] = {}
+_NAMES: dict[str, str] = {}
+"""Names of worlds of files that were loaded, by ``path/to/file.py:Class``."""
 
 
 def added_worlds() -> tuple[World, ...]:
     """Worlds that were added, for other processes to add."""
     return tuple(_ADDED.values())
+
+
+def load_world(specification: str | type[World] | World) -> World:
+    """A world of ``path/to/file.py:Class``, whose code is run, or of a class; not looked at yet.
+
+    Raises:
+        DomainError: the file or class is missing, does not import, is no world or cannot be made.
+    """
+    world = specification
+    if isinstance(world, str):
+        path, colon, kind = world.rpartition(":")
+        if not colon or not kind.isidentifier():
+            raise DomainError(f"{shown(world)} is not of the form path/to/file.py:Class")
+        world = class_in_file(Path(path), kind, World, DomainError)
+    if isinstance(world, type) and issubclass(world, World):
+        try:
+            world = world()
+        except DomainError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise DomainError(f"{world.__name__} cannot be made: {describe(error)}") from error
+    if not isinstance(world, World):
+        raise DomainError(f"a world is derived from mirror_ppl.World, not {type(world).__name__}")
+    if world.name in DOMAINS:
+        raise DomainError(f"{type(world).__name__}: mirror_ppl has a world {world.name} itself")
+    return world
 
 
 def add_domain(world: World | type[World] | str) -> World:
@@ -34,22 +64,24 @@ def add_domain(world: World | type[World] | str) -> World:
         world: it or its class, or ``path/to/file.py:Class``, whose code is run.
 
     Raises:
-        DomainError: it is no world, cannot be made, or has the name of one of the package.
+        DomainError: it is no world, cannot be made, breaks the contract of worlds (see
+            :mod:`mirror_ppl.domains.checking`), or has the name of one of the package.
     """
-    if isinstance(world, str):
-        path, colon, kind = world.rpartition(":")
-        if not colon:
-            raise DomainError(f'"{world}" is not of the form path/to/file.py:Class')
-        world = class_in_file(Path(path), kind, World, DomainError)
-    if isinstance(world, type) and issubclass(world, World):
-        try:
-            world = world()
-        except (Exception, SystemExit) as error:
-            raise DomainError(f"{world.__name__} cannot be made: {describe(error)}") from error
-    if not isinstance(world, World):
-        raise DomainError(f"a world is derived from mirror_ppl.World, not {type(world).__name__}")
-    if world.name in DOMAINS:
-        raise DomainError(f"{type(world).__name__}: mirror_ppl has a world {world.name} itself")
+    return know(require_sound(load_world(world)))
+
+
+def code_of(name: str) -> bytes:
+    """The file that a world which was added is written in; nothing of the package's own."""
+    if name in DOMAINS:
+        return b""
+    try:
+        return Path(inspect.getfile(type(get_domain(name)))).read_bytes()
+    except (OSError, TypeError):  # written at a prompt
+        return b""
+
+
+def know(world: World) -> World:
+    """Make a world known that was looked at before."""
     _ADDED[world.name] = world
     return world
 
@@ -78,7 +110,9 @@ def get_domain(name: str) -> Domain:
     if name in _ADDED:
         return _ADDED[name]
     if ".py:" in name:
-        return add_domain(name)
+        if name not in _NAMES:
+            _NAMES[name] = add_domain(name).name
+        return _ADDED[_NAMES[name]]
     for entry in entry_points(group=ENTRY_POINTS, name=name):
         return add_domain(entry.load())
     installed = [entry.name for entry in entry_points(group=ENTRY_POINTS)]

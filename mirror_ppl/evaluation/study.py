@@ -14,6 +14,7 @@ from typing import Any, cast
 import torch
 
 from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.registry import code_of
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.evaluation.assistance import REFERENCES, PlannerOptions, play, speaker
 from mirror_ppl.evaluation.learned import Plannable, Trained
@@ -211,7 +212,9 @@ def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], st
             digest.update(path.read_bytes())
     code = digest.hexdigest()
     weights = {
-        name: fingerprint(load_self_model(shipped_weights(name), name)[0]) for name in {*domains}
+        name: fingerprint(load_self_model(shipped_weights(name), name)[0])
+        + hashlib.sha256(code_of(name)).hexdigest()
+        for name in {*domains}
     }
 
     def identity(cell: Prediction | Assistance) -> str:

@@ -117,7 +117,7 @@ class FitPlots:
             raise InputError(f"there is a picture {picture} of driving only")
 
     def _of_sight(self, *names: str) -> Picture:
-        known = sight.PICTURES.get(str(self.data["posterior"].attrs.get("domain", "")), {})
+        known = sight.pictures_of(self.data)
         for name in names:
             if name in known and known[name].possible(self.data):
                 return known[name].draw(self.data)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mirror_ppl.plots import driving, notices, road_samples, search_rescue
+from mirror_ppl.plots import driving, notices, reach, road_samples, search_rescue
 from mirror_ppl.plots.picture import Picture
 
 if TYPE_CHECKING:
@@ -53,15 +53,24 @@ PICTURES: dict[str, dict[str, SightPicture]] = {
     "bomb_defusal": {"notices.png": NOTICES},
 }
 """By domain and file name."""
+OF_ANY_WORLD = {
+    "sight.png": SightPicture(reach.has_reach, reach.reach_picture, "how far each person sees"),
+    "notices.png": NOTICES,
+}
+"""By file name, of worlds that have no pictures of their own."""
 FILES = tuple(sorted({name for own in PICTURES.values() for name in own}))
 """All names that there are."""
 
 
 def sight_pictures(data: az.InferenceData) -> dict[str, tuple[Picture, str]]:
     """What each person sees, and that in words, by file name; nothing of sight of other kinds."""
-    known = PICTURES.get(str(data["posterior"].attrs.get("domain", "")), {})
     return {
         name: (picture.draw(data), picture.shows)
-        for name, picture in known.items()
+        for name, picture in pictures_of(data).items()
         if picture.possible(data)
     }
+
+
+def pictures_of(data: az.InferenceData) -> dict[str, SightPicture]:
+    """The pictures of sight that there are of the world of a posterior, by file name."""
+    return PICTURES.get(str(data["posterior"].attrs.get("domain", "")), OF_ANY_WORLD)

@@ -1,0 +1,64 @@
+"""`python -m mirror_ppl.check_domain`: look over a world of somebody's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+if TYPE_CHECKING:
+    from mirror_ppl.domains import World
+
+PROGRAM = "python -m mirror_ppl.check_domain"
+DESCRIPTION = """Look over a world of your own, whose code is run: whether it keeps the contract of
+worlds, one line for each thing that is wrong, and what it offers. The exit status is 1 if something
+is wrong. How a world is written stands in docs/adding_a_world.md."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which world."""
+
+    domain: Positional[str]
+    """The world: path/to/file.py:Class."""
+
+
+def main(options: Options) -> int:
+    """Print what is wrong, or what the world offers; return the exit status.
+
+    Raises:
+        DomainError: the file or class is missing, does not import, or is no world.
+    """
+    from mirror_ppl.domains.checking import faults_of
+    from mirror_ppl.domains.registry import load_world
+
+    world = load_world(options.domain)
+    if faults := faults_of(world):
+        print(f"{world.name}: {len(faults)} thing{'s' * (len(faults) > 1)} wrong")
+        for fault in faults:
+            print(f"  {fault}")
+        return 1
+    _show(world)
+    return 0
+
+
+def _show(world: World) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from mirror_ppl.console import console_for_tables
+    from mirror_ppl.domains.checking import capabilities
+
+    table = Table(title=f"{world.name}: nothing wrong", box=SIMPLE_HEAD, title_justify="left")
+    for column in ("capability", "here", "what it gives"):
+        table.add_column(column)
+    for one, own in capabilities(world):
+        table.add_row(one.method, "its own" if own else one.otherwise, one.gives)
+    console_for_tables(100).print(table)
+    items = ", ".join(f"{len(m.items)} {m.name}" for m in world.modalities)
+    reach = ", ".join(f"{edge:g}" for edge in world.reach_bins)
+    print(f"items: {items}; actions: {', '.join(world.actions)}; {world.horizon} steps a round")
+    print(
+        f"settings: {', '.join(world.settings)}; thresholds of sight ({world.reach_unit}): {reach}"
+    )

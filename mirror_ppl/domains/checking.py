@@ -1,0 +1,274 @@
+"""Whether a world keeps the contract of worlds, and what it offers; each fault in one line."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.capabilities import offers
+from mirror_ppl.domains.world import World
+from mirror_ppl.errors import DomainError
+from mirror_ppl.user_code import describe
+
+ROUNDS = 6
+"""Rounds that a check goes through."""
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Capability:
+    """Something that a world may write and need not.
+
+    Attributes:
+        method: or attribute, by which it does.
+        otherwise: what there is without.
+        gives: what it is for.
+    """
+
+    method: str
+    otherwise: str
+    gives: str
+
+
+CAPABILITIES = (
+    Capability("visibility", "everything is seen", "settings: what unaided people see"),
+    Capability("positions", "all items at distance 1", "thresholds of sight by distance"),
+    Capability("levels", "numbers in units of scales", "networks that read whole numbers exactly"),
+    Capability("over", "rounds last to the horizon", "rounds that end"),
+    Capability("learn", "what was last seen", "memory: what people know without looking"),
+    Capability("assume", "nothing", "what people take for granted"),
+    Capability("communicable", "everything", "what can be told"),
+    Capability("relevance", "everything", "shares of relevant messages"),
+    Capability("describe", "names and numbers", "messages in words"),
+    Capability("deed", "the action's name", "actions in words"),
+    Capability("render", "a table of numbers", "pictures of states"),
+    Capability("reference_values", "left out", "an expert; exact agreement; advice"),
+)
+
+
+def capabilities(world: World) -> list[tuple[Capability, bool]]:
+    """What a world may offer, and whether it does so by itself."""
+    base = vars(World)
+
+    def own(name: str) -> bool:
+        given = getattr(type(world), name)
+        return given is not base.get(name) and (name not in base or given != base[name])
+
+    return [(one, own(one.method)) for one in CAPABILITIES]
+
+
+def require_sound(world: World) -> World:
+    """Return a world in which no fault is found.
+
+    Raises:
+        DomainError: there are some; says the first.
+    """
+    found = faults_of(world)
+    if found:
+        more = f" (and {len(found) - 1} more: python -m mirror_ppl.check_domain)" * (len(found) > 1)
+        raise DomainError(f"{type(world).__name__}: {found[0]}{more}")
+    return world
+
+
+def faults_of(world: World) -> list[str]:
+    """What is wrong with a world, each with what was expected and what was given.
+
+    Rounds of random actions are played; where they cannot be, what comes later is not looked at.
+    """
+    faults: list[str] = _of_names(world)
+    if faults:
+        return faults
+    try:
+        with torch.random.fork_rng(devices=[]):
+            for check in (_begins, _goes_on, _looks):
+                faults += check(world)
+                if faults:
+                    return faults
+    except _CallError as error:
+        return [str(error)]
+    return faults
+
+
+class _CallError(Exception):
+    """A method of the world raised something."""
+
+
+def _call(world: World, name: str, *arguments: Any) -> Any:
+    try:
+        return getattr(world, name)(*arguments)
+    except (Exception, SystemExit) as error:
+        raise _CallError(f"{name} fails: {describe(error)}") from error
+
+
+def _of_names(world: World) -> list[str]:
+    found = []
+    if len(world.actions) < 2:  # noqa: PLR2004 - one to choose from is none
+        found.append(f"actions: expected at least 2, found {len(world.actions)}")
+    if not world.ego_features:
+        found.append("ego_features: expected at least one, found none")
+    if not (isinstance(world.horizon, int) and world.horizon > 0):
+        found.append(f"horizon: expected a whole number above 0, found {world.horizon!r}")
+    if list(world.reach_bins) != sorted(set(world.reach_bins)):
+        found.append(f"reach_bins: expected growing numbers, found {world.reach_bins}")
+    for name in ("actions", "settings", "reward_terms"):
+        names = getattr(world, name)
+        if isinstance(names, str) or len(set(names)) < len(names) or not names:
+            found.append(f"{name}: expected a tuple of different names, found {names!r}")
+    if world.mishap[0] not in world.reward_terms:
+        found.append(f"mishap: expected one of reward_terms, found {world.mishap[0]!r}")
+    return found
+
+
+def _begins(world: World) -> list[str]:
+    """How rounds begin: states of tensors, that a seed determines."""
+    first = _start(world)
+    if not is_dataclass(first) or isinstance(first, type):
+        return [f"initial: expected a dataclass of tensors, found {type(first).__name__}"]
+    for part in fields(first):
+        value = getattr(first, part.name)
+        if not isinstance(value, Tensor):
+            return [f"initial: {part.name} has to be a tensor, found {type(value).__name__}"]
+        if value.shape[:1] != (ROUNDS,):
+            return [
+                f"initial: {part.name} of {ROUNDS} rounds has to begin with the dimension "
+                f"{ROUNDS}, found {tuple(value.shape)}"
+            ]
+    if not _same(first, _start(world)):
+        return ["initial: the same generator gives other states; draw with the one that is passed"]
+    return []
+
+
+def _start(world: World) -> Any:
+    return _call(world, "initial", ROUNDS, torch.Generator().manual_seed(0))
+
+
+def _goes_on(world: World) -> list[str]:
+    """How the world moves: pure, batched, of the same kind, with finite rewards."""
+    state = _start(world)
+    generator = torch.Generator().manual_seed(1)
+    for step in range(world.horizon):
+        action = torch.randint(len(world.actions), (ROUNDS,), generator=generator)
+        before = copy.deepcopy(state)
+        following = _call(world, "transition", state, action)
+        if type(following) is not type(state):
+            return [f"transition: expected {_kind(state)}, found {_kind(following)}"]
+        for part in fields(state):
+            old, new = (getattr(one, part.name) for one in (state, following))
+            if old.shape != new.shape or old.dtype != new.dtype:
+                return [f"transition: {part.name} was {_about(old)} and becomes {_about(new)}"]
+        if not _same(before, state):
+            return ["transition: changes the state that it is given; return a new one"]
+        if not _same(following, _call(world, "transition", state, action)):
+            return ["transition: is not pure, the same state and action lead to others each time"]
+        terms = _call(world, "rewards", state, action, following)
+        if not isinstance(terms, Mapping) or set(terms) != set(world.reward_terms):
+            named = ", ".join(terms) if isinstance(terms, Mapping) else _kind(terms)
+            return [f"rewards: expected the terms {', '.join(world.reward_terms)}, found {named}"]
+        for name, value in terms.items():
+            if fault := _fault("rewards", name, value, (ROUNDS,), float):
+                return [f"{fault} (step {step})"]
+        if fault := _fault("over", "", _call(world, "over", state), (ROUNDS,), bool):
+            return [fault]
+        state = following
+    return []
+
+
+def _looks(world: World) -> list[str]:
+    """What there is to observe, and all that is made of it, along rounds ``[B, T]``."""
+    generator = torch.Generator().manual_seed(2)
+    states, actions = [_start(world)], []
+    for _ in range(world.horizon):
+        actions.append(torch.randint(len(world.actions), (ROUNDS,), generator=generator))
+        states.append(_call(world, "transition", states[-1], actions[-1]))
+    along = map_state(lambda *parts: torch.stack(parts, 1), *states)
+    shape = (ROUNDS, world.horizon + 1)
+    observation = _call(world, "observe", along)
+    expected = {"ego": (*shape, len(world.ego_features))} | {
+        m.name: (*shape, len(m.items), len(m.features)) for m in world.modalities
+    }
+    if not isinstance(observation, Mapping) or set(observation) != set(expected):
+        named = ", ".join(observation) if isinstance(observation, Mapping) else _kind(observation)
+        return [f"observe: expected {', '.join(expected)}, found {named}"]
+    found = [_fault("observe", n, observation[n], own, float) for n, own in expected.items()]
+    if any(found):
+        return [fault for fault in found if fault]
+    items = {m.name: (*shape, len(m.items)) for m in world.modalities}
+    masks = {"communicable": _call(world, "communicable", observation)}
+    for setting in world.settings:
+        masks[f"visibility in {setting}"] = _call(world, "visibility", setting, observation)
+    for name, mask in masks.items():
+        if not isinstance(mask, Mapping) or set(mask) != set(items):
+            return [f"{name}: expected masks of {', '.join(items)}"]
+        found += [_fault(name, key, mask[key], own, bool) for key, own in items.items()]
+    for rule, broken in _call(world, "faults", observation).items():
+        if bool(broken.any()):
+            found.append(f"observe: {rule}, but it is not")
+    direction, distance = _call(world, "distance", observation)
+    found.append(_fault("distance", "", distance, items["visual"], None))
+    if bool((direction < 0).any()) or bool((direction >= len(world.directions)).any()):
+        found.append(f"distance: expected directions from 0 to {len(world.directions) - 1}")
+    elif float(distance.max()) > world.reach_bins[-1]:
+        found.append(
+            f"reach_bins: the last one has to be all the world, {float(distance.max()):g} "
+            f"{world.reach_unit}, found {world.reach_bins[-1]:g}"
+        )
+    for name, value in _call(world, "symbols", observation).items():
+        size = world.symbol_sizes[name]
+        found.append(_fault("symbols", name, value, (*expected[name][:-1], size), float))
+    behind = _call(world, "state_behind", observation)
+    again = _call(world, "observe", behind)
+    following = _call(
+        world,
+        "next_observation",
+        {n: v[:, :-1] for n, v in observation.items()},
+        torch.stack(actions, 1),
+    )
+    for name, value in observation.items():
+        if bool(((again[name] - value).abs() > TOLERANCE).any()):
+            found.append(f"state_behind: {name} of the state is not what was observed")
+        elif bool(((following[name] - value[:, 1:]).abs() > TOLERANCE).any()):
+            found.append(
+                f"state_behind: {name} goes on otherwise than from the true state; something that "
+                "matters cannot be observed"
+            )
+    if offers(world, "reference_values"):
+        values = _call(world, "reference_values", along, 0.9)
+        wanted = (*shape, len(world.actions))
+        found.append(_fault("reference_values", "", values, wanted, float))
+    return [fault for fault in found if fault]
+
+
+def _fault(where: str, name: str, value: Any, shape: tuple[int, ...], kind: type | None) -> str:
+    """What is wrong with a tensor, or nothing."""
+    named = f"{where}: {name}".rstrip(": ")
+    if not isinstance(value, Tensor):
+        return f"{named} has to be a tensor, found {_kind(value)}"
+    if tuple(value.shape) != shape:
+        return f"{named} has shape {tuple(value.shape)}, expected {shape}"
+    if kind is bool and value.dtype != torch.bool:
+        return f"{named} has {value.dtype}, expected torch.bool"
+    if kind is float and value.dtype != torch.get_default_dtype():
+        return f"{named} has {value.dtype}, expected {torch.get_default_dtype()}"
+    if value.is_floating_point() and not bool(value.isfinite().all()):
+        return f"{named} has {value[~value.isfinite()][0].item():g}, expected finite numbers"
+    return ""
+
+
+def _kind(value: Any) -> str:
+    return type(value).__name__
+
+
+def _about(value: Tensor) -> str:
+    return f"{value.dtype} {tuple(value.shape)}".removeprefix("torch.")
+
+
+def _same(first: Any, second: Any) -> bool:
+    return all(
+        torch.equal(getattr(first, part.name), getattr(second, part.name)) for part in fields(first)
+    )

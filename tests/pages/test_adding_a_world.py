@@ -1,0 +1,240 @@
+"""The page about worlds of one's own: its file, its commands, and what is refused."""
+
+import re
+import shlex
+from importlib import import_module
+
+import pytest
+import torch
+from paths import ROOT
+from running import command
+
+import mirror_ppl
+from mirror_ppl.domains import DOMAINS, World, add_domain, get_domain
+from mirror_ppl.domains.checking import CAPABILITIES, faults_of
+from mirror_ppl.domains.registry import load_world
+from mirror_ppl.errors import DomainError, UnknownNameError
+from mirror_ppl.inference.results.posterior_predictive import predict_rounds
+from mirror_ppl.people import simulate, simulated_people
+
+PAGE = (ROOT / "docs" / "adding_a_world.md").read_text()
+FILE = ROOT / "docs" / "examples" / "round_table.py"
+WORLD = f"{FILE}:RoundTable"
+SMALL = {
+    "train": {"--phases": "1", "--steps": "20"},
+    "simulate": {"--people": "2", "--rounds": "5"},
+    "fit": {"--train-rounds": "3", "--draws": "50", "--jobs": "2"},
+    "assist": {"--rounds": "1", "--people": "1", "--draws": "4", "--jobs": "1"},
+}
+
+
+def test_the_page_shows_the_whole_file():
+    assert FILE.read_text() in PAGE
+    assert FILE.read_text().count("\n") <= 100
+
+
+def test_the_page_lists_what_a_world_may_offer():
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+?) \|$", PAGE, re.MULTILINE)
+    assert rows == [(one.method, one.otherwise, one.gives) for one in CAPABILITIES]
+
+
+@pytest.fixture(scope="module")
+def gone_through(tmp_path_factory):
+    """The folder in which all commands of the page were run, with small settings."""
+    folder = tmp_path_factory.mktemp("table")
+    lines = [line for line in PAGE.splitlines() if line.startswith("python -m mirror_ppl.")]
+    assert len(lines) == 5
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        (folder / "docs").symlink_to(ROOT / "docs")
+        for line in lines:
+            _, _, module, *given = shlex.split(line)
+            name = module.removeprefix("mirror_ppl.")
+            for option, value in SMALL.get(name, {}).items():
+                if option in given:
+                    place = given.index(option)
+                    del given[place : place + 2]
+                given += [option, value]
+            own = import_module(f"mirror_ppl.commands.{name}")
+            assert command(own, *given) == 0, line
+    return folder
+
+
+def test_every_command_of_the_page_works(gone_through):
+    made = {path.name for path in (gone_through / "runs" / "table").iterdir()}
+    assert {"posterior.nc", "summary.json", "sight.png", "check.png"} <= made
+    assert (gone_through / "runs" / "round_table_self_model.safetensors").exists()
+
+
+def test_it_is_inferred_from_python(gone_through, monkeypatch):
+    monkeypatch.chdir(gone_through)
+    fit = mirror_ppl.infer("runs/table.nc", domain=WORLD, train_rounds=2, draws=20)
+    assert fit.human.domain.name == "round_table"
+    assert fit.plot.sight() is not None
+    with pytest.raises(mirror_ppl.face.InputError, match="recordings are of round_table"):
+        mirror_ppl.infer("runs/table.nc", domain="driving")
+
+
+def test_people_like_the_robot_are_the_human_model(gone_through, monkeypatch):
+    """What simulated people do has the probabilities that the program gives them."""
+    monkeypatch.chdir(gone_through)
+    get_domain(WORLD)
+    rounds = simulate("round_table", "dark", "diverse", 3, 4, seed=5, told=0.2)
+    people = simulated_people("round_table", "dark", "diverse", 3, 5)
+    human, known = people.modelled()
+    found = predict_rounds(human, rounds, known)[0]
+    entropy = torch.special.entr(found.exp()).sum(-1)
+    # A lapse has probability 1e-6 in place of none.
+    assert torch.allclose(entropy[rounds.mask], rounds.action_entropy[rounds.mask], atol=1e-4)
+    paper = simulated_people("round_table", "dark", "paper", 3, 5)
+    assert paper.modelled() is None
+    assert torch.equal(paper.consistency, people.consistency)
+
+
+def test_the_tables_of_a_study(gone_through, monkeypatch, tmp_path):
+    from mirror_ppl.commands import calibrate, evaluate
+
+    monkeypatch.chdir(gone_through)
+    args = ["--domain", WORLD, "--people", "2", "--seeds", "1", "--rounds", "1", "--jobs", "1"]
+    some = [
+        "--setting",
+        "dark",
+        "--models",
+        "mirror",
+        "base-rate",
+        "--out",
+        tmp_path / "prediction",
+    ]
+    assert command(evaluate, "prediction", *args, *some) == 0
+    few = ["--domain", WORLD, "--people", "2", "--rounds", "2", "--draws", "20", "--jobs", "2"]
+    assert command(calibrate, *few, "--out", tmp_path / "calibration") == 0
+
+
+def world(**changes):
+    """The round table with other methods or attributes."""
+    return type("Changed", (type(load_world(WORLD)),), changes)
+
+
+def start_of_numbers(self, batch, generator, scenario=None):
+    return torch.zeros(batch)
+
+
+def careless(self, batch, generator, scenario=None):
+    state = type(self).__mro__[1].initial(self, batch, generator)
+    return type(state)(torch.randint(1, 4, (batch,)), state.puddle, state.has_tea)
+
+
+def forgetful(self, observation):
+    state = type(self).__mro__[1].state_behind(self, observation)
+    return type(state)(state.pot, 0 * state.puddle, state.has_tea)
+
+
+def by_chance(self, state, action):
+    after = type(self).__mro__[1].transition(self, state, action)
+    return type(after)(after.pot, torch.randint(1, 4, after.puddle.shape), after.has_tea)
+
+
+def in_place(self, state, action):
+    state.puddle.add_(1)
+    return state
+
+
+def nowhere(self, state, action, following):
+    return {
+        "tea": torch.full(action.shape, torch.nan),
+        "puddle": 0.0 * action,
+        "step": 0.0 * action,
+    }
+
+
+def broken(self, state):
+    raise RuntimeError("the lamp is out")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"actions": ("wait",)}, "actions: expected at least 2, found 1"),
+        ({"ego_features": ()}, "ego_features: expected at least one, found none"),
+        ({"mishap": ("fire", "fires")}, "mishap: expected one of reward_terms, found 'fire'"),
+        ({"reach_bins": (0.0, 2.0)}, "the last one has to be all the world, 3 places, found 2"),
+        ({"initial": start_of_numbers}, "initial: expected a dataclass of tensors, found Tensor"),
+        ({"initial": careless}, "draw with the one that is passed"),
+        ({"transition": by_chance}, "transition: is not pure"),
+        ({"transition": in_place}, "transition: changes the state that it is given"),
+        ({"rewards": nowhere}, "rewards: tea has nan, expected finite numbers (step 0)"),
+        ({"rewards": lambda *_: {}}, "rewards: expected the terms tea, puddle, step, found "),
+        ({"observe": lambda *_: {}}, "observe: expected ego, visual, found "),
+        ({"observe": broken}, "observe fails: RuntimeError: the lamp is out"),
+        ({"state_behind": forgetful}, "state_behind: visual of the state is not what was observed"),
+        ({"levels": {"offset": range(3)}}, "offset of visual has to be one of [0, 1, 2]"),
+        ({"visibility": lambda *_: {}}, "visibility in light: expected masks of visual"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(changes, message):
+    kind = world(**changes)
+    if "observe" in changes:
+        kind.over = lambda self, state: state.has_tea
+    (fault, *_) = faults_of(kind())
+    assert message in fault
+    with pytest.raises(DomainError, match="^Changed: "):
+        add_domain(kind)
+
+
+def test_a_sound_world_has_no_faults_and_shipped_names_are_taken():
+    assert faults_of(load_world(WORLD)) == []
+    for name in DOMAINS:
+        with pytest.raises(DomainError, match=f"mirror_ppl has a world {name} itself"):
+            add_domain(world(name=name))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("nowhere.py:World", "there is no such file"),
+        (f"{FILE}:Table", "has no class Table derived from mirror_ppl.domains.World"),
+        (str(FILE), "is not of the form path/to/file.py:Class"),
+        (3, "a world is derived from mirror_ppl.World, not int"),
+    ],
+)
+def test_what_is_no_world(given, message):
+    with pytest.raises(DomainError, match=re.escape(message)):
+        add_domain(given)
+
+
+def test_what_only_the_author_knows_is_asked_for():
+    with pytest.raises(DomainError, match="Empty needs modalities"):
+        load_world(type("Empty", (World,), dict.fromkeys(World.__abstractmethods__, broken)))
+    with pytest.raises(UnknownNameError, match='unknown domain "tea"'):
+        get_domain("tea")
+
+
+def test_a_bad_world_ends_a_command_with_one_line(tmp_path, capsys):
+    from mirror_ppl.commands import check_domain
+    from mirror_ppl.commands import simulate as simulate_command
+
+    bad = tmp_path / "bad.py"
+    bad.write_text(FILE.read_text().replace('"puddle": -2.0', '"puddel": -2.0'))
+    spec = f"{bad}:RoundTable"
+    assert command(simulate_command, "--domain", spec, "--out", tmp_path / "x.nc") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: RoundTable: rewards: expected the terms tea, puddle, step")
+    assert command(check_domain, spec) == 1
+    assert "1 thing wrong" in capsys.readouterr().out
+    assert command(check_domain, WORLD) == 0
+    assert "left out" in capsys.readouterr().out
+
+
+def test_memory_keeps_what_has_not_changed_and_what_lasts():
+    from mirror_ppl.domains.memory import LastSeen
+
+    table = load_world(WORLD)
+    seen = torch.tensor([True, False])
+    for lasting, known in (((), [False, False]), (("pot",), [True, False])):
+        memory = LastSeen.nothing(table.modalities)
+        for pot, mask in ((1.0, seen), (1.0, ~seen & False), (2.0, ~seen & False)):
+            now = {"visual": torch.tensor([[pot], [3.0]])}
+            memory = memory.after(table.modalities, lasting, now, {"visual": mask})
+            if pot == 1.0:
+                assert memory.items(table.modalities)["visual"].tolist() == [True, False]
+        assert memory.items(table.modalities)["visual"].tolist() == known
