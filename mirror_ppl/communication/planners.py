@@ -13,6 +13,7 @@ from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Obj
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.rollouts import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.search import Automatic
+from mirror_ppl.domains.registry import settings_of
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models.implants import LEAST_PROBABILITY
 from mirror_ppl.models.world_knowledge import planning_domain
@@ -54,7 +55,8 @@ class PlannerOptions:
     def of(cls, domain: str, **changes: Any) -> Self:
         """The settings for a domain, with changes; None leaves what is set for the domain."""
         given = {name: value for name, value in changes.items() if value is not None}
-        return cls(**(BY_DOMAIN.get(domain, {}) | given))
+        own = BY_DOMAIN.get(domain) or settings_of(domain, "planning", cls)
+        return cls(**({**own} | given))
 
 
 BY_DOMAIN: dict[str, dict[str, Any]] = {

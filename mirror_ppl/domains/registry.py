@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
+from dataclasses import fields
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
@@ -117,3 +120,19 @@ def get_domain(name: str) -> Domain:
         return add_domain(entry.load())
     installed = [entry.name for entry in entry_points(group=ENTRY_POINTS)]
     raise UnknownNameError.of("domain", name, dict.fromkeys([*DOMAINS, *_ADDED, *installed]))
+
+
+def settings_of(name: str, kind: str, options: type) -> Mapping[str, Any]:
+    """Settings that a world of somebody's own has set: ``training`` or ``planning``.
+
+    Raises:
+        DomainError: there is no such setting.
+    """
+    if name in DOMAINS:
+        return {}
+    own = getattr(get_domain(name), kind)
+    known = [field.name for field in fields(options)]
+    for each in own:
+        if each not in known:
+            raise DomainError(f"{name}: {kind} has {each}, expected some of {', '.join(known)}")
+    return own

@@ -53,6 +53,9 @@ class World(ABC):
             feature as one number for each level, and others as a number in units of their scales.
         lasting: items that people keep in mind once they were seen or told of, however these
             change; of others they keep what has not changed since.
+        training: settings of :class:`~mirror_ppl.training.self_model.SelfModelOptions` that differ
+            in this world, by name.
+        planning: those of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
         mishap: reward term of what people should be kept from, and what several are called.
     """
 
@@ -68,6 +71,8 @@ class World(ABC):
     reach_bins: ClassVar[tuple[float, ...]]
     levels: ClassVar[Mapping[str, range]] = {}
     lasting: ClassVar[tuple[str, ...]] = ()
+    training: ClassVar[Mapping[str, Any]] = {}
+    planning: ClassVar[Mapping[str, Any]] = {}
     mishap: ClassVar[tuple[str, str]]
 
     scenarios: ClassVar[tuple[str, ...]] = ("any",)

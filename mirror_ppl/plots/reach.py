@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mirror_ppl.domains import get_domain
+from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import draws, explain, of_person, people, truth
@@ -22,8 +23,12 @@ DARK = 0.6
 
 
 def has_reach(data: az.InferenceData) -> bool:
-    """Whether the posterior says how far people see in each direction of the world."""
-    return all(SIGHT + name in data["posterior"] for name in _domain(data).directions)
+    """Whether the world is known and the posterior says how far people see in each direction."""
+    try:
+        directions = _domain(data).directions
+    except UnknownNameError:
+        return False
+    return all(SIGHT + name in data["posterior"] for name in directions)
 
 
 def reach_picture(data: az.InferenceData) -> Picture:

@@ -25,6 +25,7 @@ from torch import Tensor
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.domains.capabilities import offers
+from mirror_ppl.domains.registry import settings_of
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
@@ -92,7 +93,8 @@ class SelfModelOptions:
             changes: settings by name; None leaves what is set for the domain.
         """
         given = {name: value for name, value in changes.items() if value is not None}
-        return cls(**(BY_DOMAIN.get(domain, {}) | given))
+        own = BY_DOMAIN.get(domain) or settings_of(domain, "training", cls)
+        return cls(**({**own} | given))
 
     def __post_init__(self) -> None:
         for name in ("phases", "rounds", "steps", "batch", "stride"):

@@ -1,0 +1,326 @@
+"""Any small deterministic Gymnasium environment as a world: all that can happen in it, tabulated.
+
+People are inferred and messages are planned by leading thousands of courses of a round at once,
+which an environment that steps one course at a time cannot do. So every state that can be reached
+from some seeds is visited once, each action is tried there, and what comes of it is written into
+tables. Then the world is a look-up, and exact values come for free. The tables are kept in a file,
+for the next command.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import os
+import pickle
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
+from mirror_ppl.domains.base import Observation
+from mirror_ppl.domains.world import World
+from mirror_ppl.errors import CheckpointError, DomainError
+from mirror_ppl.progress import Progress
+from mirror_ppl.row_hashing import as_whole_numbers, row_numbers
+
+SWEEPS = 1000
+"""Of value iteration at most."""
+CLOSE = 1e-6
+TRIED_TWICE = 200
+"""States that are tried again when they are reached by another way: is all of them observed?"""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Which state of the table, ``[...]``."""
+
+    number: Tensor
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Everything that can happen, of S states.
+
+    Attributes:
+        observation: all that can be observed of each, ``[S, ...]``.
+        following: the state after each action ``[S, A]``.
+        terms: reward terms of each action by name, ``[S, A]``.
+        over: where all is done, ``[S]``.
+        begins: where rounds may begin, ``[S]``.
+    """
+
+    observation: dict[str, Tensor]
+    following: Tensor
+    terms: dict[str, Tensor]
+    over: Tensor
+    begins: Tensor
+
+
+class GymnasiumWorld(World):
+    """A world that is a Gymnasium environment; derive from it.
+
+    What it has to say besides the environment is what there is to see. The environment has to be
+    deterministic between resets, and what is not observed must not matter.
+
+    Attributes:
+        moves: the environment's actions that people may take, in the order of ``actions``; the
+            first ones unless given.
+        layouts: how many resets, with the seeds 0, 1 and so on, the world is made of.
+        most_states: with more states than this an environment is refused.
+    """
+
+    moves: ClassVar[tuple[int, ...]] = ()
+    layouts: ClassVar[int] = 20
+    most_states: ClassVar[int] = 100_000
+
+    @abstractmethod
+    def make(self) -> gym.Env:
+        """The environment; it is reset and stepped, and copied by pickling."""
+
+    @abstractmethod
+    def look(self, env: Any) -> Mapping[str, Any]:
+        """What there is to observe now: ``ego`` of E numbers, each modality of K times F."""
+
+    def terms(self, env: Any, action: int, reward: float, terminated: bool) -> dict[str, float]:
+        """Reward terms of a step by name, the environment being as it is afterwards."""
+        del env, action, terminated
+        return {self.reward_terms[0]: reward}
+
+    def begins(self, env: Any) -> bool:
+        """Whether rounds may begin in a state that is no reset, as when one starts anywhere."""
+        del env
+        return False
+
+    @cached_property
+    def tables(self) -> Tables:
+        """All that can happen; read from its file, or worked out.
+
+        Raises:
+            DomainError: the environment fails, has actions that are not numbered, is not
+                deterministic, or has too many states.
+        """
+        path, identity = _file(type(self)), {"world": self.name}
+        if path is None:
+            return _visited(self)
+        try:
+            content = read_checkpoint(path, identity)
+        except (CheckpointError, OSError):
+            content = vars(_visited(self))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_checkpoint(path, identity, content)
+        return Tables(**{part.name: content[part.name] for part in fields(Tables)})
+
+    def initial(
+        self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
+    ) -> Place:
+        """One of the states in which rounds may begin, all alike."""
+        del scenario
+        return self._drawn(self.tables.begins, batch, generator)
+
+    def anywhere(self, batch: int, generator: torch.Generator) -> Place:
+        """Any state in which something is still to be done."""
+        return self._drawn(~self.tables.over, batch, generator)
+
+    def _drawn(self, where: Tensor, batch: int, generator: torch.Generator) -> Place:
+        device = generator.device
+        known = where.nonzero().squeeze(-1).to(device)
+        return Place(known[torch.randint(len(known), (batch,), generator=generator, device=device)])
+
+    def transition(self, state: Place, action: Tensor) -> Place:
+        """Looked up."""
+        return Place(self.tables.following.to(action.device)[state.number, action])
+
+    def rewards(self, state: Place, action: Tensor, following: Place) -> dict[str, Tensor]:
+        """Looked up."""
+        del following
+        tables = self.tables.terms
+        return {name: each.to(action.device)[state.number, action] for name, each in tables.items()}
+
+    def over(self, state: Place) -> Tensor:
+        """Where the environment has terminated."""
+        return self.tables.over.to(state.number.device)[state.number]
+
+    def observe(self, state: Place) -> Observation:
+        """Looked up."""
+        device = state.number.device
+        return {
+            name: value.to(device)[state.number] for name, value in self.tables.observation.items()
+        }
+
+    def state_behind(self, observation: Observation) -> Place:
+        """The state with this observation; one that was never visited is taken for the nearest."""
+        rows = _rows(observation, observation["ego"].shape[:-1])
+        names, order = self._names
+        names, order = names.to(rows.device), order.to(rows.device)
+        place = torch.searchsorted(names, row_numbers(rows)).clamp(max=len(names) - 1)
+        found = order[place]
+        strange = (_rows(self.tables.observation, ()).to(rows.device)[found] != rows).any(-1)
+        if bool(strange.any()):
+            found = found.clone()
+            found[strange] = self._nearest({n: v[strange] for n, v in observation.items()})
+        return Place(found)
+
+    @cached_property
+    def _names(self) -> tuple[Tensor, Tensor]:
+        return tuple(row_numbers(_rows(self.tables.observation, ())).sort())
+
+    def nearest(self, observation: Observation) -> Observation:
+        """The observation of the nearest state, features in units of their scales."""
+        shape = observation["ego"].shape[:-1]
+        flat = {n: v.reshape(-1, *v.shape[len(shape) :]) for n, v in observation.items()}
+        return self.observe(Place(self._nearest(flat).view(shape)))
+
+    def _nearest(self, observation: Observation) -> Tensor:
+        """Numbers ``[n]`` of the states nearest to observations ``[n, ...]``."""
+        known, own = (
+            torch.cat([part.flatten(1) for part in self._scaled(each).values()], -1)
+            for each in (self.tables.observation, observation)
+        )
+        parts = own.split(1024)
+        return torch.cat([torch.cdist(part, known.to(part), p=1).argmin(-1) for part in parts])
+
+    def _scaled(self, observation: Observation) -> dict[str, Tensor]:
+        scales = {m.name: torch.tensor(m.scales) for m in self.modalities}
+        return {
+            name: observation[name] / scales[name].to(observation[name])
+            if name in scales
+            else value
+            for name, value in sorted(observation.items())
+        }
+
+    def reference_values(self, state: Place, discount: float) -> Tensor:
+        """Exact values ``[..., A]`` by value iteration; of a discount of 1 to the horizon."""
+        known = self.__dict__.setdefault("_values", {})
+        if discount not in known:
+            tables, reward = self.tables, sum(self.tables.terms.values())
+            values = torch.zeros_like(torch.as_tensor(reward))
+            for _ in range(SWEEPS if discount < 1 else self.horizon):
+                after = values.amax(-1).masked_fill(tables.over, 0.0)
+                new = reward + discount * after[tables.following]
+                done = bool((new - values).abs().max() < CLOSE)
+                values = new
+                if done:
+                    break
+            known[discount] = values
+        return known[discount].to(state.number.device)[state.number]
+
+
+def _rows(observation: Observation, shape: tuple[int, ...] | torch.Size) -> Tensor:
+    """Observations as whole numbers ``[*shape, N]``, in the order of names."""
+    dimensions = len(shape) or 1
+    parts = [
+        as_whole_numbers(part).flatten(dimensions)
+        if part.dim() > dimensions
+        else as_whole_numbers(part)[..., None]
+        for _, part in sorted(observation.items())
+    ]
+    return torch.cat(parts, -1)
+
+
+def _file(kind: type[GymnasiumWorld]) -> Path | None:
+    """Where tables of a world are kept; other code has another file, and code of no file none."""
+    content = f"{kind.version} {kind.layouts} {kind.horizon} {kind.moves} {gym.__version__}"
+    try:
+        for each in kind.__mro__:
+            if issubclass(each, GymnasiumWorld):
+                content += inspect.getsource(each) + Path(inspect.getfile(each)).read_text()
+    except (OSError, TypeError):
+        return None
+    digest = hashlib.sha256(content.encode()).hexdigest()[:16]
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return root / "mirror_ppl" / f"{kind.__name__}-{digest}.pt"
+
+
+def _visited(world: GymnasiumWorld) -> Tables:
+    """Visit every state that can be reached."""
+    env = world.make()
+    if not isinstance(env.action_space, gym.spaces.Discrete):
+        raise DomainError(
+            f"{world.name}: expected actions that are numbered (Discrete), found {env.action_space}"
+        )
+    moves = world.moves or tuple(range(len(world.actions)))
+    if len(moves) != len(world.actions):
+        raise DomainError(f"{world.name}: {len(world.actions)} actions, but {len(moves)} moves")
+    numbers: dict[bytes, int] = {}
+    seen: list[dict[str, Tensor]] = []
+    waiting: list[bytes] = []
+    begins, over, following, terms = [], [], [], []
+    again: list[tuple[int, bytes]] = []
+
+    def visit(end: bool, begin: bool = False) -> int:
+        own = {
+            name: torch.tensor(part, dtype=torch.get_default_dtype())
+            for name, part in sorted(world.look(env.unwrapped).items())
+        }
+        key = pickle.dumps([part.tolist() for part in own.values()] + [end])
+        number = numbers.get(key)
+        if number is None:
+            number = numbers[key] = len(seen)
+            if len(seen) >= world.most_states:
+                raise DomainError(
+                    f"{world.name}: more than {world.most_states} states; fewer layouts, or a "
+                    "smaller world, or more of them in most_states"
+                )
+            seen.append(own)
+            over.append(end)
+            begins.append(False)
+            waiting.append(b"" if end else pickle.dumps(env))
+        elif number < len(following) and not end and len(again) < TRIED_TWICE:
+            again.append((number, pickle.dumps(env)))
+        begins[number] |= not end and (begin or world.begins(env.unwrapped))
+        return number
+
+    def tried(snapshot: bytes) -> list[tuple[int, dict[str, float]]]:
+        nonlocal env
+        found = []
+        for move in moves:
+            env = pickle.loads(snapshot)
+            _, reward, terminated, _, _ = env.step(move)
+            found.append(
+                (
+                    visit(bool(terminated)),
+                    world.terms(env.unwrapped, move, float(reward), bool(terminated)),
+                )
+            )
+        return found
+
+    with Progress(f"visit {world.name}", world.layouts) as progress:
+        for seed in range(world.layouts):
+            env.reset(seed=seed)
+            visit(False, begin=True)
+            while len(following) < len(seen):
+                number = len(following)
+                if over[number]:
+                    outcome = [(number, dict.fromkeys(world.reward_terms, 0.0))] * len(moves)
+                else:
+                    outcome = tried(waiting[number])
+                    waiting[number] = b""
+                following.append([one for one, _ in outcome])
+                terms.append([own for _, own in outcome])
+            progress.advance()
+        for number, snapshot in tuple(again):
+            if [one for one, _ in tried(snapshot)] != following[number]:
+                raise DomainError(
+                    f"{world.name}: the same observation leads to different ones, as after "
+                    f"{seen[number]}; something that matters cannot be observed"
+                )
+    return Tables(
+        {name: torch.stack([one[name] for one in seen]) for name in seen[0]},
+        torch.tensor(following),
+        {
+            name: torch.tensor(
+                [[own[name] for own in row] for row in terms], dtype=torch.get_default_dtype()
+            )
+            for name in world.reward_terms
+        },
+        torch.tensor(over),
+        torch.tensor(begins),
+    )

@@ -1,0 +1,159 @@
+"""Gymnasium environments as worlds: tables that are the environment, and what is refused."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from paths import ROOT
+
+from mirror_ppl.domains import Modality
+from mirror_ppl.domains.checking import faults_of
+from mirror_ppl.domains.gymnasium_world import GymnasiumWorld, Place
+from mirror_ppl.domains.registry import load_world
+from mirror_ppl.errors import DomainError
+
+UNLOCKING = f"{ROOT / 'docs' / 'examples' / 'unlocking.py'}:Unlocking"
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+class Row(gym.Env):
+    """A row of five places; the prize is at one end of it."""
+
+    observation_space = gym.spaces.Discrete(5)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.prize = 2, int(self.np_random.integers(2)) * 4
+        self.taken = 0
+        return self.place, {}
+
+    def step(self, action):
+        self.taken += 1
+        self.place = min(max(self.place + (-1, 0, 1)[action], 0), 4)
+        end = self.place == self.prize
+        return self.place, 3.0 * end - 0.1, end, False, {}
+
+
+class Shelf(GymnasiumWorld):
+    modalities = (Modality("visual", ("prize",), ("offset",), ("places",), (4.0,), 0.01),)
+    ego_features = ("place",)
+    actions = ("left", "wait", "right")
+    horizon = 6
+    positions = ("offset",)
+    layouts = 8
+
+    def make(self):
+        return Row()
+
+    def look(self, env):
+        return {"ego": [env.place], "visual": [[env.prize - env.place]]}
+
+
+def test_every_state_is_visited_once():
+    shelf = Shelf()
+    assert faults_of(shelf) == []
+    # Five places with the prize at either end; rounds begin in the middle.
+    assert len(shelf.tables.over) == 10
+    assert int(shelf.tables.over.sum()) == int(shelf.tables.begins.sum()) == 2
+    assert shelf.observe(shelf.initial(50, torch.Generator().manual_seed(0)))["ego"].eq(2).all()
+
+
+def test_values_are_exact():
+    shelf = Shelf()
+    state = shelf.state_behind({"ego": torch.tensor([[2.0]]), "visual": torch.tensor([[[2.0]]])})
+    # Two steps to the prize: .9 goes to 2.9 one step later; others lose steps.
+    assert shelf.reference_values(state, 0.5).tolist()[0] == pytest.approx(
+        [-0.1 + 0.5 * (-0.1 + 0.5 * 1.35), -0.1 + 0.5 * 1.35, 1.35]
+    )
+    tables, reward = shelf.tables, sum(shelf.tables.terms.values())
+    values = shelf.reference_values(Place(torch.arange(10)), 0.9)
+    after = values.amax(-1).masked_fill(tables.over, 0.0)[tables.following]
+    assert torch.allclose(values, reward + 0.9 * after, atol=1e-5)
+
+
+def test_tables_are_kept_for_the_next_time(tmp_path):
+    first = Shelf().tables
+    (file,) = (tmp_path / "mirror_ppl").iterdir()
+    made = file.stat().st_mtime_ns
+    assert torch.equal(Shelf().tables.following, first.following)
+    assert file.stat().st_mtime_ns == made
+    file.write_bytes(b"damaged")
+    assert torch.equal(Shelf().tables.following, first.following)
+
+
+def test_the_nearest_state_stands_for_what_cannot_be():
+    shelf = Shelf()
+    decoded = {"ego": torch.tensor([[1.9]]), "visual": torch.tensor([[[2.2]]])}
+    near = shelf.nearest(decoded)
+    assert near["ego"].tolist() == [[2.0]]
+    assert near["visual"].tolist() == [[[2.0]]]
+    assert shelf.state_behind(decoded).number == shelf.state_behind(near).number
+
+
+class Hidden(Row):
+    """The way is barred every third time."""
+
+    def step(self, action):
+        return super().step(1 if self.taken % 3 == 2 else action)
+
+
+class Steered(Row):
+    action_space = gym.spaces.Box(-1.0, 1.0)
+
+
+class Broken(Row):
+    def step(self, action):
+        raise RuntimeError("the motor is off")
+
+
+class Chance(Row):
+    def step(self, action):
+        return super().step(int(self.np_random.integers(3)))
+
+
+@pytest.mark.parametrize(
+    ("env", "changes", "message"),
+    [
+        (Hidden, {}, "something that matters cannot be observed"),
+        (Chance, {}, "something that matters cannot be observed"),
+        (Steered, {}, "expected actions that are numbered (Discrete), found Box"),
+        (Broken, {}, "the motor is off"),
+        (Row, {"most_states": 3}, "more than 3 states"),
+        (Row, {"moves": (0, 1)}, "3 actions, but 2 moves"),
+    ],
+)
+def test_what_cannot_be_tabulated_is_refused(env, changes, message):
+    kind = type("Other", (Shelf,), {"make": lambda self: env(), **changes})
+    (fault,) = faults_of(kind())
+    assert message in fault
+    with pytest.raises((DomainError, RuntimeError)):
+        _ = kind().tables
+
+
+def test_minigrid_is_as_it_is_when_it_is_stepped():
+    kind = type("Few", (type(load_world(UNLOCKING)),), {"layouts": 2})
+    world = kind()
+    chooser = np.random.default_rng(0)
+    for seed in range(2):
+        env = world.make()
+        env.reset(seed=seed)
+        seen = world.look(env)
+        state = world.state_behind({n: torch.tensor(v).float()[None] for n, v in seen.items()})
+        for _ in range(200):
+            action = int(chooser.integers(len(world.actions)))
+            _, reward, terminated, _, _ = env.step(world.moves[action])
+            following = world.transition(state, torch.tensor([action]))
+            terms = world.rewards(state, torch.tensor([action]), following)
+            wanted = world.terms(env, action, float(reward), terminated)
+            assert {n: float(v) for n, v in terms.items()} == pytest.approx(wanted)
+            for name, value in world.look(env).items():
+                assert torch.equal(world.observe(following)[name][0], torch.tensor(value).float())
+            assert bool(world.over(following)) == terminated
+            if terminated:
+                break
+            state = following
