@@ -21,6 +21,7 @@ from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.console import usable_device
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
+from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.domains import DOMAINS as worlds
 from mirror_ppl.domains import World, add_domain, domain_of, get_domain, require_known
 from mirror_ppl.errors import InputError, UnreliableWeights
@@ -52,6 +53,7 @@ __all__ = [
     "Communicator",
     "Fit",
     "HumanModel",
+    "Recorder",
     "RoundSoFar",
     "World",
     "add_domain",

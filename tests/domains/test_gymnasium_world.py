@@ -6,11 +6,11 @@ import pytest
 import torch
 from paths import ROOT
 
-from mirror_ppl.domains import Modality
+from mirror_ppl.domains import Modality, add_domain
 from mirror_ppl.domains.checking import faults_of
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld, Place
 from mirror_ppl.domains.registry import load_world
-from mirror_ppl.errors import DomainError
+from mirror_ppl.errors import DomainError, InputError, UnknownNameError
 
 UNLOCKING = f"{ROOT / 'docs' / 'examples' / 'unlocking.py'}:Unlocking"
 
@@ -157,3 +157,53 @@ def test_minigrid_is_as_it_is_when_it_is_stepped():
             if terminated:
                 break
             state = following
+
+
+def test_what_is_played_is_recorded(tmp_path):
+    from mirror_ppl.data import load_demonstrations, save_demonstrations
+    from mirror_ppl.data.recorder import Recorder
+
+    shelf = add_domain(Shelf)
+    env = Recorder(Row(), shelf, person="ada")
+    with pytest.raises(InputError, match="no round was played"):
+        env.recordings()
+    with pytest.raises(InputError, match="call reset"):
+        env.step(0)
+    env.reset(seed=0)
+    env.reset(seed=3)
+    toward = 0 if env.env.prize == 0 else 2
+    env.tell("visual", "prize")
+    env.step(1)
+    env.step(toward)
+    assert env.step(toward)[2]
+    with pytest.raises(InputError, match="the round is over"):
+        env.step(0)
+    env.person = "ben"
+    for _ in range(2):
+        env.reset(seed=4)
+        for step in range(6):
+            assert env.step(1)[3] == (step == 5)
+    with pytest.raises(UnknownNameError, match='unknown item "pot"'):
+        env.tell("visual", "pot")
+    env.reset()
+    with pytest.raises(InputError, match="has to be one of"):
+        env.step(7)
+    save_demonstrations(tmp_path / "played.nc", env.recordings())
+    played = load_demonstrations(tmp_path / "played.nc")
+    assert played.people == ("ada", "ben")
+    assert played.round_counts.tolist() == [1, 2]
+    assert played.lengths.tolist() == [[3, 0], [6, 6]]
+    assert played.actions[0, 0, :3].tolist() == [1, toward, toward]
+    assert played.told["visual"][0, 0, :, 0].tolist() == [True, False, False, False, False, False]
+    # What follows from each action is what was recorded.
+    shelf_now = {n: v[1, 0, :-1] for n, v in played.observation().items()}
+    following = shelf.next_observation(shelf_now, played.actions[1, 0])
+    assert torch.equal(following["visual"], played.observation()["visual"][1, 0, 1:])
+
+
+def test_only_worlds_of_environments_are_recorded_so():
+    from mirror_ppl.data.recorder import Recorder
+    from mirror_ppl.domains import get_domain
+
+    with pytest.raises(InputError, match="GymnasiumWorld"):
+        Recorder(Row(), get_domain("driving"))

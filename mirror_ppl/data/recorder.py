@@ -1,0 +1,147 @@
+"""Recordings of rounds that somebody plays in a Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.domains.base import Domain, require_known
+from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
+from mirror_ppl.errors import InputError
+
+
+class Recorder(gym.Wrapper):
+    """Keeps what happens in an environment, for `fit`.
+
+        env = Recorder(world.make(), world, person="ada")
+        env.reset(); env.tell("visual", "key"); env.step(2); ...
+        save_demonstrations("ada.nc", env.recordings())
+
+    A round begins with a reset and ends when the environment terminates or the world's horizon is
+    reached; rounds without a step are not kept.
+
+    Args:
+        env: the environment that is played, like the world's own.
+        world: says what there is to observe in it, and which actions count.
+        person: id of who plays; change the attribute when somebody else does.
+        setting: one of the world's settings; the last unless given.
+
+    Raises:
+        InputError: the world is no :class:`~mirror_ppl.domains.gymnasium_world.GymnasiumWorld`.
+        UnknownNameError: there is no such setting.
+    """
+
+    def __init__(
+        self, env: gym.Env, world: Domain, person: str = "person-01", setting: str | None = None
+    ) -> None:
+        super().__init__(env)
+        if not isinstance(world, GymnasiumWorld):
+            raise InputError("the world has to be one of a Gymnasium environment (GymnasiumWorld)")
+        self.world, self.person = world, person
+        self.setting = require_known(
+            setting or world.settings[-1], "setting", world.settings, world.name
+        )
+        self._moves = world.moves or tuple(range(len(world.actions)))
+        self._rounds: list[_Round] = []
+        self._told: list[tuple[str, int]] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin a round; see `gymnasium.Env.reset`."""
+        found = self.env.reset(seed=seed, options=options)
+        self._rounds.append(_Round(self.person, self.world.look(self.env.unwrapped)))
+        self._told = []
+        return found
+
+    def tell(self, modality: str, *items: str) -> None:
+        """Note that items are communicated before the next action.
+
+        Raises:
+            UnknownNameError: there is no such modality or item.
+        """
+        known = {m.name: m.items for m in self.world.modalities}
+        own = known[require_known(modality, "modality", tuple(known), self.world.name)]
+        for item in items:
+            self._told.append((modality, own.index(require_known(item, "item", own, modality))))
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Play one step; see `gymnasium.Env.step`.
+
+        Raises:
+            InputError: the round has not begun or is over, or the action is none of the world's.
+        """
+        if not self._rounds or self._rounds[-1].over:
+            raise InputError("the round is over or has not begun; call reset()")
+        if action not in self._moves:
+            raise InputError(f"action has to be one of {self._moves} (moves), not {action!r}")
+        found, reward, terminated, truncated, info = self.env.step(action)
+        now = self._rounds[-1]
+        now.add(self._moves.index(action), self._told, self.world.look(self.env.unwrapped))
+        self._told = []
+        truncated = truncated or len(now.actions) == self.world.horizon
+        now.over = terminated or truncated
+        return found, float(reward), terminated, truncated, info
+
+    def recordings(self) -> Demonstrations:
+        """All rounds so far, by person in the order in which they first played.
+
+        Raises:
+            InputError: there are none.
+        """
+        rounds = [one for one in self._rounds if one.actions]
+        if not rounds:
+            raise InputError("no round was played")
+        people = tuple(dict.fromkeys(one.person for one in rounds))
+        own = {name: [one for one in rounds if one.person == name] for name in people}
+        number, steps = max(map(len, own.values())), max(len(one.actions) for one in rounds)
+        shape = (len(people), number)
+        actions = np.full((*shape, steps), -1)
+        lengths = np.zeros(shape, int)
+        first = rounds[0].seen[0]
+        seen = {
+            name: np.full((*shape, steps + 1, *np.shape(part)), np.nan)
+            for name, part in first.items()
+        }
+        told = {
+            m.name: np.zeros((*shape, steps, len(m.items)), bool) for m in self.world.modalities
+        }
+        for person, name in enumerate(people):
+            for place, one in enumerate(own[name]):
+                lengths[person, place] = length = len(one.actions)
+                actions[person, place, :length] = one.actions
+                for key, values in seen.items():
+                    values[person, place, : length + 1] = [part[key] for part in one.seen]
+                for step, said in enumerate(one.told):
+                    for modality, item in said:
+                        told[modality][person, place, step, item] = True
+        return Demonstrations(
+            domain=self.world.name,
+            setting=self.setting,
+            people=people,
+            ego=seen.pop("ego"),
+            observations=seen,
+            actions=actions,
+            round_counts=np.array([len(own[name]) for name in people]),
+            lengths=lengths,
+            told=told,
+        )
+
+
+class _Round:
+    """A round under way: what there was to observe, what was told and done."""
+
+    def __init__(self, person: str, first: Mapping[str, Any]) -> None:
+        self.person, self.over = person, False
+        self.seen: list[Mapping[str, Any]] = [first]
+        self.actions: list[int] = []
+        self.told: list[Sequence[tuple[str, int]]] = []
+
+    def add(self, action: int, told: Sequence[tuple[str, int]], now: Mapping[str, Any]) -> None:
+        self.actions.append(action)
+        self.told.append(told)
+        self.seen.append(now)
