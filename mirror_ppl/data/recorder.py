@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, require_known
@@ -123,12 +124,12 @@ class Recorder(gym.Wrapper):
             domain=self.world.name,
             setting=self.setting,
             people=people,
-            ego=seen.pop("ego"),
-            observations=seen,
-            actions=actions,
-            round_counts=np.array([len(own[name]) for name in people]),
-            lengths=lengths,
-            told=told,
+            ego=torch.from_numpy(seen.pop("ego")),
+            observations={name: torch.from_numpy(part) for name, part in seen.items()},
+            actions=torch.from_numpy(actions),
+            round_counts=torch.tensor([len(own[name]) for name in people]),
+            lengths=torch.from_numpy(lengths),
+            told={name: torch.from_numpy(part) for name, part in told.items()},
         )
 
 

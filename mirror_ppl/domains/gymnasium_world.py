@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import torch
@@ -77,9 +77,9 @@ class GymnasiumWorld(World):
         most_states: with more states than this an environment is refused.
     """
 
-    moves: ClassVar[tuple[int, ...]] = ()
-    layouts: ClassVar[int] = 20
-    most_states: ClassVar[int] = 100_000
+    moves: tuple[int, ...] = ()
+    layouts: int = 20
+    most_states: int = 100_000
 
     @abstractmethod
     def make(self) -> gym.Env:
@@ -170,7 +170,8 @@ class GymnasiumWorld(World):
 
     @cached_property
     def _names(self) -> tuple[Tensor, Tensor]:
-        return tuple(row_numbers(_rows(self.tables.observation, ())).sort())
+        names, order = row_numbers(_rows(self.tables.observation, ())).sort()
+        return names, order
 
     def nearest(self, observation: Observation) -> Observation:
         """The observation of the nearest state, features in units of their scales."""
@@ -196,9 +197,13 @@ class GymnasiumWorld(World):
             for name, value in sorted(observation.items())
         }
 
+    @cached_property
+    def _values(self) -> dict[float, Tensor]:
+        return {}  # by discount, once they were asked for
+
     def reference_values(self, state: Place, discount: float) -> Tensor:
         """Exact values ``[..., A]`` by value iteration; of a discount of 1 to the horizon."""
-        known = self.__dict__.setdefault("_values", {})
+        known = self._values
         if discount not in known:
             tables, reward = self.tables, sum(self.tables.terms.values())
             values = torch.zeros_like(torch.as_tensor(reward))

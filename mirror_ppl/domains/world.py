@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -59,35 +59,35 @@ class World(ABC):
         mishap: reward term of what people should be kept from, and what several are called.
     """
 
-    name: ClassVar[str]
-    version: ClassVar[str] = "1"
-    modalities: ClassVar[tuple[Modality, ...]]
-    ego_features: ClassVar[tuple[str, ...]]
-    actions: ClassVar[tuple[str, ...]]
-    horizon: ClassVar[int]
-    settings: ClassVar[tuple[str, ...]] = ("everyday",)
-    reward_terms: ClassVar[tuple[str, ...]] = ("reward",)
-    positions: ClassVar[tuple[str, ...]] = ()
-    reach_bins: ClassVar[tuple[float, ...]]
-    levels: ClassVar[Mapping[str, range]] = {}
-    lasting: ClassVar[tuple[str, ...]] = ()
-    training: ClassVar[Mapping[str, Any]] = {}
-    planning: ClassVar[Mapping[str, Any]] = {}
-    mishap: ClassVar[tuple[str, str]]
+    name: str
+    version: str = "1"
+    modalities: tuple[Modality, ...]
+    ego_features: tuple[str, ...]
+    actions: tuple[str, ...]
+    horizon: int
+    settings: tuple[str, ...] = ("everyday",)
+    reward_terms: tuple[str, ...] = ("reward",)
+    positions: tuple[str, ...] = ()
+    reach_bins: tuple[float, ...]
+    levels: Mapping[str, range] = {}
+    lasting: tuple[str, ...] = ()
+    training: Mapping[str, Any] = {}
+    planning: Mapping[str, Any] = {}
+    mishap: tuple[str, str]
 
-    scenarios: ClassVar[tuple[str, ...]] = ("any",)
-    over_at_horizon: ClassVar[bool] = True
-    directions: ClassVar[tuple[str, ...]] = ("around",)
-    direction_groups: ClassVar[tuple[tuple[int, ...], ...]] = ((0,),)
-    reach_unit: ClassVar[str]
-    reach_practice: ClassVar[tuple[float, ...]] = ()
-    told_practice: ClassVar[float] = 0.3
-    notice_practice: ClassVar[tuple[float, float]] = (1.0, 1.0)
-    partial_views: ClassVar[Mapping[str, tuple[float, ...]]]
-    assumptions: ClassVar[tuple[str, ...]] = ()
-    settled: ClassVar[bool] = False
-    counterparts: ClassVar[tuple[int | None, ...]]
-    symbol_sizes: ClassVar[Mapping[str, int]]
+    scenarios: tuple[str, ...] = ("any",)
+    over_at_horizon: bool = True
+    directions: tuple[str, ...] = ("around",)
+    direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
+    reach_unit: str
+    reach_practice: tuple[float, ...] = ()
+    told_practice: float = 0.3
+    notice_practice: tuple[float, float] = (1.0, 1.0)
+    partial_views: Mapping[str, tuple[float, ...]]
+    assumptions: tuple[str, ...] = ()
+    settled: bool = False
+    counterparts: tuple[int | None, ...]
+    symbol_sizes: Mapping[str, int]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Work out what follows from the rest.
