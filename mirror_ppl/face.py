@@ -302,6 +302,8 @@ def load_recordings(
     setting = require_known(setting or settings[-1], "setting", settings, domain)
     populations = populations_of(domain)
     population = require_known(population or "paper", "population", populations, domain)
+    if domain not in worlds:
+        raise InputError(f"no recordings of {domain} ship; name a file of them")
     return load_demonstrations(asset_path(f"{domain}_{setting}_{population}.nc"))
 
 

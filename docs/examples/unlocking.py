@@ -68,16 +68,17 @@ class Unlocking(GymnasiumWorld):
     reach_bins = (0.0, 1.0, 2.0, 3.0, 4.0)
     reach_unit = "cells"
     lasting = ("key", "goal")
+    networks = {"encoder": 128, "decoder": 64, "q_network": 200}
     training = {
-        "phases": 150,
-        "rounds": 400,
+        "phases": 300,
+        "rounds": 200,
         "steps": 40,
         "learning_rate": 2e-3,
         "beta": 1.0,
         "beta_decay": 0.98,
         "discount": 0.95,
         "length": 12,
-        "stride": 3,
+        "stride": 2,
         "difference_weight": 4.0,
         "exact": True,
     }

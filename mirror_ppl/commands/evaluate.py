@@ -177,6 +177,8 @@ def _cells(options: Options) -> list[Any]:
 
     worlds = [get_domain(name) for name in options.domain]
     domains = {world.name: world.settings for world in worlds}
+    if len({id(world) for world in worlds}) > len(domains):
+        raise OptionError("--domain: two worlds have the same name; give one another name")
     every = sorted({setting for settings in domains.values() for setting in settings})
     for name in options.setting:
         if name not in every:

@@ -49,12 +49,26 @@ class Recorder(gym.Wrapper):
         self._moves = world.moves or tuple(range(len(world.actions)))
         self._rounds: list[_Round] = []
         self._told: list[tuple[str, int]] = []
+        self._chooser = np.random.default_rng()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin a round; see `gymnasium.Env.reset`."""
+        """Begin a round; see `gymnasium.Env.reset`.
+
+        Without a seed, one of those of which the world is made.
+
+        Raises:
+            InputError: what there is to observe then is none of the world's states.
+        """
+        if seed is None:
+            seed = int(self._chooser.integers(self.world.layouts))
         found = self.env.reset(seed=seed, options=options)
+        if not self.world.knows(self.world.look(self.env.unwrapped)):
+            raise InputError(
+                f"seed {seed} begins in a state that {self.world.name} does not have; its layouts "
+                f"are the seeds 0 to {self.world.layouts - 1}"
+            )
         self._rounds.append(_Round(self.person, self.world.look(self.env.unwrapped)))
         self._told = []
         return found
@@ -138,11 +152,16 @@ class _Round:
 
     def __init__(self, person: str, first: Mapping[str, Any]) -> None:
         self.person, self.over = person, False
-        self.seen: list[Mapping[str, Any]] = [first]
+        self.seen = [_copied(first)]
         self.actions: list[int] = []
         self.told: list[Sequence[tuple[str, int]]] = []
 
     def add(self, action: int, told: Sequence[tuple[str, int]], now: Mapping[str, Any]) -> None:
         self.actions.append(action)
         self.told.append(told)
-        self.seen.append(now)
+        self.seen.append(_copied(now))
+
+
+def _copied(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """An environment may go on writing in what it has shown."""
+    return {name: np.array(part, float) for name, part in observation.items()}

@@ -120,6 +120,12 @@ def _of_names(world: World) -> list[str]:
         names = getattr(world, name)
         if isinstance(names, str) or len(set(names)) < len(names) or not names:
             found.append(f"{name}: expected a tuple of different names, found {names!r}")
+    known = {*world.ego_features, *(name for m in world.modalities for name in m.features)}
+    for name, levels in world.levels.items():
+        if name not in known:
+            found.append(f"levels: {name} is no feature; there are {', '.join(sorted(known))}")
+        elif not isinstance(levels, range) or not levels:
+            found.append(f"levels: {name} has to have a range that is not empty, found {levels!r}")
     if world.mishap[0] not in world.reward_terms:
         found.append(f"mishap: expected one of reward_terms, found {world.mishap[0]!r}")
     return found
@@ -139,6 +145,8 @@ def _begins(world: World) -> list[str]:
                 f"initial: {part.name} of {ROUNDS} rounds has to begin with the dimension "
                 f"{ROUNDS}, found {tuple(value.shape)}"
             ]
+    scenario = torch.zeros(ROUNDS, dtype=torch.long)
+    _call(world, "initial", ROUNDS, torch.Generator().manual_seed(0), scenario)
     if not _same(first, _start(world)):
         return ["initial: the same generator gives other states; draw with the one that is passed"]
     return []
@@ -209,8 +217,13 @@ def _looks(world: World) -> list[str]:
     for rule, broken in _call(world, "faults", observation).items():
         if bool(broken.any()):
             found.append(f"observe: {rule}, but it is not")
-    direction, distance = _call(world, "distance", observation)
+    placed = _call(world, "distance", observation)
+    if not isinstance(placed, tuple) or len(placed) != 2:  # noqa: PLR2004
+        return [f"distance: expected directions and distances, found {_kind(placed)}"]
+    direction, distance = placed
     found.append(_fault("distance", "", distance, items["visual"], None))
+    if any(found):
+        return [fault for fault in found if fault]
     if bool((direction < 0).any()) or bool((direction >= len(world.directions)).any()):
         found.append(f"distance: expected directions from 0 to {len(world.directions) - 1}")
     elif float(distance.max()) > world.reach_bins[-1]:
@@ -218,10 +231,15 @@ def _looks(world: World) -> list[str]:
             f"reach_bins: the last one has to be all the world, {float(distance.max()):g} "
             f"{world.reach_unit}, found {world.reach_bins[-1]:g}"
         )
-    for name, value in _call(world, "symbols", observation).items():
+    symbols = _call(world, "symbols", observation)
+    if set(symbols) != set(world.symbol_sizes):
+        return [f"symbols: expected {', '.join(world.symbol_sizes)}, found {', '.join(symbols)}"]
+    for name, value in symbols.items():
         size = world.symbol_sizes[name]
         found.append(_fault("symbols", name, value, (*expected[name][:-1], size), float))
     behind = _call(world, "state_behind", observation)
+    if type(behind) is not type(along):
+        return [f"state_behind: expected {_kind(along)}, found {_kind(behind)}"]
     again = _call(world, "observe", behind)
     following = _call(
         world,
@@ -241,7 +259,44 @@ def _looks(world: World) -> list[str]:
         values = _call(world, "reference_values", along, 0.9)
         wanted = (*shape, len(world.actions))
         found.append(_fault("reference_values", "", values, wanted, float))
-    return [fault for fault in found if fault]
+    return [fault for fault in found if fault] or _of_one(world, along, observation)
+
+
+def _of_one(world: World, states: Any, observations: Mapping[str, Tensor]) -> list[str]:
+    """What is only ever asked of one state, and memory: that it can be called at all."""
+    state = map_state(lambda part: part[0, 0], states)
+    now = {name: value[0, 0] for name, value in observations.items()}
+    behind = _call(world, "state_behind", now)
+    again = _call(world, "observe", behind)
+    if any(again[name].shape != value.shape for name, value in now.items()):
+        return ["state_behind: of one observation without a batch expected one state"]
+    _call(world, "next_observation", now, torch.tensor(0))
+    _call(world, "render", state)
+    for modality in world.modalities:
+        for item in modality.items:
+            _call(world, "describe", now, modality.name, item)
+    for action in range(len(world.actions)):
+        _call(world, "deed", now, None, action)
+    _call(world, "anywhere", 2, torch.Generator().manual_seed(0))
+    for name in ("relevance", "decisive", "nearest"):
+        _call(world, name, now)
+    knowledge = _call(world, "nothing_known")
+    unseen = _call(world, "visibility", world.settings[0], now)
+    knowledge = _call(
+        world,
+        "learn",
+        knowledge,
+        now,
+        unseen,
+        lambda seen: unseen,
+    )
+    _call(world, "known", knowledge)
+    assumed, _ = _call(world, "assume", knowledge, now)
+    if set(assumed) != set(world.assumptions):
+        return [f"assume: expected {', '.join(world.assumptions) or 'none'} (assumptions)"]
+    makes = {name: torch.tensor(True) for name in world.assumptions}
+    _call(world, "supposed", state, knowledge, makes)
+    return []
 
 
 def _fault(where: str, name: str, value: Any, shape: tuple[int, ...], kind: type | None) -> str:

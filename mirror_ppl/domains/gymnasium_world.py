@@ -15,27 +15,32 @@ import os
 import pickle
 from abc import abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch
 from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Observation
 from mirror_ppl.domains.world import World
-from mirror_ppl.errors import CheckpointError, DomainError
+from mirror_ppl.errors import CheckpointError, DomainError, OutputError
 from mirror_ppl.progress import Progress
 from mirror_ppl.row_hashing import as_whole_numbers, row_numbers
 
 SWEEPS = 1000
 """Of value iteration at most."""
 CLOSE = 1e-6
+CACHED = ("tables", "_names", "_values")
+"""What is worked out once."""
 TRIED_TWICE = 200
 """States that are tried again when they are reached by another way: is all of them observed?"""
+UNSEEN = "something that matters cannot be observed"
 
 
 @dataclass(frozen=True)
@@ -107,15 +112,16 @@ class GymnasiumWorld(World):
             DomainError: the environment fails, has actions that are not numbered, is not
                 deterministic, or has too many states.
         """
-        path, identity = _file(type(self)), {"world": self.name}
+        path, identity = _file(self), {"world": self.name}
         if path is None:
             return _visited(self)
         try:
             content = read_checkpoint(path, identity)
         except (CheckpointError, OSError):
             content = vars(_visited(self))
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save_checkpoint(path, identity, content)
+            with suppress(OSError, OutputError):  # without room for it, it is done again
+                path.parent.mkdir(parents=True, exist_ok=True)
+                save_checkpoint(path, identity, content)
         return Tables(**{part.name: content[part.name] for part in fields(Tables)})
 
     def initial(
@@ -157,20 +163,27 @@ class GymnasiumWorld(World):
 
     def state_behind(self, observation: Observation) -> Place:
         """The state with this observation; one that was never visited is taken for the nearest."""
-        rows = _rows(observation, observation["ego"].shape[:-1])
+        rows = _rows(observation)
         names, order = self._names
         names, order = names.to(rows.device), order.to(rows.device)
         place = torch.searchsorted(names, row_numbers(rows)).clamp(max=len(names) - 1)
         found = order[place]
-        strange = (_rows(self.tables.observation, ()).to(rows.device)[found] != rows).any(-1)
+        strange = (_rows(self.tables.observation).to(rows.device)[found] != rows).any(-1)
         if bool(strange.any()):
-            found = found.clone()
-            found[strange] = self._nearest({n: v[strange] for n, v in observation.items()})
+            nearest = self._nearest({name: value[strange] for name, value in observation.items()})
+            found = found.masked_scatter(strange, nearest)
         return Place(found)
+
+    def knows(self, observation: Mapping[str, Any]) -> bool:
+        """Whether what `look` says is one of the states that were visited."""
+        one = _tensors(observation)
+        behind = self.tables.observation
+        number = self.state_behind(one).number
+        return all(bool((behind[name][number] == value).all()) for name, value in one.items())
 
     @cached_property
     def _names(self) -> tuple[Tensor, Tensor]:
-        names, order = row_numbers(_rows(self.tables.observation, ())).sort()
+        names, order = row_numbers(_rows(self.tables.observation)).sort()
         return names, order
 
     def nearest(self, observation: Observation) -> Observation:
@@ -218,24 +231,28 @@ class GymnasiumWorld(World):
         return known[discount].to(state.number.device)[state.number]
 
 
-def _rows(observation: Observation, shape: tuple[int, ...] | torch.Size) -> Tensor:
-    """Observations as whole numbers ``[*shape, N]``, in the order of names."""
-    dimensions = len(shape) or 1
-    parts = [
-        as_whole_numbers(part).flatten(dimensions)
-        if part.dim() > dimensions
-        else as_whole_numbers(part)[..., None]
-        for _, part in sorted(observation.items())
-    ]
+def _tensors(observation: Mapping[str, Any]) -> dict[str, Tensor]:
+    dtype = torch.get_default_dtype()
+    return {
+        name: torch.tensor(np.array(part, float), dtype=dtype)
+        for name, part in sorted(observation.items())
+    }
+
+
+def _rows(observation: Observation) -> Tensor:
+    """Observations ``[...]`` as whole numbers ``[..., N]``, in the order of names."""
+    dimensions = observation["ego"].dim() - 1
+    parts = [as_whole_numbers(part).flatten(dimensions) for _, part in sorted(observation.items())]
     return torch.cat(parts, -1)
 
 
-def _file(kind: type[GymnasiumWorld]) -> Path | None:
+def _file(world: GymnasiumWorld) -> Path | None:
     """Where tables of a world are kept; other code has another file, and code of no file none."""
-    content = f"{kind.version} {kind.layouts} {kind.horizon} {kind.moves} {gym.__version__}"
+    kind, given = type(world), {n: v for n, v in vars(world).items() if n not in CACHED}
+    content = f"{kind.version} {kind.layouts} {kind.horizon} {kind.moves} {given} {gym.__version__}"
     try:
-        for each in kind.__mro__:
-            if issubclass(each, GymnasiumWorld):
+        for each in (*kind.__mro__, *type(world.make().unwrapped).__mro__):
+            if each is not object:
                 content += inspect.getsource(each) + Path(inspect.getfile(each)).read_text()
     except (OSError, TypeError):
         return None
@@ -259,13 +276,11 @@ def _visited(world: GymnasiumWorld) -> Tables:
     waiting: list[bytes] = []
     begins, over, following, terms = [], [], [], []
     again: list[tuple[int, bytes]] = []
+    most = 0
 
     def visit(end: bool, begin: bool = False) -> int:
-        own = {
-            name: torch.tensor(part, dtype=torch.get_default_dtype())
-            for name, part in sorted(world.look(env.unwrapped).items())
-        }
-        key = pickle.dumps([part.tolist() for part in own.values()] + [end])
+        own = _tensors(world.look(env.unwrapped))
+        key = pickle.dumps([part.tolist() for part in own.values()])
         number = numbers.get(key)
         if number is None:
             number = numbers[key] = len(seen)
@@ -278,7 +293,9 @@ def _visited(world: GymnasiumWorld) -> Tables:
             over.append(end)
             begins.append(False)
             waiting.append(b"" if end else pickle.dumps(env))
-        elif number < len(following) and not end and len(again) < TRIED_TWICE:
+        elif over[number] != end:
+            raise DomainError(f"{world.name}: all is done or not in {own}; {UNSEEN}")
+        elif number < len(following) and not end and (begin or len(again) < most):
             again.append((number, pickle.dumps(env)))
         begins[number] |= not end and (begin or world.begins(env.unwrapped))
         return number
@@ -299,6 +316,8 @@ def _visited(world: GymnasiumWorld) -> Tables:
 
     with Progress(f"visit {world.name}", world.layouts) as progress:
         for seed in range(world.layouts):
+            # Of each layout a share: what differs between resets may be hidden, too.
+            most = len(again) + max(TRIED_TWICE // world.layouts, 5)
             env.reset(seed=seed)
             visit(False, begin=True)
             while len(following) < len(seen):
@@ -312,10 +331,15 @@ def _visited(world: GymnasiumWorld) -> Tables:
                 terms.append([own for _, own in outcome])
             progress.advance()
         for number, snapshot in tuple(again):
-            if [one for one, _ in tried(snapshot)] != following[number]:
+            found = tried(snapshot)
+            same = [one for one, _ in found] == following[number] and all(
+                abs(own[name] - value) <= CLOSE
+                for (_, own), known in zip(found, terms[number], strict=True)
+                for name, value in known.items()
+            )
+            if not same:
                 raise DomainError(
-                    f"{world.name}: the same observation leads to different ones, as after "
-                    f"{seen[number]}; something that matters cannot be observed"
+                    f"{world.name}: other things follow from {seen[number]} each time; {UNSEEN}"
                 )
     return Tables(
         {name: torch.stack([one[name] for one in seen]) for name in seen[0]},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Mapping
 from dataclasses import fields
 from importlib.metadata import entry_points
@@ -25,8 +26,8 @@ DOMAINS: dict[str, Domain] = {
 }
 """The package's own worlds by name."""
 _ADDED: dict[str, World] = {}
-_NAMES: dict[str, str] = {}
-"""Names of worlds of files that were loaded, by ``path/to/file.py:Class``."""
+_LOADED: dict[tuple[Path, str, int], World] = {}
+"""Worlds of files that were loaded, by file, class and when it was changed last."""
 
 
 def added_worlds() -> tuple[World, ...]:
@@ -73,12 +74,12 @@ def add_domain(world: World | type[World] | str) -> World:
     return know(require_sound(load_world(world)))
 
 
-def code_of(name: str) -> bytes:
-    """The file that a world which was added is written in; nothing of the package's own."""
-    if name in DOMAINS:
+def code_of(domain: Domain) -> bytes:
+    """The file that a world of somebody's own is written in; nothing of the package's own."""
+    if not isinstance(domain, World):
         return b""
     try:
-        return Path(inspect.getfile(type(get_domain(name)))).read_bytes()
+        return Path(inspect.getfile(type(domain))).read_bytes()
     except (OSError, TypeError):  # written at a prompt
         return b""
 
@@ -113,13 +114,31 @@ def get_domain(name: str) -> Domain:
     if name in _ADDED:
         return _ADDED[name]
     if ".py:" in name:
-        if name not in _NAMES:
-            _NAMES[name] = add_domain(name).name
-        return _ADDED[_NAMES[name]]
+        return _of_file(name)
     for entry in entry_points(group=ENTRY_POINTS, name=name):
-        return add_domain(entry.load())
+        try:
+            kind = entry.load()
+        except (Exception, SystemExit) as error:
+            raise DomainError(f"{entry.value} does not import: {describe(error)}") from error
+        world = add_domain(kind)
+        if world.name != name:
+            raise DomainError(f"{entry.value}: is called {world.name}, but its entry point {name}")
+        return world
     installed = [entry.name for entry in entry_points(group=ENTRY_POINTS)]
-    raise UnknownNameError.of("domain", name, dict.fromkeys([*DOMAINS, *_ADDED, *installed]))
+    known = dict.fromkeys([*DOMAINS, *_ADDED, *installed])
+    message = f"{UnknownNameError.of('domain', name, known)}"
+    raise UnknownNameError(f"{message}; a world of your own is --domain path/to/file.py:Class")
+
+
+def _of_file(specification: str) -> World:
+    path, _, kind = specification.rpartition(":")
+    try:
+        key = Path(path).resolve(), kind, os.stat(path).st_mtime_ns
+    except (OSError, ValueError):
+        return add_domain(specification)  # which says what is wrong
+    if key not in _LOADED:
+        _LOADED[key] = add_domain(specification)
+    return know(_LOADED[key])
 
 
 def settings_of(name: str, kind: str, options: type) -> Mapping[str, Any]:

@@ -52,7 +52,8 @@ class World(ABC):
         levels: of features that are whole numbers, which they can be, by name. Networks read such a
             feature as one number for each level, and others as a number in units of their scales.
         lasting: items that people keep in mind once they were seen or told of, however these
-            change; of others they keep what has not changed since.
+            change; others are known where they are as they were last seen.
+        networks: :class:`~mirror_ppl.models.sizes.Sizes` of the robot that differ in this world.
         training: settings of :class:`~mirror_ppl.training.self_model.SelfModelOptions` that differ
             in this world, by name.
         planning: those of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
@@ -71,6 +72,7 @@ class World(ABC):
     reach_bins: tuple[float, ...]
     levels: Mapping[str, range] = {}
     lasting: tuple[str, ...] = ()
+    networks: Mapping[str, int] = {}
     training: Mapping[str, Any] = {}
     planning: Mapping[str, Any] = {}
     mishap: tuple[str, str]
@@ -88,6 +90,7 @@ class World(ABC):
     settled: bool = False
     counterparts: tuple[int | None, ...]
     symbol_sizes: Mapping[str, int]
+    _derived: frozenset[str]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Work out what follows from the rest.
@@ -101,7 +104,8 @@ class World(ABC):
 
     @classmethod
     def _complete(cls) -> None:
-        own = vars(cls)
+        if "_derived" in vars(cls):
+            return
         for name in ("modalities", "ego_features", "actions", "horizon"):
             if not hasattr(cls, name):
                 raise DomainError(f"{cls.__name__} needs {name}; see docs/adding_a_world.md")
@@ -114,27 +118,44 @@ class World(ABC):
             require_known(name, "position", features, cls.__name__)
         sizes = [visual[0].scales[features.index(name)] for name in cls.positions]
         units = {visual[0].units[features.index(name)] for name in cls.positions}
+        bins = tuple(float(number) for number in range(int(max(sizes, default=1)) + 1))
         made: dict[str, Any] = {
             "name": re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower(),
-            "reach_bins": tuple(float(n) for n in range(int(max(sizes, default=1)) + 1)),
+            "reach_bins": bins,
             "reach_unit": units.pop() if len(units) == 1 else "steps",
             "mishap": (cls.reward_terms[0], f"steps with less {cls.reward_terms[0]} than 0"),
             "counterparts": (None,) * len(visual[0].items),
             "symbol_sizes": {
-                "ego": cls._symbol_size(cls.ego_features),
-                **{m.name: cls._symbol_size(m.features) for m in cls.modalities},
+                name: sum(len(levels or (0,)) for levels in each)
+                for name, each in cls._levels().items()
             },
         }
-        for name, value in made.items():
-            if name not in own and (name == "name" or not hasattr(cls, name)):
-                setattr(cls, name, value)
-        if not hasattr(cls, "partial_views"):
+        derived = [name for name in made if not cls._given(name)]
+        for name in derived:
+            setattr(cls, name, made[name])
+        if not cls._given("partial_views"):
             middle = cls.reach_bins[len(cls.reach_bins) // 2]
             cls.partial_views = {"half_the_reach": (middle,) * len(cls.directions)}
+            derived.append("partial_views")
+        cls._derived = frozenset(derived)
 
     @classmethod
-    def _symbol_size(cls, features: tuple[str, ...]) -> int:
-        return sum(len(cls.levels.get(name, (0,))) for name in features)
+    def _given(cls, name: str) -> bool:
+        """Whether an attribute was written, and not worked out, in this class or one above."""
+        return any(
+            name in vars(each) and name not in vars(each).get("_derived", ())
+            for each in cls.__mro__
+        )
+
+    @classmethod
+    def _levels(cls) -> dict[str, list[range | None]]:
+        """The levels of each feature, by modality; of what is said, the sentences' numbers."""
+        return {"ego": [cls.levels.get(name) for name in cls.ego_features]} | {
+            m.name: [range(len(m.utterances[0]))]
+            if m.utterances
+            else [cls.levels.get(name) for name in m.features]
+            for m in cls.modalities
+        }
 
     @abstractmethod
     def initial(
@@ -191,11 +212,10 @@ class World(ABC):
         """Which observations ``[...]`` cannot be: of features with levels those without one."""
         found = {}
         names = {"ego": self.ego_features} | {m.name: m.features for m in self.modalities}
-        for modality, features in names.items():
-            for place, feature in enumerate(features):
-                if feature in self.levels:
-                    known, value = self.levels[feature], observation[modality][..., place]
-                    wrong = (value - known[0]) / known.step
+        for modality, levels in self._levels().items():
+            for place, (feature, known) in enumerate(zip(names[modality], levels, strict=True)):
+                if known is not None:
+                    wrong = (observation[modality][..., place] - known[0]) / known.step
                     wrong = (wrong != wrong.round()) | (wrong < 0) | (wrong >= len(known))
                     rule = f"{feature} of {modality} has to be one of {list(known)}"
                     found[rule] = wrong if modality == "ego" else wrong.any(-1)
@@ -234,24 +254,18 @@ class World(ABC):
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Observations as networks read them, ``[..., K, symbol_sizes]``; see ``levels``."""
-        names = {"ego": (self.ego_features, (1.0,) * len(self.ego_features))}
-        names |= {m.name: (m.features, m.scales) for m in self.modalities}
+        scales = {"ego": (1.0,) * len(self.ego_features)}
+        scales |= {m.name: m.scales for m in self.modalities}
         return {
             modality: torch.cat(
                 [
-                    self._symbol(feature, observation[modality][..., place], scales[place])
-                    for place, feature in enumerate(features)
+                    _symbol(observation[modality][..., place], known, scales[modality][place])
+                    for place, known in enumerate(levels)
                 ],
                 -1,
             )
-            for modality, (features, scales) in names.items()
+            for modality, levels in self._levels().items()
         }
-
-    def _symbol(self, feature: str, value: Tensor, scale: float) -> Tensor:
-        if feature not in self.levels:
-            return value[..., None] / scale
-        levels = torch.tensor(list(self.levels[feature]), device=value.device)
-        return (value[..., None] == levels).to(value.dtype)
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
         """Direction and distance ``[..., K]`` of visual items: the largest of ``positions``."""
@@ -270,20 +284,18 @@ class World(ABC):
 
     def nearest(self, observation: Observation) -> Observation:
         """The possible observation nearest to a decoded one: features with levels take one."""
-        names = {"ego": self.ego_features} | {m.name: m.features for m in self.modalities}
 
-        def possible(feature: str, value: Tensor) -> Tensor:
-            if feature not in self.levels:
+        def possible(value: Tensor, known: range | None) -> Tensor:
+            if known is None:
                 return value
-            known = self.levels[feature]
-            step = ((value - known[0]) / known.step).round().clamp(0, len(known) - 1)
-            return known[0] + step * known.step
+            place = ((value - known[0]) / known.step).round().clamp(0, len(known) - 1)
+            return known[0] + place * known.step
 
         return {
             modality: torch.stack(
-                [possible(f, observation[modality][..., i]) for i, f in enumerate(features)], -1
+                [possible(observation[modality][..., i], each) for i, each in enumerate(levels)], -1
             )
-            for modality, features in names.items()
+            for modality, levels in self._levels().items()
         }
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
@@ -299,7 +311,7 @@ class World(ABC):
         own = next(m for m in self.modalities if m.name == modality)
         place = own.items.index(item)
         if own.utterances:
-            return own.utterances[place][int(observation[modality][place, 0])]
+            return own.utterances[place][round(float(observation[modality][place, 0]))]
         values = zip(own.features, observation[modality][place].tolist(), own.units, strict=True)
         return f"{item}: " + ", ".join(f"{name} {v:g} {unit}".strip() for name, v, unit in values)
 
@@ -327,3 +339,11 @@ class World(ABC):
             m.name: torch.full_like(observation[m.name][..., 0], which(m), dtype=torch.bool)
             for m in self.modalities
         }
+
+
+def _symbol(value: Tensor, levels: range | None, scale: float) -> Tensor:
+    """A feature as networks read it ``[..., L]``: one number for each level, or one in all."""
+    if levels is None:
+        return value[..., None] / scale
+    known = torch.tensor(list(levels), device=value.device)
+    return (value[..., None] == known).to(value.dtype)

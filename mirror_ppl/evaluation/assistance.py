@@ -21,8 +21,9 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.domains import DOMAINS
 from mirror_ppl.domains.base import Domain, Observation, map_state
-from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.evaluation.oracle import Oracle
 from mirror_ppl.evaluation.played import Played, Tally
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
@@ -41,6 +42,9 @@ COMMUNICATORS = (
     "oracle",
 )
 """Everything that can be paired with people, in the order in which it is shown."""
+NO_ORACLE = (
+    "there is an oracle only of people with thresholds of sight of their own (population diverse)"
+)
 REFERENCES = ("none", "all", "nearest", "oracle")
 """Those of them that learn nothing of people, and are compared with those that do."""
 RATES_FROM = "mirror"
@@ -184,6 +188,8 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
     if (known := listener.driver.modelled()) is not None:
         planner = planner_of("mirror", Person(*known), replace(options, hears=1.0), seed)
         return Planning(planner)
+    if listener.domain.name not in DOMAINS:
+        raise InputError(NO_ORACLE)
     start = map_state(lambda part: part[0], listener.start.state)
     if isinstance(listener.driver, Drivers):
         oracle = Oracle(listener.driver, start)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mirror_ppl.communication.person import Person
 from mirror_ppl.domains import Domain, get_domain
+from mirror_ppl.domains.registry import code_of
 from mirror_ppl.evaluation.assistance import (
     RATES_FROM,
     Listener,
@@ -116,7 +117,9 @@ class Pairing:
             if name != "posterior"
         }
         digest = hashlib.sha256(json.dumps([settings, __version__], sort_keys=True).encode())
-        for path in (self.posterior, self.self_model, file_of(self.human_model)):
+        digest.update(code_of(self.domain))
+        weights = self.self_model or shipped_weights(self.domain.name)
+        for path in (self.posterior, weights, file_of(self.human_model)):
             digest.update(b"" if path is None else path.read_bytes())
         return digest.hexdigest()
 

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import torch
 
-from mirror_ppl.domains import get_domain
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.registry import code_of
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.evaluation.assistance import REFERENCES, PlannerOptions, play, speaker
@@ -175,7 +175,9 @@ def prediction_cells(
     if "mirror-amortized" in chosen and not guide:
         raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
     if not chosen:
-        left_out = {name for name, where in SLOW.items() if group.domain in where} | {*ASKED_FOR}
+        own = group.domain not in DOMAINS
+        left_out = {name for name, where in SLOW.items() if own or group.domain in where}
+        left_out |= {*ASKED_FOR}
         if not guide:
             left_out.add("mirror-amortized")
         # Who reads everything is somebody else only where something is hidden.
@@ -189,9 +191,15 @@ def assistance_cells(
 ) -> list[Assistance]:
     """Who is to speak to a group; arguments as above and of `Assistance`."""
     known = (*PLANNABLE, *ALSO_PLANNABLE, *REFERENCES)
+    chosen = _known(models, known, group)
+    if not chosen:
+        # Of people whose sight is that of a setting there is one of the package's worlds alone.
+        unknown = group.domain not in DOMAINS and group.population == "paper"
+        usual = (*PLANNABLE, *REFERENCES)
+        chosen = [name for name in usual if not (unknown and name == "oracle")]
     return [
         Assistance(group, name, number, played, 0 if name in REFERENCES else draws)
-        for name in _known(models, known, group) or (*PLANNABLE, *REFERENCES)
+        for name in chosen
         for number in ((0,) if name in REFERENCES else sorted({*rounds}))
         if number or name in REFERENCES or learns_from_nothing(name)
     ]
@@ -213,7 +221,7 @@ def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], st
     code = digest.hexdigest()
     weights = {
         name: fingerprint(load_self_model(shipped_weights(name), name)[0])
-        + hashlib.sha256(code_of(name)).hexdigest()
+        + hashlib.sha256(code_of(get_domain(name))).hexdigest()
         for name in {*domains}
     }
 

@@ -51,5 +51,5 @@ PAPER: dict[str, Sizes] = SIZES | {"bomb_defusal": replace(SIZES["bomb_defusal"]
 
 
 def sizes_of(domain: Domain, sizes: Mapping[str, Sizes] = SIZES) -> Sizes:
-    """The sizes for a domain; those of driving for one that is not known here."""
-    return sizes.get(domain.name, Sizes())
+    """The sizes for a domain; of one that is not known here those of driving, but for its own."""
+    return sizes.get(domain.name) or Sizes(**getattr(domain, "networks", {}))

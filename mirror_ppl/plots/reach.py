@@ -41,7 +41,7 @@ def reach_picture(data: az.InferenceData) -> Picture:
         data: with sites ``sight_*``, see :func:`has_reach`.
     """
     domain, shown = _domain(data), people(data)[:MOST_PEOPLE]
-    bins, directions = np.array(domain.reach_bins), domain.directions
+    bins, directions = np.array(domain.reach_bins, np.float32), domain.directions
     size = (len(directions) * (0.55 * len(bins) + 0.4) + 1.2, 0.3 * len(shown) + 1.7)
     figure = Picture(figsize=(max(size[0], 4.5), size[1]), layout="constrained")
     grid = figure.subplots(1, len(directions), squeeze=False)
@@ -61,7 +61,7 @@ def reach_picture(data: az.InferenceData) -> Picture:
         for row, person in enumerate(shown):
             real = truth(data, site, person)
             if real is not None:
-                number = int((bins <= float(real)).sum())
+                number = int((bins <= np.float32(real)).sum())
                 ax.add_patch(_frame(row, number))
         names = [label_of(person) for person in shown] if place == 0 else [""] * len(shown)
         ax.set_yticks(range(len(shown)), names, fontsize=8)

@@ -14,6 +14,7 @@ learn from the exact planner, which is its expert, instead of from what it expec
 from __future__ import annotations
 
 import copy
+import hashlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,7 +26,7 @@ from torch import Tensor
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.domains.capabilities import offers
-from mirror_ppl.domains.registry import settings_of
+from mirror_ppl.domains.registry import code_of, settings_of
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
@@ -266,6 +267,7 @@ class _Trainer:
         self.run_id = {
             "domain": domain.name,
             "domain_version": domain.version,
+            "domain_code": hashlib.sha256(code_of(domain)).hexdigest(),
             "options": asdict(options),
             "seed": seed,
             "speech": speech,
@@ -301,7 +303,7 @@ class _Trainer:
     def _save(self, path: Path) -> None:
         # Whole numbers of a world are small.
         starts = [
-            map_state(lambda part: part.short() if part.dtype == torch.long else part, start)
+            map_state(lambda part: part.int() if part.dtype == torch.long else part, start)
             for start in self.starts
         ]
         content = {
@@ -311,7 +313,7 @@ class _Trainer:
             "optimizer": self.optimizer.state_dict(),
             "schedule": self.schedule.state_dict(),
             "starts": [vars(start) for start in starts],
-            "actions": [actions.to(torch.int8) for actions in self.actions],
+            "actions": [actions.int() for actions in self.actions],
             "generator": self.generator.get_state(),
             "torch": torch.random.get_rng_state(),
         }
@@ -327,7 +329,7 @@ class _Trainer:
         self.starts = [
             kind(
                 **{
-                    name: part.long() if part.dtype == torch.int16 else part
+                    name: part.long() if part.dtype == torch.int32 else part
                     for name, part in start.items()
                 }
             )
@@ -363,6 +365,7 @@ class _Trainer:
 
     def _learn(self) -> str:
         options = self.options
+        exact = options.exact and offers(self.domain, "reference_values")
         starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
         actions = torch.cat(self.actions)
         elbo = bellman = 0.0
@@ -383,7 +386,7 @@ class _Trainer:
                 plan,
                 self._first(),
                 options.stride,
-                options.discount if options.exact else None,
+                options.discount if exact else None,
             )
             loss = self_model_loss(
                 self.self_model, self.target, lived, options, on_means=step % 2 == 1

@@ -54,6 +54,15 @@ class Shelf(GymnasiumWorld):
         return {"ego": [env.place], "visual": [[env.prize - env.place]]}
 
 
+def test_one_observation_without_a_batch_is_one_state():
+    world = type("Few", (type(load_world(UNLOCKING)),), {"layouts": 1})()
+    place = world.initial(1, torch.Generator().manual_seed(0))
+    one = {name: value[0] for name, value in world.observe(place).items()}
+    assert int(world.state_behind(one).number) == int(place.number)
+    following = world.next_observation(one, torch.tensor(2))
+    assert {n: v.shape for n, v in following.items()} == {n: v.shape for n, v in one.items()}
+
+
 def test_every_state_is_visited_once():
     shelf = Shelf()
     assert faults_of(shelf) == []
@@ -84,6 +93,7 @@ def test_tables_are_kept_for_the_next_time(tmp_path):
     assert file.stat().st_mtime_ns == made
     file.write_bytes(b"damaged")
     assert torch.equal(Shelf().tables.following, first.following)
+    assert file.stat().st_size > 100
 
 
 def test_the_nearest_state_stands_for_what_cannot_be():
@@ -100,6 +110,26 @@ class Hidden(Row):
 
     def step(self, action):
         return super().step(1 if self.taken % 3 == 2 else action)
+
+
+class Late(Row):
+    """The prize is worth less the later it is reached."""
+
+    def step(self, action):
+        place, reward, *rest = super().step(action)
+        return place, reward - 0.05 * self.taken, *rest
+
+
+class Walled(Row):
+    """There is a wall in some layouts, which cannot be observed."""
+
+    def reset(self, *, seed=None, options=None):
+        found = super().reset(seed=seed)
+        self.wall = seed is not None and seed >= 4
+        return found
+
+    def step(self, action):
+        return super().step(1 if self.wall and self.place == 2 else action)
 
 
 class Steered(Row):
@@ -121,6 +151,8 @@ class Chance(Row):
     [
         (Hidden, {}, "something that matters cannot be observed"),
         (Chance, {}, "something that matters cannot be observed"),
+        (Late, {}, "something that matters cannot be observed"),
+        (Walled, {}, "something that matters cannot be observed"),
         (Steered, {}, "expected actions that are numbered (Discrete), found Box"),
         (Broken, {}, "the motor is off"),
         (Row, {"most_states": 3}, "more than 3 states"),
@@ -169,7 +201,7 @@ def test_what_is_played_is_recorded(tmp_path):
         env.recordings()
     with pytest.raises(InputError, match="call reset"):
         env.step(0)
-    env.reset(seed=0)
+    env.reset()
     env.reset(seed=3)
     toward = 0 if env.env.prize == 0 else 2
     env.tell("visual", "prize")

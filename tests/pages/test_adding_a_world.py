@@ -10,7 +10,7 @@ from paths import ROOT
 from running import command
 
 import mirror_ppl
-from mirror_ppl.domains import DOMAINS, World, add_domain, get_domain
+from mirror_ppl.domains import DOMAINS, Modality, World, add_domain, get_domain
 from mirror_ppl.domains.checking import CAPABILITIES, faults_of
 from mirror_ppl.domains.registry import load_world
 from mirror_ppl.errors import DomainError, UnknownNameError
@@ -173,8 +173,6 @@ def broken(self, state):
 )
 def test_what_is_wrong_is_said_in_one_line(changes, message):
     kind = world(**changes)
-    if "observe" in changes:
-        kind.over = lambda self, state: state.has_tea
     (fault, *_) = faults_of(kind())
     assert message in fault
     with pytest.raises(DomainError, match="^Changed: "):
@@ -238,3 +236,65 @@ def test_memory_keeps_what_has_not_changed_and_what_lasts():
             if pot == 1.0:
                 assert memory.items(table.modalities)["visual"].tolist() == [True, False]
         assert memory.items(table.modalities)["visual"].tolist() == known
+
+
+def test_people_whose_sight_is_a_settings_have_no_oracle(gone_through, monkeypatch, capsys):
+    from mirror_ppl.commands import assist, fit
+    from mirror_ppl.commands import simulate as simulate_command
+    from mirror_ppl.evaluation.learners import Group
+    from mirror_ppl.evaluation.study import assistance_cells
+
+    monkeypatch.chdir(gone_through)
+    few = ["--people", "1", "--rounds", "3", "--out", "paper.nc"]
+    assert command(simulate_command, "--domain", WORLD, *few) == 0
+    fitted = ["--demos", "paper.nc", "--draws", "20", "--out", "paper"]
+    assert command(fit, "--domain", WORLD, *fitted) == 0
+    small = ["--posterior", "paper/posterior.nc", "--rounds", "1", "--draws", "4", "--jobs", "1"]
+    capsys.readouterr()
+    assert command(assist, "--domain", WORLD, *small, "--communicator", "oracle") == 2
+    assert "thresholds of sight of their own" in capsys.readouterr().err
+    for population, there in (("paper", False), ("diverse", True)):
+        group = Group("round_table", "dark", population, 1, 0)
+        cells = assistance_cells(group, (), (1,), 1, 4)
+        assert ("oracle" in {cell.model for cell in cells}) == there
+
+
+def test_worlds_of_the_same_name_are_told_apart(tmp_path):
+    source = FILE.read_text()
+    specs = []
+    for horizon in (5, 9):
+        (tmp_path / f"table{horizon}.py").write_text(
+            source.replace("horizon = 8", f"horizon = {horizon}")
+        )
+        specs.append(f"{tmp_path / f'table{horizon}.py'}:RoundTable")
+    assert [get_domain(spec).horizon for spec in (*specs, *specs)] == [5, 9, 5, 9]
+
+
+def test_what_follows_from_a_class_is_worked_out_anew_in_derived_ones():
+    wide = Modality("visual", ("pot", "puddle", "cat"), ("offset",), ("places",), (5.0,), 0.01)
+    base = load_world(WORLD)
+    more = world(modalities=(wide,), levels={"offset": range(-5, 6)}, reward_terms=("purr",))
+    made = load_world(more)
+    assert made.name == "changed"
+    assert made.reach_bins == (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+    assert made.symbol_sizes == {"ego": 1, "visual": 11}
+    assert made.counterparts == (None, None, None)
+    assert base.reach_bins == (0.0, 1.0, 2.0, 3.0)
+    assert type("Named", (more,), {"name": "mine"})().name == "mine"
+
+
+def test_sentences_are_read_as_sentences():
+    spoken = Modality(
+        "verbal", ("pot",), ("side",), ("",), (1.0,), 0.03, utterances=(("left!", "right!"),)
+    )
+    visual = load_world(WORLD).modalities[0]
+    talking = world(modalities=(visual, spoken))()
+    assert talking.symbol_sizes["verbal"] == 2
+    said = {
+        "ego": torch.zeros(1),
+        "visual": torch.zeros(2, 1),
+        "verbal": torch.tensor([[1.0]]),
+    }
+    assert talking.symbols(said)["verbal"].tolist() == [[0.0, 1.0]]
+    assert talking.describe(said, "verbal", "pot") == "right!"
+    assert talking.nearest(said | {"verbal": torch.tensor([[0.6]])})["verbal"].tolist() == [[1.0]]
