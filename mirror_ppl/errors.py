@@ -136,5 +136,9 @@ class CheckpointError(MirrorError):
     """
 
 
+class StaleSelfModel(UserWarning):
+    """A world of somebody's own has changed since its self-model was trained."""
+
+
 class UnreliableWeights(UserWarning):
     """Importance weights of somebody are not to be relied on."""

@@ -42,7 +42,8 @@ class Options:
     posterior: Path = Path("runs/demo/posterior.nc")
     """A posterior of simulated people, from python -m mirror_ppl.fit (or make demo)."""
     domain: str | None = None
-    """The world that the posterior has to be of; that of the posterior unless given."""
+    """The world that the posterior has to be of; that of the posterior unless given. One of your
+    own has to be: path/to/file.py:Class, whose code is run."""
     setting: str | None = None
     """The setting that the posterior has to be of; that of the posterior unless given."""
     communicator: tuple[str, ...] = ()
@@ -352,7 +353,8 @@ def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, roun
     about = [f"about {name.replace('_', ' ')}" for name in first["relevant"]]
     worth = table(
         f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
-        "rewards a round; ±: standard error; [90% interval], paired; -: needs none and oracle",
+        "rewards a round; ±: standard error; [90% interval], paired; -: needs none, and an oracle "
+        "ahead of it",
         ["task", "cost", "net", "above none", "way to oracle"],
     )
     said = table(

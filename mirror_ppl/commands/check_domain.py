@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 PROGRAM = "python -m mirror_ppl.check_domain"
 DESCRIPTION = """Look over a world of your own, whose code is run: whether it keeps the contract of
 worlds, one line for each thing that is wrong, and what it offers. The exit status is 1 if something
-is wrong. How a world is written stands in docs/adding_a_world.md."""
+is wrong, and 2 if it cannot be loaded. How a world is written stands in docs/adding_a_world.md."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,35 @@ def main(options: Options) -> int:
     from mirror_ppl.domains.registry import load_world
 
     world = load_world(options.domain)
-    if faults := faults_of(world):
+    if faults := faults_of(world) or _of_settings(world):
         print(f"{world.name}: {len(faults)} thing{'s' * (len(faults) > 1)} wrong")
         for fault in faults:
             print(f"  {fault}")
         return 1
     _show(world)
     return 0
+
+
+def _of_settings(world: World) -> list[str]:
+    """What is wrong with the settings of a world that is sound otherwise."""
+    from mirror_ppl.communication.planners import PlannerOptions
+    from mirror_ppl.domains.registry import know
+    from mirror_ppl.errors import MirrorError
+    from mirror_ppl.models.sizes import sizes_of
+    from mirror_ppl.training.self_model import SelfModelOptions
+
+    know(world)
+    found = []
+    for name, made in (
+        ("training", lambda: SelfModelOptions.of(world.name)),
+        ("planning", lambda: PlannerOptions.of(world.name)),
+        ("networks", lambda: sizes_of(world)),
+    ):
+        try:
+            made()
+        except (MirrorError, TypeError, ValueError) as error:
+            found.append(f"{name}: {error}")
+    return found
 
 
 def _show(world: World) -> None:

@@ -37,7 +37,7 @@ class Options:
     """Recordings in the format of docs/demonstrations.md."""
     domain: str | None = None
     """The world of the shipped recordings: driving (unless given), search_rescue or bomb_defusal.
-    """
+    Of --demos of a world of your own, path/to/file.py:Class, whose code is run."""
     setting: str | None = None
     """The setting of the shipped recordings: clear or fog in driving, clear or smoke in
     search_rescue, labelled or unlabelled in bomb_defusal. Default: the one in which people see

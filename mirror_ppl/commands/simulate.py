@@ -29,7 +29,8 @@ class Options:
     """The netCDF file to write; one that is there is replaced, missing folders are created."""
     domain: str = "driving"
     """The world: driving (two lanes, four cars that never yield), search_rescue (a burning house,
-    a victim, two corridors) or bomb_defusal (three stages, six terminals)."""
+    a victim, two corridors) or bomb_defusal (three stages, six terminals);
+    or one of your own, path/to/file.py:Class, whose code is run (docs/adding_a_world.md)."""
     setting: str | None = None
     """Its setting: of driving clear (the whole road in sight) or fog (2 cells ahead, nothing
     behind), of search_rescue clear (the whole house in sight) or smoke (1.5 cells around), of

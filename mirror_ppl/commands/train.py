@@ -33,7 +33,8 @@ class Options:
     the domain."""
     domain: str = "driving"
     """The world to learn: driving (two lanes, four cars that never yield), search_rescue (a
-    burning house, a victim, two corridors) or bomb_defusal (three stages, six terminals)."""
+    burning house, a victim, two corridors) or bomb_defusal (three stages, six terminals);
+    or one of your own, path/to/file.py:Class, whose code is run (docs/adding_a_world.md)."""
     phases: int | None = None
     """Of a self-model: phases of acting and learning; 2 to try it out. Default: what makes a good
     one, of driving 40, of search_rescue 400 and of bomb_defusal 200."""

@@ -103,7 +103,10 @@ class Modality:
         if self.image is not None and math.prod(self.image) != len(self.features):
             raise ValueError(f"modality {self.name!r}: an image's features are its pixels")
         if self.utterances and len(self.utterances) != len(self.items):
-            raise ValueError(f"modality {self.name!r}: each item needs its utterances")
+            raise ValueError(
+                f"modality {self.name!r}: each item needs a tuple of its utterances, expected "
+                f"{len(self.items)}, found {len(self.utterances)}"
+            )
 
     def cost(self, number: Tensor) -> Tensor:
         """Cost in units of reward of communicating ``number`` items in one step."""

@@ -102,6 +102,8 @@ class _CallError(Exception):
 def _call(world: World, name: str, *arguments: Any) -> Any:
     try:
         return getattr(world, name)(*arguments)
+    except DomainError as error:
+        raise _CallError(str(error)) from error
     except (Exception, SystemExit) as error:
         raise _CallError(f"{name} fails: {describe(error)}") from error
 
@@ -212,7 +214,11 @@ def _looks(world: World) -> list[str]:
         masks[f"visibility in {setting}"] = _call(world, "visibility", setting, observation)
     for name, mask in masks.items():
         if not isinstance(mask, Mapping) or set(mask) != set(items):
-            return [f"{name}: expected masks of {', '.join(items)}"]
+            named = ", ".join(mask) if isinstance(mask, Mapping) else _kind(mask)
+            return [
+                f"{name}: expected masks of {', '.join(items)} (of what is only said, too: nobody "
+                f"sees it), found {named}"
+            ]
         found += [_fault(name, key, mask[key], own, bool) for key, own in items.items()]
     for rule, broken in _call(world, "faults", observation).items():
         if bool(broken.any()):

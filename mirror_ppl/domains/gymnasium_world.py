@@ -36,6 +36,8 @@ from mirror_ppl.row_hashing import as_whole_numbers, row_numbers
 SWEEPS = 1000
 """Of value iteration at most."""
 CLOSE = 1e-6
+SOONER, LITTLE = 0.95, 1e-4
+"""A discount by which what is alike without one differs, and how much that counts."""
 CACHED = ("tables", "_names", "_values")
 """What is worked out once."""
 TRIED_TWICE = 200
@@ -215,20 +217,29 @@ class GymnasiumWorld(World):
         return {}  # by discount, once they were asked for
 
     def reference_values(self, state: Place, discount: float) -> Tensor:
-        """Exact values ``[..., A]`` by value iteration; of a discount of 1 to the horizon."""
+        """Exact values ``[..., A]`` by value iteration; of a discount of 1 to the horizon.
+
+        Of those of 1, alike ones differ a little by how soon the rewards come.
+        """
         known = self._values
         if discount not in known:
-            tables, reward = self.tables, sum(self.tables.terms.values())
-            values = torch.zeros_like(torch.as_tensor(reward))
-            for _ in range(SWEEPS if discount < 1 else self.horizon):
-                after = values.amax(-1).masked_fill(tables.over, 0.0)
-                new = reward + discount * after[tables.following]
-                done = bool((new - values).abs().max() < CLOSE)
-                values = new
-                if done:
-                    break
-            known[discount] = values
+            known[discount] = self._iterated(discount)
+            if discount == 1:
+                # Where it is the same, sooner is better: who waits as well as not never comes.
+                known[discount] = known[discount] + LITTLE * self._iterated(SOONER)
         return known[discount].to(state.number.device)[state.number]
+
+    def _iterated(self, discount: float) -> Tensor:
+        tables, reward = self.tables, sum(self.tables.terms.values())
+        values = torch.zeros_like(torch.as_tensor(reward))
+        for _ in range(SWEEPS if discount < 1 else self.horizon):
+            after = values.amax(-1).masked_fill(tables.over, 0.0)
+            new = reward + discount * after[tables.following]
+            done = bool((new - values).abs().max() < CLOSE)
+            values = new
+            if done:
+                break
+        return values
 
 
 def _tensors(observation: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -271,6 +282,11 @@ def _visited(world: GymnasiumWorld) -> Tables:
     moves = world.moves or tuple(range(len(world.actions)))
     if len(moves) != len(world.actions):
         raise DomainError(f"{world.name}: {len(world.actions)} actions, but {len(moves)} moves")
+    if max(moves) >= env.action_space.n:
+        raise DomainError(
+            f"{world.name}: the environment has {env.action_space.n} actions, from 0 on, and no "
+            f"{max(moves)} (actions, moves)"
+        )
     numbers: dict[bytes, int] = {}
     seen: list[dict[str, Tensor]] = []
     waiting: list[bytes] = []

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -148,7 +148,7 @@ class World(ABC):
         )
 
     @classmethod
-    def _levels(cls) -> dict[str, list[range | None]]:
+    def _levels(cls) -> Mapping[str, Sequence[range | None]]:
         """The levels of each feature, by modality; of what is said, the sentences' numbers."""
         return {"ego": [cls.levels.get(name) for name in cls.ego_features]} | {
             m.name: [range(len(m.utterances[0]))]

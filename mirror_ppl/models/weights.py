@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -15,8 +16,9 @@ from torch import Tensor, nn
 
 from mirror_ppl.checks import as_path
 from mirror_ppl.data import asset_path
-from mirror_ppl.domains import DOMAINS, get_domain
-from mirror_ppl.errors import AssetError, MirrorError
+from mirror_ppl.domains import DOMAINS, World, get_domain
+from mirror_ppl.domains.registry import code_of
+from mirror_ppl.errors import AssetError, MirrorError, StaleSelfModel
 from mirror_ppl.files import json_text, read_whole, write_whole
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
@@ -64,6 +66,7 @@ def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) 
         "format": FORMAT,
         "domain": self_model.domain.name,
         "domain_version": self_model.domain.version,
+        "domain_code": hashlib.sha256(code_of(self_model.domain)).hexdigest(),
         "sizes": json.dumps(asdict(self_model.sizes)),
         "card": json_text(card),
     }
@@ -150,6 +153,14 @@ def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, d
             raise AssetError(
                 f"{path}: is for version {metadata['domain_version']} of {world.name}, "
                 f"this is version {world.version}"
+            )
+        code = hashlib.sha256(code_of(world)).hexdigest()
+        if isinstance(world, World) and metadata.get("domain_code") != code:
+            warnings.warn(
+                f"{path}: the file of {world.name} has changed since this self-model was trained; "
+                "train it again unless that changes nothing",
+                StaleSelfModel,
+                stacklevel=2,
             )
         sizes = Sizes(**json.loads(metadata["sizes"])) if "sizes" in metadata else None
         with torch.random.fork_rng(devices=[]):

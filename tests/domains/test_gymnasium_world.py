@@ -85,6 +85,26 @@ def test_values_are_exact():
     assert torch.allclose(values, reward + 0.9 * after, atol=1e-5)
 
 
+class Free(Row):
+    """Waiting costs nothing, and nor does going."""
+
+    def step(self, action):
+        place, reward, *rest = super().step(action)
+        return place, reward + 0.1, *rest
+
+
+def test_who_may_wait_for_nothing_still_goes():
+    world = type("Idle", (Shelf,), {"make": lambda self: Free()})()
+    place = world.initial(20, torch.Generator().manual_seed(0))
+    earned = 0.0
+    for _ in range(world.horizon):
+        action = world.reference_values(place, 1.0).argmax(-1)
+        following = world.transition(place, action)
+        earned += sum(world.rewards(place, action, following).values())
+        place = following
+    assert torch.allclose(earned, torch.tensor(3.0), atol=1e-3)
+
+
 def test_tables_are_kept_for_the_next_time(tmp_path):
     first = Shelf().tables
     (file,) = (tmp_path / "mirror_ppl").iterdir()
@@ -157,6 +177,7 @@ class Chance(Row):
         (Broken, {}, "the motor is off"),
         (Row, {"most_states": 3}, "more than 3 states"),
         (Row, {"moves": (0, 1)}, "3 actions, but 2 moves"),
+        (Row, {"moves": (0, 1, 3)}, "the environment has 3 actions, from 0 on, and no 3"),
     ],
 )
 def test_what_cannot_be_tabulated_is_refused(env, changes, message):

@@ -298,3 +298,35 @@ def test_sentences_are_read_as_sentences():
     assert talking.symbols(said)["verbal"].tolist() == [[0.0, 1.0]]
     assert talking.describe(said, "verbal", "pot") == "right!"
     assert talking.nearest(said | {"verbal": torch.tensor([[0.6]])})["verbal"].tolist() == [[1.0]]
+
+
+def test_a_robot_of_another_version_of_the_file_is_told(gone_through, monkeypatch, tmp_path):
+    from mirror_ppl.errors import StaleSelfModel
+    from mirror_ppl.models.weights import load_self_model
+
+    monkeypatch.chdir(gone_through)
+    weights = gone_through / "runs" / "round_table_self_model.safetensors"
+    get_domain(WORLD)
+    load_self_model(weights)
+    other = tmp_path / "round_table.py"
+    other.write_text(FILE.read_text().replace("5.0 * ", "-5.0 * "))
+    get_domain(f"{other}:RoundTable")
+    with pytest.warns(StaleSelfModel, match="has changed since this self-model was trained"):
+        load_self_model(weights)
+
+
+def test_settings_are_looked_over(tmp_path, capsys):
+    from mirror_ppl.commands import check_domain
+
+    for line, message in (
+        ('training = {"phasez": 3}', "training has phasez, expected some of"),
+        ('training = {"phases": 0}', "phases must be at least 1, not 0"),
+        ('planning = {"horizn": 3}', "planning has horizn"),
+        ('networks = {"coder": 3}', "networks: "),
+    ):
+        file = tmp_path / "settings.py"
+        file.write_text(
+            FILE.read_text().replace("    horizon = 8\n", f"    horizon = 8\n    {line}\n")
+        )
+        assert command(check_domain, f"{file}:RoundTable") == 1
+        assert message in capsys.readouterr().out
