@@ -23,6 +23,7 @@ from mirror_ppl.version import __version__ as __version__
 if _TYPE_CHECKING:
     from mirror_ppl.face import (
         Communicator,
+        Companion,
         Fit,
         HumanModel,
         Recorder,
@@ -36,6 +37,7 @@ if _TYPE_CHECKING:
 
 __all__ = [
     "Communicator",
+    "Companion",
     "Fit",
     "HumanModel",
     "Recorder",

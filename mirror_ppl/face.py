@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from mirror_ppl.checks import require_kind, seed_number, whole_number
 from mirror_ppl.communication.communicator import Communicator as PlannedCommunicator
+from mirror_ppl.communication.companion import Companion
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Communicator",
+    "Companion",
     "Fit",
     "HumanModel",
     "Recorder",

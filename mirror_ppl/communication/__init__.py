@@ -6,6 +6,7 @@ Three layers: the person (`person`, posterior draws of a human model tracked thr
 """
 
 from mirror_ppl.communication.communicator import Communicator, Decision, Gain
+from mirror_ppl.communication.companion import Companion
 from mirror_ppl.communication.messages import Channels, Message, every_message
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective, Valued
 from mirror_ppl.communication.person import Person, PlanningContext
@@ -17,6 +18,7 @@ __all__ = [
     "Automatic",
     "Channels",
     "Communicator",
+    "Companion",
     "CrossEntropy",
     "Decision",
     "Divergence",

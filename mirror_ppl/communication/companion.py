@@ -1,0 +1,97 @@
+"""A communicator beside somebody whose world runs elsewhere: in a simulator, or for real."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mirror_ppl.checks import require_kind
+from mirror_ppl.communication.communicator import Communicator, Decision
+from mirror_ppl.communication.messages import Channels
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.errors import InputError
+
+
+class Companion:
+    """Is told what happens in rounds of one person, and says what to tell them.
+
+        companion = Companion(communicator)
+        companion.begin(observation)
+        while ...:
+            decision = companion.decide()       # send decision.message
+            companion.observe(observation, action)
+        companion.begin(observation)            # the next round; what was learned of them stays
+
+    Observations are dicts of numpy arrays, tensors or lists: ``ego`` ``[E]``, each modality
+    ``[K, F]``, everything that the robot knows of the world.
+
+    Args:
+        communicator: for the first round.
+
+    Attributes:
+        communicator: for the present round.
+        past: the present round so far; ``None`` before the first.
+    """
+
+    def __init__(self, communicator: Communicator) -> None:
+        self.communicator = require_kind(communicator, Communicator, "communicator")
+        self.past: RoundSoFar | None = None
+        self._decision: Decision | None = None
+
+    def begin(self, observation: Mapping[str, Any]) -> None:
+        """A round begins. From the one before is learned which channels reach the person.
+
+        Raises:
+            InputError: such an observation cannot be; nothing has changed then.
+        """
+        past = RoundSoFar.begin(self.communicator.person.human.domain, observation)
+        if self.past is not None and self.past.time:
+            self.communicator = self.communicator.after(self.past)
+        self.past, self._decision = past, None
+
+    def decide(self) -> Decision:
+        """What to tell them now; the same until the next `observe`.
+
+        Raises:
+            InputError: no round has begun.
+        """
+        if self._decision is None:
+            self._decision = self.communicator.plan(self._round())
+        return self._decision
+
+    def observe(
+        self,
+        observation: Mapping[str, Any],
+        action: int,
+        message: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        """The person has acted.
+
+        Args:
+            observation: what there is to observe after it.
+            action: index of what they did.
+            message: names of the items that were communicated before it, by modality; what was
+                decided unless given, and nothing if nothing was.
+
+        Raises:
+            InputError: no round has begun or it is over, or one of these cannot be; nothing has
+                changed then.
+            UnknownNameError: there is no such modality or item.
+        """
+        past, domain = self._round(), self.communicator.person.human.domain
+        if past.time >= domain.horizon:
+            raise InputError(f"the round is over after its {domain.horizon} steps; call begin")
+        channels = Channels(domain)
+        if message is None and self._decision is not None:
+            told = self._decision.told
+        else:
+            items = {name: tuple(own) for name, own in (message or {}).items()}
+            told = channels.split(channels.flags(items))
+        after = past.then(told, action, observation)
+        after.check(domain)
+        self.past, self._decision = after, None
+
+    def _round(self) -> RoundSoFar:
+        if self.past is None:
+            raise InputError("no round has begun; call begin with the first observation")
+        return self.past
