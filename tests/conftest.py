@@ -13,6 +13,8 @@ import pyro
 import pytest
 import torch
 
+from mirror_ppl.domains import registry
+
 torch.set_num_threads(1)
 
 # No deadline: the first call of a torch function takes far longer than the others.
@@ -44,6 +46,7 @@ def fresh_start(seed):
         yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
+    registry._ADDED.clear()  # worlds that a test added
 
 
 @pytest.fixture

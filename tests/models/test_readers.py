@@ -256,5 +256,5 @@ def test_utterances_that_nobody_knows_are_refused():
 def test_modalities_have_to_fit_together():
     with pytest.raises(ValueError, match="an image's features are its pixels"):
         Modality("visual", ("a",), ("x",), ("1",), (1.0,), 0.1, image=(3, 3, 1))
-    with pytest.raises(ValueError, match="each item needs its utterances"):
+    with pytest.raises(ValueError, match="each item needs a tuple of its utterances"):
         Modality("verbal", ("a",), ("x",), ("1",), (1.0,), 0.1, utterances=(("a",), ("b",)))
