@@ -198,8 +198,8 @@ BAD_DATASETS = {
     ),
     "unknown domain": (
         renamed(domain="boats"),
-        'unknown domain "boats"; known: bomb_defusal, driving, search_rescue; a world of your own is '
-        "--domain path/to/file.py:Class",
+        'unknown domain "boats"; known: bomb_defusal, driving, search_rescue; '
+        "a world of your own is --domain path/to/file.py:Class",
     ),
     "unknown setting": (
         renamed(setting="rain"),
