@@ -25,7 +25,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.communication.search import Automatic, Found, Search, joined
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility
-from mirror_ppl.domains.capabilities import offers
+from mirror_ppl.domains.world import offers
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.world_knowledge import planning_domain
 

@@ -55,8 +55,8 @@ class PlannerOptions:
     def of(cls, domain: str, **changes: Any) -> Self:
         """The settings for a domain, with changes; None leaves what is set for the domain."""
         given = {name: value for name, value in changes.items() if value is not None}
-        own = BY_DOMAIN.get(domain) or settings_of(domain, "planning", cls)
-        return cls(**({**own} | given))
+        own = {**BY_DOMAIN.get(domain, {}), **settings_of(domain, "planning", cls)}
+        return cls(**(own | given))
 
 
 BY_DOMAIN: dict[str, dict[str, Any]] = {

@@ -1,9 +1,8 @@
 """Worlds as pure batched functions, and their Gymnasium faces."""
 
 from mirror_ppl.domains.base import Domain, Modality, Observation, Visibility, require_known
-from mirror_ppl.domains.capabilities import offers
 from mirror_ppl.domains.registry import DOMAINS, add_domain, added_worlds, domain_of, get_domain
-from mirror_ppl.domains.world import World
+from mirror_ppl.domains.world import World, offers
 
 __all__ = [
     "DOMAINS",

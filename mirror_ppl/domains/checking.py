@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.capabilities import offers
-from mirror_ppl.domains.world import World
+from mirror_ppl.domains.world import World, offers
 from mirror_ppl.errors import DomainError
 from mirror_ppl.user_code import describe
 
@@ -54,13 +53,7 @@ CAPABILITIES = (
 
 def capabilities(world: World) -> list[tuple[Capability, bool]]:
     """What a world may offer, and whether it does so by itself."""
-    base = vars(World)
-
-    def own(name: str) -> bool:
-        given = getattr(type(world), name)
-        return given is not base.get(name) and (name not in base or given != base[name])
-
-    return [(one, own(one.method)) for one in CAPABILITIES]
+    return [(one, offers(world, one.method)) for one in CAPABILITIES]
 
 
 def require_sound(world: World) -> World:
@@ -288,14 +281,7 @@ def _of_one(world: World, states: Any, observations: Mapping[str, Tensor]) -> li
         _call(world, name, now)
     knowledge = _call(world, "nothing_known")
     unseen = _call(world, "visibility", world.settings[0], now)
-    knowledge = _call(
-        world,
-        "learn",
-        knowledge,
-        now,
-        unseen,
-        lambda seen: unseen,
-    )
+    knowledge = _call(world, "learn", knowledge, now, unseen, lambda seen: unseen)
     _call(world, "known", knowledge)
     assumed, _ = _call(world, "assume", knowledge, now)
     if set(assumed) != set(world.assumptions):

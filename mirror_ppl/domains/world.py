@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
-from mirror_ppl.domains.capabilities import left_out
 from mirror_ppl.domains.memory import LastSeen
 from mirror_ppl.errors import DomainError
 
@@ -320,7 +319,6 @@ class World(ABC):
         del observation, item
         return self.actions[action]
 
-    @left_out
     def reference_values(self, state: Any, discount: float) -> Tensor:
         """Exact discounted action values ``[..., A]``; there are none unless a world has them."""
         raise DomainError(f"{self.name} has no exact action values (reference_values)")
@@ -347,3 +345,8 @@ def _symbol(value: Tensor, levels: range | None, scale: float) -> Tensor:
         return value[..., None] / scale
     known = torch.tensor(list(levels), device=value.device)
     return (value[..., None] == known).to(value.dtype)
+
+
+def offers(domain: Any, capability: str) -> bool:
+    """Whether a world has a method or attribute of its own, and not the default of `World`."""
+    return getattr(type(domain), capability, None) != getattr(World, capability, None)

@@ -117,7 +117,7 @@ class Pairing:
             if name != "posterior"
         }
         digest = hashlib.sha256(json.dumps([settings, __version__], sort_keys=True).encode())
-        digest.update(code_of(self.domain))
+        digest.update(code_of(self.domain).encode())
         weights = self.self_model or shipped_weights(self.domain.name)
         for path in (self.posterior, weights, file_of(self.human_model)):
             digest.update(b"" if path is None else path.read_bytes())

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Domain, map_state, roll_out, total_reward
-from mirror_ppl.domains.capabilities import offers
+from mirror_ppl.domains.world import offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.training.experience import drive, experience, follow, supposed
 from mirror_ppl.training.views import ViewPlan

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from mirror_ppl.checks import as_path
 from mirror_ppl.data import asset_path
-from mirror_ppl.domains import DOMAINS, World, get_domain
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.registry import code_of
 from mirror_ppl.errors import AssetError, MirrorError, StaleSelfModel
 from mirror_ppl.files import json_text, read_whole, write_whole
@@ -66,7 +66,7 @@ def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) 
         "format": FORMAT,
         "domain": self_model.domain.name,
         "domain_version": self_model.domain.version,
-        "domain_code": hashlib.sha256(code_of(self_model.domain)).hexdigest(),
+        "domain_code": code_of(self_model.domain),
         "sizes": json.dumps(asdict(self_model.sizes)),
         "card": json_text(card),
     }
@@ -154,8 +154,7 @@ def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, d
                 f"{path}: is for version {metadata['domain_version']} of {world.name}, "
                 f"this is version {world.version}"
             )
-        code = hashlib.sha256(code_of(world)).hexdigest()
-        if isinstance(world, World) and metadata.get("domain_code") != code:
+        if metadata.get("domain_code", "") != code_of(world):
             warnings.warn(
                 f"{path}: the file of {world.name} has changed since this self-model was trained; "
                 "train it again unless that changes nothing",

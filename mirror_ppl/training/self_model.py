@@ -14,7 +14,6 @@ learn from the exact planner, which is its expert, instead of from what it expec
 from __future__ import annotations
 
 import copy
-import hashlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,8 +24,8 @@ from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
-from mirror_ppl.domains.capabilities import offers
 from mirror_ppl.domains.registry import code_of, settings_of
+from mirror_ppl.domains.world import offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
@@ -94,8 +93,8 @@ class SelfModelOptions:
             changes: settings by name; None leaves what is set for the domain.
         """
         given = {name: value for name, value in changes.items() if value is not None}
-        own = BY_DOMAIN.get(domain) or settings_of(domain, "training", cls)
-        return cls(**({**own} | given))
+        own = {**BY_DOMAIN.get(domain, {}), **settings_of(domain, "training", cls)}
+        return cls(**(own | given))
 
     def __post_init__(self) -> None:
         for name in ("phases", "rounds", "steps", "batch", "stride"):
@@ -267,7 +266,7 @@ class _Trainer:
         self.run_id = {
             "domain": domain.name,
             "domain_version": domain.version,
-            "domain_code": hashlib.sha256(code_of(domain)).hexdigest(),
+            "domain_code": code_of(domain),
             "options": asdict(options),
             "seed": seed,
             "speech": speech,
