@@ -145,8 +145,8 @@ def main(options: Options) -> None:
     self_model, _ = load_self_model(shipped_weights("driving"))
     kept = pd.read_csv(options.out) if options.out and options.out.exists() else pd.DataFrame()
     rows, shown = kept.to_dict("records"), []
-    done = {(row["kind"], row["seed"], row["human_model"]) for row in rows}
-    every = kinds(self_model)
+    done = {(row["kind"], row["seed"], row["human_model"], row["people"]) for row in rows}
+    every, asked = kinds(self_model), set()
     for kind, seed in itertools.product(options.kinds or every, options.seeds):
         human, known = every[kind]
         drawn = draw_prior(human, options.people, 1, seed)
@@ -156,22 +156,26 @@ def main(options: Options) -> None:
         recordings = play_rounds(human, implants, 26, "fog", generator)
         truth = reach(human.domain, implants)[:, 0]
         for fitted in options.human_models:
+            cell = kind, seed, fitted, options.people
+            asked.add(cell)
             pictured = options.picture is not None and seed == options.seeds[0]
             pictured &= fitted == options.human_models[0]
-            if (kind, seed, fitted) in done and not pictured:
+            if cell in done and not pictured:
                 continue
             fit = mirror_ppl.infer(recordings, human=fitted, seed=seed, train_rounds=20)
             if pictured:
                 first = fit.data["model_check"].isel(person=slice(SHOWN))
                 names = [f"{kind} {number + 1}" for number in range(len(first["person"]))]
                 shown.append(first.assign_coords(person=names))
-            if (kind, seed, fitted) in done:
+            if cell in done:
                 continue
             rows.append({"kind": kind, "seed": seed, "human_model": fitted} | found(fit, truth))
             if options.out is not None:  # so that what is done is kept
                 pd.DataFrame(rows).to_csv(options.out, index=False, float_format="%.3f")
             print(pd.DataFrame(rows[-1:]).to_string(index=False), flush=True)
-    print(together(pd.DataFrame(rows)).to_string())
+    table = pd.DataFrame(rows)
+    cells = zip(table["kind"], table["seed"], table["human_model"], table["people"], strict=True)
+    print(together(table[[cell in asked for cell in cells]]).to_string())
     if options.picture is not None:
         joined = az.InferenceData(model_check=xr.concat(shown, "person"))
         options.picture.write_bytes(plot_model_check(joined).content())

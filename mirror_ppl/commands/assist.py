@@ -198,8 +198,8 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
 def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tuple[str, ...]:
     """Communicators without those that cannot plan for these people, unless they are asked for."""
     from mirror_ppl.communication.objectives import beliefs_have_density, require_density
-    from mirror_ppl.domains import DOMAINS
     from mirror_ppl.evaluation.assistance import NO_ORACLE
+    from mirror_ppl.people import has_oracle
 
     if KL in chosen and not beliefs_have_density(pairing.human):
         if KL in options.communicator:
@@ -207,11 +207,7 @@ def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tu
         chosen = tuple(name for name in chosen if name != KL)
         name = type(pairing.human).__name__
         print(f"{KL} is left out: beliefs of {name} have no density", file=sys.stderr)
-    if (
-        not options.communicator
-        and pairing.domain.name not in DOMAINS
-        and pairing.listener(0, inferred=False).driver.modelled() is None
-    ):
+    if not (options.communicator or has_oracle(pairing.domain.name, pairing.population)):
         chosen = tuple(name for name in chosen if name != "oracle")
         print(f"oracle is left out: {NO_ORACLE}", file=sys.stderr)
     if not options.communicator and pairing.domain.as_believed is not pairing.domain:

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.check_domain`: look over a world of somebody's own."""
+"""`python -m mirror_ppl.check_domain`: look over a world that a user wrote."""
 
 from __future__ import annotations
 

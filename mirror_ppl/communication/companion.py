@@ -1,4 +1,4 @@
-"""A communicator beside somebody whose world runs elsewhere: in a simulator, or for real."""
+"""A communicator for a person in a foreign loop: that of a simulator, or of a robot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mirror_ppl.errors import InputError
 
 
 class Companion:
-    """Is told what happens in rounds of one person, and says what to tell them.
+    """Receives what happens in rounds of one person, and plans the messages to them.
 
         companion = Companion(communicator)
         companion.begin(observation)

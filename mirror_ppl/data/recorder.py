@@ -1,4 +1,4 @@
-"""Recordings of rounds that somebody plays in a Gymnasium environment."""
+"""Recordings of rounds that a person plays in a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Recorder(gym.Wrapper):
     Args:
         env: the environment that is played, like the world's own.
         world: says what there is to observe in it, and which actions count.
-        person: id of who plays; change the attribute when somebody else does.
+        person: id of who plays; change the attribute when another person does.
         setting: one of the world's settings; the last unless given.
 
     Raises:
@@ -64,12 +64,13 @@ class Recorder(gym.Wrapper):
         if seed is None:
             seed = int(self._chooser.integers(self.world.layouts))
         found = self.env.reset(seed=seed, options=options)
-        if not self.world.knows(self.world.look(self.env.unwrapped)):
+        first = self.world.look(self.env.unwrapped)
+        if not self.world.knows(first):
             raise InputError(
                 f"seed {seed} begins in a state that {self.world.name} does not have; its layouts "
                 f"are the seeds 0 to {self.world.layouts - 1}"
             )
-        self._rounds.append(_Round(self.person, self.world.look(self.env.unwrapped)))
+        self._rounds.append(_Round(self.person, first))
         self._told = []
         return found
 

@@ -34,11 +34,11 @@ from mirror_ppl.progress import Progress
 from mirror_ppl.row_hashing import as_whole_numbers, row_numbers
 
 SWEEPS = 1000
-"""Of value iteration at most."""
+"""Most sweeps of value iteration."""
 CLOSE = 1e-6
 SOONER, LITTLE = 0.95, 1e-4
 """A discount by which what is alike without one differs, and how much that counts."""
-CACHED = ("tables", "_names", "_values")
+CACHED = ("tables", "_names", "_path", "_values")
 """What is worked out once."""
 TRIED_TWICE = 200
 """States that are tried again when they are reached by another way: is all of them observed?"""
@@ -114,7 +114,7 @@ class GymnasiumWorld(World):
             DomainError: the environment fails, has actions that are not numbered, is not
                 deterministic, or has too many states.
         """
-        path, identity = _file(self), {"world": self.name}
+        path, identity = self._path, {"world": self.name}
         if path is None:
             return _visited(self)
         try:
@@ -125,6 +125,17 @@ class GymnasiumWorld(World):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 save_checkpoint(path, identity, content)
         return Tables(**{part.name: content[part.name] for part in fields(Tables)})
+
+    @cached_property
+    def _path(self) -> Path | None:
+        return _file(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without tables that other processes can read from the file."""
+        kept = ("tables",) if self._path is None or not self._path.exists() else ()
+        return {
+            name: part for name, part in vars(self).items() if name not in CACHED or name in kept
+        }
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None

@@ -35,6 +35,7 @@ from mirror_ppl.inference.results.summary import score
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
+from mirror_ppl.people import has_oracle
 from mirror_ppl.training.guide_file import shipped_guide
 
 CODE = (
@@ -193,10 +194,8 @@ def assistance_cells(
     known = (*PLANNABLE, *ALSO_PLANNABLE, *REFERENCES)
     chosen = _known(models, known, group)
     if not chosen:
-        # Of people whose sight is that of a setting there is one of the package's worlds alone.
-        unknown = group.domain not in DOMAINS and group.population == "paper"
-        usual = (*PLANNABLE, *REFERENCES)
-        chosen = [name for name in usual if not (unknown and name == "oracle")]
+        there = has_oracle(group.domain, group.population)
+        chosen = [name for name in (*PLANNABLE, *REFERENCES) if there or name != "oracle"]
     return [
         Assistance(group, name, number, played, 0 if name in REFERENCES else draws)
         for name in chosen

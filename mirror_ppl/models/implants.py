@@ -24,6 +24,8 @@ NOTICES, NOTICED = "notices_", "noticed_"
 """Prefixes of the sites of how probably each item is noticed at a step, and of when it was."""
 LEAST_PROBABILITY = 1e-6
 """So near to 0 or 1 probabilities count as this far away, so that logarithms are finite."""
+CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 3.0, 0.5
+"""Of the prior of inverse temperatures per unit of reward, and the spread of their logarithms."""
 RESIDUAL_HIDDEN = 8
 
 
@@ -141,7 +143,8 @@ def choice_implants(like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
 
     return {
         "consistency": pyro.sample(
-            "consistency", dist.LogNormal(number(math.log(3.0)), number(0.5))
+            "consistency",
+            dist.LogNormal(number(math.log(CONSISTENCY_MEDIAN)), number(CONSISTENCY_SPREAD)),
         ),
         "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(1 / lapse - 1))),
     }

@@ -92,6 +92,14 @@ def populations_of(domain: str) -> tuple[str, ...]:
     return PEOPLE[name].populations if name in PEOPLE else ROBOT_LIKE
 
 
+def has_oracle(domain: str, population: str) -> bool:
+    """Whether the best messages to such people can be found: not if a setting limits their sight.
+
+    The package's worlds have exact oracles of their own.
+    """
+    return get_domain(domain).name in PEOPLE or population == "diverse"
+
+
 def simulate(  # noqa: PLR0913 - everything recordings can depend on
     domain: str = "driving",
     setting: str | None = None,
@@ -164,6 +172,7 @@ __all__ = [
     "act",
     "best_sequences",
     "draw_starts",
+    "has_oracle",
     "learn_reward",
     "learned_reward",
     "log_policy",

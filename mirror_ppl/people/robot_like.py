@@ -16,16 +16,19 @@ from mirror_ppl.domains.base import (
     require_known,
 )
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.implants import LEAST_PROBABILITY, SIGHT, sight_sites
+from mirror_ppl.models.implants import (
+    CONSISTENCY_MEDIAN,
+    CONSISTENCY_SPREAD,
+    LEAST_PROBABILITY,
+    SIGHT,
+    sight_sites,
+)
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.people.base import SimulatedPeople
 from mirror_ppl.people.populations import derived_generator
 
 POPULATIONS = ("diverse", "paper")
-MEDIAN_CONSISTENCY, SPREAD = 3.0, 0.5
-"""Of inverse temperatures per unit of reward, and the standard deviation of their logarithms; as
-the prior of the human model has them."""
 
 
 @dataclass(frozen=True)
@@ -150,12 +153,12 @@ def simulated_robot_like(
         generator = derived_generator(seed, "robot-like", person)
         drawn = torch.randint(len(bins), (len(domain.directions),), generator=generator)
         reach.append(bins[drawn])
-        consistency.append(SPREAD * torch.randn((), generator=generator))
+        consistency.append(CONSISTENCY_SPREAD * torch.randn((), generator=generator))
     return RobotLike(
         self_model,
         setting,
         torch.stack(reach) if population == "diverse" else None,
-        MEDIAN_CONSISTENCY * torch.stack(consistency).exp(),
+        CONSISTENCY_MEDIAN * torch.stack(consistency).exp(),
     )
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from example_person import DOMAIN, human
+from example_person import CHANNELS, DOMAIN, human
 
 from mirror_ppl.communication import (
     Communicator,
@@ -39,19 +39,21 @@ def test_it_decides_as_the_communicator_does_with_all_that_happened(communicator
     first = next(seen)
     companion.begin(first)
     past = RoundSoFar.begin(DOMAIN, first)
-    for _ in range(3):
+    for message in (None, {"verbal": ["rear-left"]}, None):
         decision = companion.decide()
         assert decision is companion.decide()
         assert torch.equal(decision.flags, communicator.plan(past).flags)
         now = next(seen)
-        companion.observe(now, 0)
-        past = past.then(decision.told, 0, now)
+        companion.observe(now, 0, message)
+        told = CHANNELS.split(CHANNELS.flags(message)) if message else decision.told
+        past = past.then(told, 0, now)
     for name, mask in past.told.items():
         assert torch.equal(companion.past.told[name], mask)
     companion.begin(first)
     learned = communicator.after(past).person
     assert companion.past.time == 0
     assert companion.communicator.person.hears == learned.hears
+    assert learned.hears != communicator.person.hears
 
 
 def test_what_was_really_said_counts(communicator):

@@ -1,5 +1,7 @@
 """Gymnasium environments as worlds: tables that are the environment, and what is refused."""
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -111,6 +113,9 @@ def test_tables_are_kept_for_the_next_time(tmp_path):
     made = file.stat().st_mtime_ns
     assert torch.equal(Shelf().tables.following, first.following)
     assert file.stat().st_mtime_ns == made
+    sent = pickle.loads(pickle.dumps(Shelf()))
+    assert "tables" not in vars(sent)
+    assert torch.equal(sent.tables.following, first.following)
     file.write_bytes(b"damaged")
     assert torch.equal(Shelf().tables.following, first.following)
     assert file.stat().st_size > 100
