@@ -20,10 +20,10 @@ from torch import Tensor
 
 from mirror_ppl.commands import fit
 from mirror_ppl.communication import RoundSoFar
+from mirror_ppl.domains.driving.oracle import Oracle
+from mirror_ppl.domains.driving.people import Drivers
 from mirror_ppl.evaluation.assistance import PlannerOptions, Truth, play, speaker
 from mirror_ppl.evaluation.assistance_cells import Pairing
-from mirror_ppl.evaluation.oracle import Oracle
-from mirror_ppl.people.driving import Drivers
 from mirror_ppl.training.experience import map_state
 
 

@@ -22,13 +22,14 @@ from mirror_ppl.communication import Person
 from mirror_ppl.domains import Observation, Visibility, get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import DrivingState
+from mirror_ppl.domains.driving.participants import simulated_drivers
+from mirror_ppl.domains.driving.people import Drivers
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import at_step, messages_at
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, assumption_sites, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import draw_starts, simulated_drivers
-from mirror_ppl.people.driving import Drivers
+from mirror_ppl.people import draw_starts
 
 PEOPLE = 10
 KINDS = ((), ("visual",), ("verbal",), ("visual", "verbal"))

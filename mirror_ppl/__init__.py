@@ -49,9 +49,12 @@ __all__ = [
     "worlds",
 ]
 
-_register("mirror_ppl/Driving-v0", "mirror_ppl.domains.driving_environment:DrivingEnv")
-_register("mirror_ppl/SearchRescue-v0", "mirror_ppl.domains.rescue_environment:SearchRescueEnv")
-_register("mirror_ppl/BombDefusal-v0", "mirror_ppl.domains.bomb_environment:BombDefusalEnv")
+for _folder, _name in (
+    ("driving", "Driving"),
+    ("search_rescue", "SearchRescue"),
+    ("bomb_defusal", "BombDefusal"),
+):
+    _register(f"mirror_ppl/{_name}-v0", f"mirror_ppl.domains.{_folder}.environment:{_name}Env")
 
 
 def __getattr__(name: str) -> _Any:

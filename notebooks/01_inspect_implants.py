@@ -149,7 +149,7 @@ numbers.round(2)
 # changes, the round holds some that nobody could have foreseen.
 
 # %%
-from mirror_ppl.plots.rounds import lane_changes
+from mirror_ppl.domains.driving.rounds import lane_changes
 
 changes = lane_changes(data, "observed_data")
 fit.plot.round(person, int(changes.sel(person=person).values.argmax()))

@@ -113,7 +113,9 @@ print(decision.why())
 # same start and the same luck, rounds differ only in what was said.
 
 # %%
-from mirror_ppl.people import Memory, draw_starts, simulated_drivers
+from mirror_ppl.domains.driving.participants import simulated_drivers
+from mirror_ppl.domains.driving.people import Memory
+from mirror_ppl.people import draw_starts
 
 driver = simulated_drivers("fog", "paper", 10, 0).select([0])
 starts = draw_starts(1, 8 if quick else 60, 0, "notebook")
@@ -234,7 +236,7 @@ for step, decision in enumerate(told.decisions):
 # collision. (The README shows this picture; `.savefig("communicate.png")` makes a file of it.)
 
 # %%
-from mirror_ppl.plots.replay import plot_frames
+from mirror_ppl.domains.driving.replay import plot_frames
 
 crash, step = crash_step(told_nothing), decisive_step(told)
 rounds = {"told nothing": told_nothing, "with the communicator": told}

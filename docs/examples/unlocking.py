@@ -6,7 +6,7 @@ from minigrid.core.mission import MissionSpace
 from minigrid.core.world_object import Door, Goal, Key
 from minigrid.minigrid_env import MiniGridEnv
 
-from mirror_ppl.domains import Modality
+from mirror_ppl.domains import Modality, Record
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
 
 WIDTH, HEIGHT, WALL, DOOR_ROW = 7, 6, 4, 2
@@ -68,20 +68,22 @@ class Unlocking(GymnasiumWorld):
     reach_bins = (0.0, 1.0, 2.0, 3.0, 4.0)
     reach_unit = "cells"
     lasting = ("key", "goal")
-    networks = {"encoder": 128, "decoder": 64, "q_network": 200}
-    training = {
-        "phases": 300,
-        "rounds": 200,
-        "steps": 40,
-        "learning_rate": 2e-3,
-        "beta": 1.0,
-        "beta_decay": 0.98,
-        "discount": 0.95,
-        "length": 12,
-        "stride": 2,
-        "difference_weight": 4.0,
-        "exact": True,
-    }
+    record = Record(
+        networks={"encoder": 128, "decoder": 64, "q_network": 200},
+        training={
+            "phases": 300,
+            "rounds": 200,
+            "steps": 40,
+            "learning_rate": 2e-3,
+            "beta": 1.0,
+            "beta_decay": 0.98,
+            "discount": 0.95,
+            "length": 12,
+            "stride": 2,
+            "difference_weight": 4.0,
+            "exact": True,
+        },
+    )
 
     def make(self):
         """MiniGrid with the two rooms."""

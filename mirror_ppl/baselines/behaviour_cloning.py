@@ -29,7 +29,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -46,7 +45,7 @@ from mirror_ppl.baselines.training import (
 )
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
-from mirror_ppl.people.populations import derived_generator
+from mirror_ppl.people.base import derived_generator
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class BehaviourCloneOptions(TrainingOptions):
             this was better on validation than the full decay.
     """
 
-    BY_DOMAIN = MappingProxyType({"search_rescue": {"learning_rate": 0.003, "weight_decay": 3.0}})
+    BASELINE = "bc"
 
     learning_rate: float = 0.03
     weight_decay: float = 6.0

@@ -24,10 +24,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,27 +43,10 @@ from mirror_ppl.baselines.training import (
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.people.populations import derived_generator
+from mirror_ppl.people.base import derived_generator
 
 SAMPLED = 0.0
 """Reward of what the network does by itself."""
-LONG_ROUNDS: Mapping[str, Any] = {
-    "batch": 5,
-    "sampled": 5,
-    "kept": 50,
-    "epochs": 1500,
-    "check_every": 10,
-    "patience": 60,
-    "learning_rate": 0.01,
-    "weight_decay": 0.1,
-}
-"""Where rounds are long it takes many steps until what networks do is like what people do."""
-RARE_BUTTONS: Mapping[str, Any] = LONG_ROUNDS | {
-    "learning_rate": 0.05,
-    "weight_decay": 1.0,
-    "reward": 10.0,
-}
-"""Where people also do one thing, waiting, at most steps."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +81,7 @@ class SoftQOptions(TrainingOptions):
     sample_every: int = 10
     kept: int = 5
 
-    BY_DOMAIN = MappingProxyType({"search_rescue": LONG_ROUNDS, "bomb_defusal": RARE_BUTTONS})
+    BASELINE = "sqil"
     COUNTS = (*TrainingOptions.COUNTS, "sampled", "sample_every", "kept")
 
     def __post_init__(self) -> None:

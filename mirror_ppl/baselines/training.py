@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from mirror_ppl.baselines.inputs import SIGHTS, Sight, StepInputs
 from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.data.demonstrations import Demonstrations
-from mirror_ppl.domains import require_known
+from mirror_ppl.domains import get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError
 
 Report = Callable[[int, str], None]
@@ -50,15 +50,15 @@ class TrainingOptions:
     check_every: int = 5
     patience: int = 10
 
-    BY_DOMAIN: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """What is other than the defaults in a domain."""
+    BASELINE: ClassVar[str] = ""
+    """The name under which worlds have settings of their own."""
     COUNTS = ("hidden", "epochs", "batch", "check_every", "patience")
     """Settings that have to be at least 1."""
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
         """The settings for a domain, with changes by name."""
-        return cls(**{**cls.BY_DOMAIN.get(domain, {}), **changes})
+        return cls(**{**get_domain(domain).record.baselines.get(cls.BASELINE, {}), **changes})
 
     def __post_init__(self) -> None:
         require_known(self.sight, "sight", SIGHTS)

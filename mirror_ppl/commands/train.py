@@ -119,7 +119,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
 
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.evaluation.self_model import self_model_quality
-    from mirror_ppl.models.sizes import PAPER, SIZES, sizes_of
+    from mirror_ppl.models.sizes import sizes_of
     from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
     from mirror_ppl.training.self_model import SelfModelOptions, train_self_model
@@ -130,8 +130,8 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
     ):
         raise OptionError(f"--speech: nothing is put into words in {options.domain}")
     domain = get_domain(options.domain)
-    known = {"shipped": SIZES, "paper": PAPER}
-    sizes = sizes_of(domain, known[require_known(options.sizes, "sizes", tuple(known))])
+    known = ("shipped", "paper")
+    sizes = sizes_of(domain, paper=require_known(options.sizes, "sizes", known) == "paper")
     settings = SelfModelOptions.of(
         domain.name,
         phases=options.phases,

@@ -13,7 +13,8 @@ from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Obj
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.rollouts import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.search import Automatic
-from mirror_ppl.domains.registry import settings_of
+from mirror_ppl.domains.record import settings_of
+from mirror_ppl.domains.registry import get_domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models.implants import LEAST_PROBABILITY
 from mirror_ppl.models.world_knowledge import planning_domain
@@ -55,32 +56,7 @@ class PlannerOptions:
     def of(cls, domain: str, **changes: Any) -> Self:
         """The settings for a domain, with changes; None leaves what is set for the domain."""
         given = {name: value for name, value in changes.items() if value is not None}
-        own = {**BY_DOMAIN.get(domain, {}), **settings_of(domain, "planning", cls)}
-        return cls(**(own | given))
-
-
-BY_DOMAIN: dict[str, dict[str, Any]] = {
-    "search_rescue": {
-        "horizon": 16,
-        "terminal_value": True,
-        "enumerate_above": 0.4,
-        "items": 2,
-        "min_standard_errors": 1.0,
-    },
-    # Costs grow so fast that no third item is worth its own; the oracle looks at two, too. A bomb
-    # does nothing by itself, so what helps cannot wait; and where the next stage takes as long,
-    # steps that are looked at are used up all the same, whenever this one ends.
-    # A wrong button costs much more than a message: it is rash to be silent until a gain is sure.
-    "bomb_defusal": {
-        "horizon": 12,
-        "terminal_value": True,
-        "enumerate_above": 0.4,
-        "items": 2,
-        "patience": 1,
-        "min_standard_errors": 0.0,
-    },
-}
-"""Settings of planners that differ by domain."""
+        return cls(**{**settings_of(get_domain(domain).record, "planning", cls), **given})
 
 
 def _utility(world: World, options: PlannerOptions) -> Objective:

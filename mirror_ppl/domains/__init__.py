@@ -1,6 +1,7 @@
 """Worlds as pure batched functions, and their Gymnasium faces."""
 
 from mirror_ppl.domains.base import Domain, Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.record import Record
 from mirror_ppl.domains.registry import DOMAINS, add_domain, added_worlds, domain_of, get_domain
 from mirror_ppl.domains.world import World, offers
 
@@ -10,6 +11,7 @@ __all__ = [
     "Modality",
     "Observation",
     "Visibility",
+    "Record",
     "World",
     "add_domain",
     "added_worlds",

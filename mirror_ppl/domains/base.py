@@ -29,6 +29,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import UnknownNameError
 
 Observation = Mapping[str, Tensor]
@@ -147,11 +148,12 @@ class Domain(Protocol):
     them leave nothing open, the world is ``settled``.
     ``mishap`` is the reward term of what people should be kept from, and what several of them are
     called. ``counterparts`` has for each visual item the verbal item that tells of the same, where
-    that tells more of it.
+    that tells more of it. ``record`` is what other parts of the package do differently here.
     """
 
     name: str
     version: str
+    record: Record
     modalities: tuple[Modality, ...]
     ego_features: tuple[str, ...]
     symbol_sizes: Mapping[str, int]

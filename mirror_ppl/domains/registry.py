@@ -5,11 +5,8 @@ from __future__ import annotations
 import hashlib
 import inspect
 import os
-from collections.abc import Mapping
-from dataclasses import fields
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
 
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
@@ -34,6 +31,11 @@ _LOADED: dict[tuple[Path, str, int], World] = {}
 def added_worlds() -> tuple[World, ...]:
     """Worlds that were added, for other processes to add."""
     return tuple(_ADDED.values())
+
+
+def known_domains() -> tuple[Domain, ...]:
+    """The package's own worlds, and those that were added."""
+    return (*DOMAINS.values(), *_ADDED.values())
 
 
 def load_world(specification: str | type[World] | World) -> World:
@@ -77,7 +79,7 @@ def add_domain(world: World | type[World] | str) -> World:
 
 def code_of(domain: Domain) -> str:
     """Hash of the file of a world that a user wrote; empty for the package's own worlds."""
-    if not isinstance(domain, World):
+    if domain.name in DOMAINS:
         return ""
     try:
         return hashlib.sha256(Path(inspect.getfile(type(domain))).read_bytes()).hexdigest()
@@ -140,19 +142,3 @@ def _of_file(specification: str) -> World:
     if key not in _LOADED:
         _LOADED[key] = add_domain(specification)
     return know(_LOADED[key])
-
-
-def settings_of(name: str, kind: str, options: type) -> Mapping[str, Any]:
-    """Settings that a world of somebody's own has set: ``training`` or ``planning``.
-
-    Raises:
-        DomainError: there is no such setting.
-    """
-    if name in DOMAINS:
-        return {}
-    own = getattr(get_domain(name), kind)
-    known = [field.name for field in fields(options)]
-    for each in own:
-        if each not in known:
-            raise DomainError(f"{name}: {kind} has {each}, expected some of {', '.join(known)}")
-    return own

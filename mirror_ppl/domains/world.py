@@ -20,6 +20,7 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
 from mirror_ppl.domains.memory import LastSeen
+from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import DomainError
 
 PIXELS = 24
@@ -52,10 +53,8 @@ class World(ABC):
             feature as one number for each level, and others as a number in units of their scales.
         lasting: items that people keep in mind once they were seen or told of, however these
             change; others are known where they are as they were last seen.
-        networks: :class:`~mirror_ppl.models.sizes.Sizes` of the robot that differ in this world.
-        training: settings of :class:`~mirror_ppl.training.self_model.SelfModelOptions` that differ
-            in this world, by name.
-        planning: those of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
+        record: settings of training, planning and networks, people and pictures of this world's
+            own; see :class:`~mirror_ppl.domains.record.Record`.
         mishap: reward term of what people should be kept from, and what several are called.
     """
 
@@ -71,9 +70,7 @@ class World(ABC):
     reach_bins: tuple[float, ...]
     levels: Mapping[str, range] = {}
     lasting: tuple[str, ...] = ()
-    networks: Mapping[str, int] = {}
-    training: Mapping[str, Any] = {}
-    planning: Mapping[str, Any] = {}
+    record: Record = Record()
     mishap: tuple[str, str]
 
     scenarios: tuple[str, ...] = ("any",)
@@ -189,6 +186,15 @@ class World(ABC):
         """What an unaided person sees ``[..., K]``: everything, and nothing is said to them."""
         require_known(setting, "setting", self.settings, self.name)
         return self._all(observation, lambda m: m.name == VISUAL)
+
+    def scenario(
+        self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
+    ) -> Tensor:
+        """Indices ``[batch]`` into ``scenarios``: those that are given, or drawn uniformly."""
+        if scenario is not None:
+            return scenario
+        many, device = len(self.scenarios), generator.device
+        return torch.randint(many, (batch,), generator=generator, device=device)
 
     @property
     def as_believed(self) -> Self:

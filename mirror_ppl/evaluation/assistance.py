@@ -21,16 +21,12 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains import DOMAINS
 from mirror_ppl.domains.base import Domain, Observation, map_state
 from mirror_ppl.errors import InputError, UnknownNameError
-from mirror_ppl.evaluation.oracle import Oracle
 from mirror_ppl.evaluation.played import Played, Tally
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
-from mirror_ppl.people import draw_starts
-from mirror_ppl.people.base import SimulatedPeople, act
-from mirror_ppl.people.driving import Drivers
-from mirror_ppl.people.populations import derived_generator
+from mirror_ppl.people import draw_starts, people_of
+from mirror_ppl.people.base import SimulatedPeople, act, derived_generator
 from mirror_ppl.people.recordings import Start
 
 COMMUNICATORS = (
@@ -188,12 +184,13 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
     if (known := listener.driver.modelled()) is not None:
         planner = planner_of("mirror", Person(*known), replace(options, hears=1.0), seed)
         return Planning(planner)
-    if listener.domain.name not in DOMAINS:
+    own = people_of(listener.domain.name)
+    if own is None:
         raise InputError(NO_ORACLE)
     start = map_state(lambda part: part[0], listener.start.state)
-    if isinstance(listener.driver, Drivers):
-        oracle = Oracle(listener.driver, start)
-        return lambda rounds, _: (oracle.messages(torch.stack([r.actions for r in rounds])), None)
+    if own.oracle is not None:
+        best = own.oracle(listener.driver, start)
+        return lambda rounds, _: (best(torch.stack([past.actions for past in rounds])), None)
     knows = ReachableOracle(listener.driver, start)
     return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
 

@@ -24,7 +24,7 @@ from mirror_ppl.baselines import (
 )
 from mirror_ppl.baselines.inputs import INFORMED, Sight
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains import DOMAINS, get_domain
+from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import Listener, listeners
 from mirror_ppl.evaluation.known_sight import known_sight
@@ -224,14 +224,9 @@ message means, too. Pooled ones have one network for all people."""
 ASKED_FOR = ("mirror-known-sight", "bc-informed", "bc-informed-pooled", "sqil-informed")
 """Of these what is compared in prediction on request only: it is given what nobody has, or what
 messages mean where there are none."""
-SLOW = {
-    "mirror-nuts": DOMAINS,
-    "mirror-svi": ("bomb_defusal",),
-    "sqil-everything": ("search_rescue", "bomb_defusal"),
-    "sqil-pooled": ("search_rescue", "bomb_defusal"),
-}
-"""Of these what is compared on request only, and where: a chain of each person takes minutes, `svi`
-sums over all rules of a bomb at each of its steps, and SQIL learns from long rounds for minutes."""
+SLOW = ("mirror-nuts",)
+"""Of these what is compared on request only, besides what is slow in a world by its record: a chain
+of each person takes minutes."""
 PLANNABLE = (
     "mirror",
     "perceptual-only",

@@ -1,10 +1,10 @@
 """The oracle for worlds of few states: the best that could be said, by everything within reach.
 
-Like `mirror_ppl.evaluation.oracle`, for domains in which the world and what a person has in mind
-take few enough states together to list them all, whatever the time: which states can be reached
-under any messages and actions is worked out once, and backward induction over the steps of a round
-goes over that list. What a person will have in mind next may be chance; the oracle knows what they
-have in mind, and how likely what comes next is.
+Like `mirror_ppl.domains.driving.oracle`, for domains in which the world and what a person has in
+mind take few enough states together to list them all, whatever the time: which states can be
+reached under any messages and actions is worked out once, and backward induction over the steps of
+a round goes over that list. What a person will have in mind next may be chance; the oracle knows
+what they have in mind, and how likely what comes next is.
 """
 
 from __future__ import annotations

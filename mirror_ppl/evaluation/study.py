@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import torch
 
-from mirror_ppl.domains import DOMAINS, get_domain
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.registry import code_of
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.evaluation.assistance import REFERENCES, PlannerOptions, play, speaker
@@ -42,7 +42,7 @@ CODE = (
     *(f"{name}/**/*.py" for name in ("baselines", "communication", "data", "domains")),
     *(f"{name}/**/*.py" for name in ("inference", "likelihood", "models", "people")),
     *(f"evaluation/{name}.py" for name in ("assistance", "known_sight", "learned", "learners")),
-    *(f"evaluation/{name}.py" for name in ("oracle", "played", "reachable_oracle", "study")),
+    *(f"evaluation/{name}.py" for name in ("played", "reachable_oracle", "study")),
     "cross_entropy.py",
     "row_hashing.py",
     "data/assets/*guide*.safetensors",
@@ -176,9 +176,7 @@ def prediction_cells(
     if "mirror-amortized" in chosen and not guide:
         raise AssetError(f"mirror-amortized: no trained guide ships for {group.domain}")
     if not chosen:
-        own = group.domain not in DOMAINS
-        left_out = {name for name, where in SLOW.items() if own or group.domain in where}
-        left_out |= {*ASKED_FOR}
+        left_out = {*SLOW, *get_domain(group.domain).record.slow, *ASKED_FOR}
         if not guide:
             left_out.add("mirror-amortized")
         # Who reads everything is somebody else only where something is hidden.

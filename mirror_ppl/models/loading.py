@@ -8,17 +8,9 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from mirror_ppl.checks import require_kind
+from mirror_ppl.domains.base import Domain
+from mirror_ppl.domains.registry import known_domains
 from mirror_ppl.errors import HumanModelError
-from mirror_ppl.models.bomb_defusal import BombDefusalHuman
-from mirror_ppl.models.bomb_defusal_variants import (
-    BombDefusalAnyKind,
-    BombDefusalHardOfHearing,
-    BombDefusalLate,
-    BombDefusalNoImplants,
-    BombDefusalPerceptualOnly,
-    BombDefusalPolicyOnly,
-    BombDefusalPreferring,
-)
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.variants import VARIANTS
@@ -26,28 +18,20 @@ from mirror_ppl.user_code import class_in_file, describe
 
 MIRROR = "mirror"
 """The package's own model; which it is depends on the domain."""
-OWN: Mapping[str, Mapping[str, type[HumanModel]]] = {
-    "bomb_defusal": {
-        MIRROR: BombDefusalHuman,
-        "perceptual-only": BombDefusalPerceptualOnly,
-        "policy-only": BombDefusalPolicyOnly,
-        "no-implants": BombDefusalNoImplants,
-        "late": BombDefusalLate,
-        "preferring": BombDefusalPreferring,
-        "hard-of-hearing": BombDefusalHardOfHearing,
-        "all": BombDefusalAnyKind,
-    }
-}
-"""What names in ``VARIANTS`` stand for in domains that need another model than `HumanModel`."""
 
 
 def model_name(class_name: str) -> str:
     """What commands call a human model of that class; of somebody's own the name of the class."""
-    for variants in (VARIANTS, *OWN.values()):
+    for variants in (VARIANTS, *map(human_models_of, known_domains())):
         for name, kind in variants.items():
             if kind.__name__ == class_name:
                 return name
     return class_name
+
+
+def human_models_of(domain: Domain) -> Mapping[str, type[HumanModel]]:
+    """The package's human models by name, with those of a world's own in place of some."""
+    return {**VARIANTS, **domain.record.part("human_models")}
 
 
 def file_of(specification: str | None) -> Path | None:
@@ -77,7 +61,7 @@ def load_human_model(
     if specification is None or specification in VARIANTS:
         require_kind(self_model, SelfModel, "self_model")
         name = specification or MIRROR
-        return OWN.get(self_model.domain.name, {}).get(name, VARIANTS[name])(self_model)
+        return human_models_of(self_model.domain)[name](self_model)
     path_text, colon, name = specification.rpartition(":")
     if not colon or not name.isidentifier():
         close = get_close_matches(specification.lower(), VARIANTS, n=1)

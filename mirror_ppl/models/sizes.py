@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from mirror_ppl.domains.base import Domain
 
@@ -40,16 +39,12 @@ class Sizes:
     code: int = 8
 
 
-SIZES: dict[str, Sizes] = {
-    "driving": Sizes(),
-    "search_rescue": Sizes(encoder=128, decoder=64, q_network=200),
-    "bomb_defusal": Sizes(encoder=128, decoder=64, q_network=200, image=64, stride=2),
-}
-"""The supplement's sizes by domain; of bomb defusal a smaller Q-network, see ``PAPER``."""
-PAPER: dict[str, Sizes] = SIZES | {"bomb_defusal": replace(SIZES["bomb_defusal"], q_network=2048)}
-"""The supplement's sizes by domain, whatever they cost."""
+def sizes_of(domain: Domain, paper: bool = False) -> Sizes:
+    """The sizes for a domain.
 
-
-def sizes_of(domain: Domain, sizes: Mapping[str, Sizes] = SIZES) -> Sizes:
-    """The sizes for a domain; of one that is not known here those of driving, but for its own."""
-    return sizes.get(domain.name) or Sizes(**getattr(domain, "networks", {}))
+    Args:
+        domain: the world.
+        paper: the supplement's, whatever they cost: of bomb defusal a larger Q-network.
+    """
+    record = domain.record
+    return Sizes(**{**record.networks, **(record.paper_networks if paper else {})})

@@ -1,58 +1,35 @@
 """Simulated people, and the recordings of them from which models of people are fitted.
 
-A domain's people are in a file of the domain's name, and an entry in ``PEOPLE``; those of a world
-that has none are as the robot itself, of limited sight.
+A world's own people are in its folder, and named in its record; those of a world that has none are
+as the robot itself, of limited sight.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from mirror_ppl.checks import real_number, seed_number, whole_number
 from mirror_ppl.console import usable_device
-from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import require_known
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people.base import SimulatedPeople, act
-from mirror_ppl.people.bomb_defusal import Defusers
-from mirror_ppl.people.bomb_participants import DEFUSER_POPULATIONS, simulated_defusers
-from mirror_ppl.people.driving import Drivers, Memory, PlanningDrivers, TaskDrivers, remember
-from mirror_ppl.people.driving_participants import learned_reward, simulated_drivers
-from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_reward, log_policy
-from mirror_ppl.people.populations import POPULATIONS
+from mirror_ppl.people.base import DomainPeople, SimulatedPeople, act
 from mirror_ppl.people.recordings import Start, draw_starts, record, recorded
-from mirror_ppl.people.rescue_participants import RESCUE_POPULATIONS, simulated_firefighters
 from mirror_ppl.people.robot_like import POPULATIONS as ROBOT_LIKE
 from mirror_ppl.people.robot_like import RobotLike, simulated_robot_like
-from mirror_ppl.people.search_rescue import Firefighters
 from mirror_ppl.progress import Progress
 
 
-@dataclass(frozen=True)
-class DomainPeople:
-    """The people of a domain.
+def people_of(domain: str) -> DomainPeople | None:
+    """The people of a domain's own; None where they are as the robot itself, of limited sight.
 
-    Attributes:
-        populations: names of who they may be.
-        simulated: makes them, of setting, population, number, seed and device.
+    Raises:
+        UnknownNameError: there is no such domain.
     """
-
-    populations: tuple[str, ...]
-    simulated: Callable[..., SimulatedPeople]
-
-
-PEOPLE: dict[str, DomainPeople] = {
-    "driving": DomainPeople(tuple(POPULATIONS), simulated_drivers),
-    "search_rescue": DomainPeople(tuple(RESCUE_POPULATIONS), simulated_firefighters),
-    "bomb_defusal": DomainPeople(DEFUSER_POPULATIONS, simulated_defusers),
-}
-"""The people of each domain, by its name."""
+    return get_domain(domain).record.part("people")
 
 
 def simulated_people(
@@ -76,8 +53,8 @@ def simulated_people(
     world = get_domain(domain)
     require_known(population, "population", populations_of(domain), domain)
     people, seed = whole_number(people, "people", 1), seed_number(seed)
-    if world.name in PEOPLE:
-        return PEOPLE[world.name].simulated(setting, population, people, seed, device)
+    if (own := people_of(world.name)) is not None:
+        return own.simulated(setting, population, people, seed, device)
     robot, _ = load_self_model(self_model or shipped_weights(world.name), world.name)
     return simulated_robot_like(robot.to(device), setting, population, people, seed)
 
@@ -88,16 +65,16 @@ def populations_of(domain: str) -> tuple[str, ...]:
     Raises:
         UnknownNameError: there is no such domain.
     """
-    name = get_domain(domain).name
-    return PEOPLE[name].populations if name in PEOPLE else ROBOT_LIKE
+    own = people_of(domain)
+    return ROBOT_LIKE if own is None else own.populations
 
 
 def has_oracle(domain: str, population: str) -> bool:
     """Whether the best messages to such people can be found: not if a setting limits their sight.
 
-    The package's worlds have exact oracles of their own.
+    People of a world's own can be looked through exactly, and others if they are as modelled.
     """
-    return get_domain(domain).name in PEOPLE or population == "diverse"
+    return people_of(domain) is not None or population == "diverse"
 
 
 def simulate(  # noqa: PLR0913 - everything recordings can depend on
@@ -154,34 +131,16 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
 
 
 __all__ = [
-    "PEOPLE",
-    "POPULATIONS",
-    "CrossEntropyOptions",
-    "Decisions",
-    "Defusers",
     "DomainPeople",
-    "Drivers",
-    "Firefighters",
-    "LearnedReward",
-    "Memory",
-    "PlanningDrivers",
     "RobotLike",
     "SimulatedPeople",
     "Start",
-    "TaskDrivers",
     "act",
-    "best_sequences",
     "draw_starts",
     "has_oracle",
-    "learn_reward",
-    "learned_reward",
-    "log_policy",
+    "people_of",
     "populations_of",
     "record",
-    "remember",
     "simulate",
-    "simulated_defusers",
-    "simulated_drivers",
-    "simulated_firefighters",
     "simulated_people",
 ]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -13,6 +15,23 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state
 
 if TYPE_CHECKING:
     from mirror_ppl.models.human import HumanModel
+
+
+@dataclass(frozen=True)
+class DomainPeople:
+    """The simulated people of a domain.
+
+    Attributes:
+        populations: names of who they may be.
+        simulated: makes them, of setting, population, number, seed and device.
+        oracle: of one person and the states in which rounds begin, what says ``[R, items]`` what is
+            best after actions ``[R, t]``; unless given it is sought in every state that can be
+            reached (:mod:`mirror_ppl.evaluation.reachable_oracle`).
+    """
+
+    populations: tuple[str, ...]
+    simulated: Callable[..., SimulatedPeople]
+    oracle: Callable[[Any, Any], Callable[[Tensor], Tensor]] | None = None
 
 
 @dataclass(frozen=True)
@@ -148,3 +167,16 @@ def act(probability: Tensor, luck: Tensor) -> Tensor:
 def each(value: Tensor, dimensions: int) -> Tensor:
     """Insert dimensions behind the first, so that people broadcast over what follows."""
     return value.reshape(value.shape[0], *[1] * dimensions, *value.shape[1:])
+
+
+def derived_generator(
+    seed: int, *purpose: str | int, device: torch.device | str = "cpu"
+) -> torch.Generator:
+    """A generator of its own for each seed and purpose.
+
+    Hashed rather than added up, so that neighbouring seeds share nothing.
+    """
+    text = "/".join(map(str, (seed, *purpose)))
+    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
+    # Torch's seeds are signed.
+    return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)

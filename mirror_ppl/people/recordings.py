@@ -10,9 +10,8 @@ from torch import Tensor
 
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, total_reward
-from mirror_ppl.domains.driving import Driving
-from mirror_ppl.people.base import SimulatedPeople, act
-from mirror_ppl.people.populations import derived_generator
+from mirror_ppl.domains.registry import get_domain
+from mirror_ppl.people.base import SimulatedPeople, act, derived_generator
 from mirror_ppl.progress import Progress
 from mirror_ppl.version import __version__
 
@@ -101,7 +100,7 @@ def draw_starts(
         domain: the world; driving unless given.
         fates: numbers L of a round that decide what is chance in a person's mind.
     """
-    domain = domain or Driving()
+    domain = domain or get_domain("driving")
     scenarios, states, luck, fate = [], [], [], []
     for person in range(people):
         generator = derived_generator(seed, *purpose, person, device=device)

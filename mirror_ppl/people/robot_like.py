@@ -25,8 +25,7 @@ from mirror_ppl.models.implants import (
 )
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.people.base import SimulatedPeople
-from mirror_ppl.people.populations import derived_generator
+from mirror_ppl.people.base import SimulatedPeople, derived_generator
 
 POPULATIONS = ("diverse", "paper")
 

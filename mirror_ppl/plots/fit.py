@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from mirror_ppl.errors import InputError
@@ -11,7 +12,6 @@ from mirror_ppl.plots.identifiability import plot_identifiability
 from mirror_ppl.plots.implants import plot_implants
 from mirror_ppl.plots.model_check import plot_model_check
 from mirror_ppl.plots.picture import Picture
-from mirror_ppl.plots.rounds import plot_predictive_check, plot_round
 
 if TYPE_CHECKING:
     import arviz as az
@@ -77,23 +77,21 @@ class FitPlots:
         return plot_model_check(self.data)
 
     def predictive_check(self) -> Picture:
-        """How often people change lanes, beside how often the model says that they do.
+        """What people did beside what the model says that they do; of drivers, changes of lane.
 
         Raises:
-            InputError: the world is not driving.
+            InputError: there is no such picture of this world.
         """
-        self._require_driving("predictive_check")
-        return plot_predictive_check(self.data)
+        return self._of_rounds("predictive_check")(self.data)
 
     def round(self, person: str, number: int, *, held_out: bool = False) -> Picture:
-        """One round of a driver over time, see :func:`mirror_ppl.plots.rounds.plot_round`.
+        """One round over time; see :func:`mirror_ppl.domains.driving.rounds.plot_round`.
 
         Raises:
-            InputError: the world is not driving.
+            InputError: there is no such picture of this world.
             UnknownNameError: there is nobody of that id, or no such round.
         """
-        self._require_driving("round")
-        return plot_round(self.data, person, number, held_out=held_out)
+        return self._of_rounds("round")(self.data, person, number, held_out=held_out)
 
     def files(self) -> dict[str, tuple[Picture, str]]:
         """Every picture that a fit writes, with what it shows, by file name."""
@@ -112,9 +110,12 @@ class FitPlots:
         found = [group[name].values for name in ("open_together", "information")]
         return any((values >= NEGLIGIBLE).any() for values in found)
 
-    def _require_driving(self, picture: str) -> None:
-        if self.data["posterior"].attrs.get("domain") != "driving":
-            raise InputError(f"there is a picture {picture} of driving only")
+    def _of_rounds(self, name: str) -> Callable[..., Picture]:
+        known = sight.record_of(self.data).part("rounds")
+        if name not in known:
+            domain = self.data["posterior"].attrs.get("domain")
+            raise InputError(f"there is no picture {name} of {domain}")
+        return known[name]
 
     def _of_sight(self, *names: str) -> Picture:
         known = sight.pictures_of(self.data)

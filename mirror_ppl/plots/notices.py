@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
 from mirror_ppl.models.implants import NOTICES
-from mirror_ppl.plots.picture import Picture, label_of
+from mirror_ppl.plots.picture import Picture, SightPicture, label_of
 from mirror_ppl.plots.reading import draws, explain, of_person, people, truth
 
 if TYPE_CHECKING:
@@ -90,3 +90,8 @@ def _draw(ax: Axes, rows: dict[str, np.ndarray], items: list[str], first: bool) 
         ax.axhline(0.5, color="black", lw=1.2)
     for spine in ax.spines.values():
         spine.set_visible(False)
+
+
+NOTICES_PICTURE = SightPicture(
+    has_notices, notices_picture, "how probably each person notices what is there"
+)

@@ -1,9 +1,13 @@
 """Figures that notebooks show."""
 
+from __future__ import annotations
+
 import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from matplotlib import font_manager
 from matplotlib.figure import Figure
@@ -12,6 +16,9 @@ from matplotlib.text import Text
 from matplotlib.ticker import FixedFormatter, FuncFormatter
 
 from mirror_ppl.files import write_whole
+
+if TYPE_CHECKING:
+    import arviz as az
 
 DOTS_PER_INCH = 120
 LONGEST = 40
@@ -67,6 +74,21 @@ class Picture(Figure):
         content = BytesIO()
         self.savefig(content, format="png")
         return content.getvalue()
+
+
+@dataclass(frozen=True)
+class SightPicture:
+    """A picture of what people see.
+
+    Attributes:
+        possible: whether a posterior can be drawn so.
+        draw: draws it.
+        shows: what is to be seen, in words.
+    """
+
+    possible: Callable[[az.InferenceData], bool]
+    draw: Callable[[az.InferenceData], Picture]
+    shows: str
 
 
 def displayable(text: str, font: font_manager.FontProperties | None = None) -> str:

@@ -28,7 +28,7 @@ def has_reach(data: az.InferenceData) -> bool:
         directions = _domain(data).directions
     except UnknownNameError:
         return False
-    return all(SIGHT + name in data["posterior"] for name in directions)
+    return bool(directions) and all(SIGHT + name in data["posterior"] for name in directions)
 
 
 def reach_picture(data: az.InferenceData) -> Picture:

@@ -2,64 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from mirror_ppl.plots import driving, notices, reach, road_samples, search_rescue
-from mirror_ppl.plots.picture import Picture
+from mirror_ppl.domains import Record, get_domain
+from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.plots import reach
+from mirror_ppl.plots.notices import NOTICES_PICTURE
+from mirror_ppl.plots.picture import Picture, SightPicture
 
 if TYPE_CHECKING:
     import arviz as az
 
 
-@dataclass(frozen=True)
-class SightPicture:
-    """A picture of what people see.
-
-    Attributes:
-        possible: whether a posterior can be drawn so.
-        draw: draws it.
-        shows: what is to be seen, in words.
-    """
-
-    possible: Callable[[az.InferenceData], bool]
-    draw: Callable[[az.InferenceData], Picture]
-    shows: str
-
-
-NOTICES = SightPicture(
-    notices.has_notices, notices.notices_picture, "how probably each person notices what is there"
-)
-PICTURES: dict[str, dict[str, SightPicture]] = {
-    "driving": {
-        "sight.png": SightPicture(
-            driving.has_sight, driving.sight_picture, "the road as each person sees it"
-        ),
-        "samples.png": SightPicture(
-            road_samples.has_sight,
-            road_samples.samples_picture,
-            "the same in samples, beside what they really see",
-        ),
-        "notices.png": NOTICES,
-    },
-    "search_rescue": {
-        "sight.png": SightPicture(
-            search_rescue.has_sight,
-            search_rescue.sight_picture,
-            "the house as each person sees it",
-        ),
-    },
-    "bomb_defusal": {"notices.png": NOTICES},
-}
-"""By domain and file name."""
-OF_ANY_WORLD = {
+FILES = ("notices.png", "samples.png", "sight.png")
+"""Names that pictures of what people see may have."""
+OF_ANY_WORLD: Mapping[str, SightPicture] = {
     "sight.png": SightPicture(reach.has_reach, reach.reach_picture, "how far each person sees"),
-    "notices.png": NOTICES,
+    "notices.png": NOTICES_PICTURE,
 }
 """By file name, of worlds that have no pictures of their own."""
-FILES = tuple(sorted({name for own in PICTURES.values() for name in own}))
-"""All names that there are."""
 
 
 def sight_pictures(data: az.InferenceData) -> dict[str, tuple[Picture, str]]:
@@ -71,6 +33,14 @@ def sight_pictures(data: az.InferenceData) -> dict[str, tuple[Picture, str]]:
     }
 
 
-def pictures_of(data: az.InferenceData) -> dict[str, SightPicture]:
+def pictures_of(data: az.InferenceData) -> Mapping[str, SightPicture]:
     """The pictures of sight that there are of the world of a posterior, by file name."""
-    return PICTURES.get(str(data["posterior"].attrs.get("domain", "")), OF_ANY_WORLD)
+    return record_of(data).part("pictures") or OF_ANY_WORLD
+
+
+def record_of(data: az.InferenceData) -> Record:
+    """What is known of the world of a posterior; nothing of one that is not known here."""
+    try:
+        return get_domain(str(data["posterior"].attrs.get("domain", ""))).record
+    except UnknownNameError:
+        return Record()

@@ -24,7 +24,8 @@ from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
-from mirror_ppl.domains.registry import code_of, settings_of
+from mirror_ppl.domains.record import settings_of
+from mirror_ppl.domains.registry import code_of, get_domain
 from mirror_ppl.domains.world import offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
@@ -93,8 +94,7 @@ class SelfModelOptions:
             changes: settings by name; None leaves what is set for the domain.
         """
         given = {name: value for name, value in changes.items() if value is not None}
-        own = {**BY_DOMAIN.get(domain, {}), **settings_of(domain, "training", cls)}
-        return cls(**(own | given))
+        return cls(**{**settings_of(get_domain(domain).record, "training", cls), **given})
 
     def __post_init__(self) -> None:
         for name in ("phases", "rounds", "steps", "batch", "stride"):
@@ -111,45 +111,6 @@ class SelfModelOptions:
         for name in ("beta", "beta_decay", "epsilon", "epsilon_decay", "epsilon_floor", "discount"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
-
-
-BY_DOMAIN: dict[str, dict[str, Any]] = {
-    "search_rescue": {
-        "phases": 400,
-        "rounds": 400,
-        "steps": 40,
-        "learning_rate": 2e-3,
-        "beta": 1.0,
-        "beta_decay": 0.98,
-        "epsilon_decay": 0.9,
-        "discount": 0.95,
-        "target_rate": 0.02,
-        "world_weight": 0.01,
-        "length": 16,
-        "stride": 2,
-        "difference_weight": 4.0,
-        "exact": True,
-    },
-    "bomb_defusal": {
-        "phases": 200,
-        "rounds": 400,
-        "steps": 30,
-        "batch": 192,
-        "learning_rate": 2e-3,
-        "beta": 1.0,
-        "beta_decay": 0.98,
-        "epsilon_decay": 0.9,
-        "discount": 0.95,
-        "target_rate": 0.02,
-        "world_weight": 0.01,
-        "speech_weight": 30.0,
-        "length": 10,
-        "stride": 2,
-        "difference_weight": 4.0,
-        "exact": True,
-    },
-}
-"""Settings that differ by domain; beta and epsilon are the supplement's."""
 
 
 @dataclass(frozen=True)

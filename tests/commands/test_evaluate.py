@@ -14,7 +14,7 @@ from mirror_ppl.baselines import NetworkPerson
 from mirror_ppl.baselines.training import mean_nll
 from mirror_ppl.commands import evaluate
 from mirror_ppl.domains import DOMAINS, get_domain
-from mirror_ppl.domains.bomb_panel import OLD_RULES, RULES
+from mirror_ppl.domains.bomb_defusal.panel import OLD_RULES, RULES
 from mirror_ppl.errors import OptionError
 from mirror_ppl.evaluation import learners, study
 from mirror_ppl.evaluation.assistance import REFERENCES
@@ -346,7 +346,12 @@ def test_by_default_everything_is_compared():
 def test_results_depend_on_the_code_that_made_them():
     root = Path(evaluate.__file__).parents[1]
     files = {path for part in study.CODE for path in root.glob(part)}
-    for name in ("models/human.py", "evaluation/study.py", "domains/driving.py", "data/schema.py"):
+    for name in (
+        "models/human.py",
+        "evaluation/study.py",
+        "domains/driving/world.py",
+        "data/schema.py",
+    ):
         assert root / name in files
     for part in study.CODE:
         assert list(root.glob(part)), part

@@ -10,7 +10,7 @@ import torch
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.bomb_defusal import BombDefusal, BombState
-from mirror_ppl.domains.bomb_panel import (
+from mirror_ppl.domains.bomb_defusal.panel import (
     BUTTONS,
     OLD_RULES,
     PICTURE,

@@ -17,7 +17,7 @@ from paths import DOCS
 
 import mirror_ppl  # noqa: F401  registers the environment
 from mirror_ppl.domains.driving import Driving, DrivingState
-from mirror_ppl.domains.driving_environment import DrivingEnv
+from mirror_ppl.domains.driving.environment import DrivingEnv
 from mirror_ppl.errors import UnknownNameError
 
 NAME = "mirror_ppl/Driving-v0"

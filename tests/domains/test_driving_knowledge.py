@@ -8,10 +8,10 @@ from example_course import perceived
 from example_person import DOMAIN, human, self_model
 
 from mirror_ppl.domains.driving import CAR_LANES, DrivingState
-from mirror_ppl.domains.driving_knowledge import ROAD_END, CarKnowledge, assumed_cars
+from mirror_ppl.domains.driving.knowledge import ROAD_END, CarKnowledge, assumed_cars
+from mirror_ppl.domains.driving.people import Memory, in_sight, remember
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import assumption_sites, sight_sites
-from mirror_ppl.people.driving import Memory, in_sight, remember
 
 BINS = len(DOMAIN.reach_bins)
 SIGHTS, ASSUMED = sight_sites(DOMAIN), assumption_sites(DOMAIN)

@@ -19,7 +19,7 @@ from mirror_ppl.domains.driving import (
     lane_rewards,
     task_weights,
 )
-from mirror_ppl.domains.lane_values import action_values
+from mirror_ppl.domains.driving.lane_values import action_values
 
 PAGE = DOCS / "driving.md"
 DOMAIN = Driving()

@@ -10,7 +10,8 @@ import torch
 from example_course import perceived
 
 from mirror_ppl.domains import Domain
-from mirror_ppl.domains.rescue_house import (
+from mirror_ppl.domains.search_rescue import UTTERANCES, RescueState, SearchRescue
+from mirror_ppl.domains.search_rescue.house import (
     ENTRANCE,
     HOUSE,
     OBSTACLES,
@@ -20,7 +21,6 @@ from mirror_ppl.domains.rescue_house import (
     as_image,
     as_portions,
 )
-from mirror_ppl.domains.search_rescue import UTTERANCES, RescueState, SearchRescue
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel

@@ -13,6 +13,7 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.objectives import Valued
 from mirror_ppl.communication.search import Found
 from mirror_ppl.domains.driving import Driving, DrivingState
+from mirror_ppl.domains.driving.people import Memory, TaskDrivers
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import (
     COMMUNICATORS,
@@ -23,7 +24,6 @@ from mirror_ppl.evaluation.assistance import (
     speaker,
 )
 from mirror_ppl.people import draw_starts
-from mirror_ppl.people.driving import Memory, TaskDrivers
 from mirror_ppl.people.recordings import Start
 
 DOMAIN = Driving()

@@ -13,10 +13,11 @@ import torch
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.driving import CARS, Driving, DrivingState
+from mirror_ppl.domains.driving.oracle import Oracle
+from mirror_ppl.domains.driving.participants import simulated_drivers
+from mirror_ppl.domains.driving.people import Memory, TaskDrivers, in_sight, remember
 from mirror_ppl.evaluation.assistance import Listener, play
-from mirror_ppl.evaluation.oracle import Oracle
-from mirror_ppl.people import draw_starts, remember, simulated_drivers
-from mirror_ppl.people.driving import Memory, TaskDrivers, in_sight
+from mirror_ppl.people import draw_starts
 
 DOMAIN = Driving()
 CHANNELS = Channels(DOMAIN)

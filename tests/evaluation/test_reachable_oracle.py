@@ -6,10 +6,10 @@ import torch
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.search_rescue import SearchRescue
+from mirror_ppl.domains.search_rescue.people import HOME, Firefighters
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
 from mirror_ppl.people import draw_starts, simulated_people
-from mirror_ppl.people.search_rescue import HOME, Firefighters
 
 WORLD = SearchRescue()
 CHANNELS = Channels(WORLD)

@@ -11,6 +11,7 @@ from example_course import gone_through
 
 from mirror_ppl.data import Demonstrations, concatenate
 from mirror_ppl.domains.bomb_defusal import BombDefusal
+from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.contract import check_contract
@@ -20,7 +21,6 @@ from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, restricted, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
-from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from mirror_ppl import load_recordings
+from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalNoImplants
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate
 from mirror_ppl.inference.engines import InferenceOptions, infer
@@ -13,7 +14,6 @@ from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.bomb_defusal_variants import BombDefusalNoImplants
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import has_own_program
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -13,8 +13,8 @@ import torch
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import map_state, roll_out
 from mirror_ppl.domains.driving import CAR_LANES, CARS, ROAD_END, DrivingState
+from mirror_ppl.domains.driving.people import Memory, remember
 from mirror_ppl.evaluation.self_model import _exact_values, fixed_views
-from mirror_ppl.people.driving import Memory, remember
 from mirror_ppl.training.experience import experience, follow, supposed
 from mirror_ppl.training.views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES, draw_views
 

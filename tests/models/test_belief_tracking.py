@@ -9,11 +9,11 @@ from test_bomb_defusal_human import WAIT, course
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains.base import RepeatedObservation, of_each
+from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.belief_tracking import BeliefState, Memory, Transition
-from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.human import at_step, messages_at
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 

@@ -14,7 +14,8 @@ from mirror_ppl.communication import Person, RoundSoFar
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
-from mirror_ppl.domains.bomb_panel import BUTTONS, OLD_RULES, RULES, read_panel
+from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
+from mirror_ppl.domains.bomb_defusal.panel import BUTTONS, OLD_RULES, RULES, read_panel
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.results.summary import summarize
 from mirror_ppl.likelihood.attention import Proposal, site_probabilities
@@ -23,7 +24,6 @@ from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel

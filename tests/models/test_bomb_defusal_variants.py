@@ -5,9 +5,9 @@ import torch
 from example_course import beliefs_of, gone_through, perceived
 from test_bomb_defusal_human import WORLD, course, implants
 
-from mirror_ppl.domains.bomb_panel import RULES
+from mirror_ppl.domains.bomb_defusal.human import RULE, BombDefusalHuman
+from mirror_ppl.domains.bomb_defusal.panel import RULES
 from mirror_ppl.likelihood.contract import check_contract
-from mirror_ppl.models.bomb_defusal import RULE, BombDefusalHuman
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.self_model import SelfModel

@@ -10,7 +10,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.evaluation.self_model import fixed_views, self_model_quality
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.sizes import PAPER, SIZES
+from mirror_ppl.models.sizes import sizes_of
 from mirror_ppl.models.weights import load_self_model
 from mirror_ppl.training.experience import experience
 from mirror_ppl.training.self_model import (
@@ -164,16 +164,16 @@ def test_training_writes_a_self_model_of_the_world_as_it_is(tmp_path, capsys):
     main(Options(domain="bomb_defusal", out=out, phases=1, steps=1))
     self_model, card = load_self_model(out, "bomb_defusal")
     assert self_model.domain.rules == WORLD.rules
-    assert self_model.sizes == SIZES["bomb_defusal"]
+    assert self_model.sizes == sizes_of(WORLD)
     assert {"share_full", "return_as_it_is"} <= set(card["quality"])
     assert "return as it is" in capsys.readouterr().out
 
 
 def test_the_supplement_s_sizes_run():
     """Stride 2, 64 units between convolution and features, a Q-network of 3 x 2048."""
-    sizes = PAPER["bomb_defusal"]
+    sizes = sizes_of(WORLD, paper=True)
     assert (sizes.stride, sizes.image, sizes.q_network) == (2, 64, 2048)
-    assert PAPER["driving"] == SIZES["driving"]
+    assert sizes_of(get_domain("driving"), paper=True) == sizes_of(get_domain("driving"))
     options = SelfModelOptions.of("bomb_defusal", phases=1, rounds=8, steps=1, batch=4, length=3)
     generator = torch.Generator().manual_seed(0)
     trained = train_self_model(WORLD.as_believed, options, generator, sizes=sizes)

@@ -14,6 +14,7 @@ from mirror_ppl.communication import (
     SimulatorWorld,
 )
 from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalAnyKind
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.screening import Screening
@@ -21,7 +22,6 @@ from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.bomb_defusal_variants import BombDefusalAnyKind
 from mirror_ppl.models.family import (
     FORGETS,
     KIND,

@@ -15,7 +15,7 @@ from mirror_ppl.models import speech
 from mirror_ppl.models.networks import PIXEL_SCALE, Encoder, ImageDecoder
 from mirror_ppl.models.readers import ImageReader, Source, SpeechReader, image_patches
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.sizes import SIZES, Sizes
+from mirror_ppl.models.sizes import Sizes, sizes_of
 
 WORLD = SearchRescue()
 VERBAL = next(m for m in WORLD.modalities if m.name == "verbal")
@@ -106,7 +106,7 @@ def observed(*batch):
 @pytest.mark.parametrize("name", ["visual", "verbal"])
 def test_what_is_hidden_counts_for_nothing_and_what_is_seen_does(name):
     torch.manual_seed(0)
-    network, values = Encoder(WORLD, SIZES["search_rescue"], codes()), observed(6)
+    network, values = Encoder(WORLD, sizes_of(WORLD), codes()), observed(6)
     visible = {m.name: torch.rand(6, len(m.items)) < 0.5 for m in WORLD.modalities}
     before = network.combine(network.embed(values), visible)
     other = {key: value.clone() for key, value in values.items()}
@@ -120,7 +120,7 @@ def test_what_is_hidden_counts_for_nothing_and_what_is_seen_does(name):
 
 
 def test_imagined_items_are_read_as_if_they_were_seen():
-    network, values = Encoder(WORLD, SIZES["search_rescue"], codes()), observed(4)
+    network, values = Encoder(WORLD, sizes_of(WORLD), codes()), observed(4)
     imagined = {name: value.flip(0) for name, value in values.items()}
     masks = {m.name: torch.rand(4, len(m.items)) < 0.5 for m in WORLD.modalities}
     taken = {name: ~mask & (torch.rand(mask.shape) < 0.5) for name, mask in masks.items()}
@@ -136,7 +136,7 @@ def test_imagined_items_are_read_as_if_they_were_seen():
 
 def test_views_share_what_items_look_like():
     """One embedded observation under many masks gives what each mask by itself gives."""
-    reader = ImageReader(9, (3, 3, 3), SIZES["search_rescue"])
+    reader = ImageReader(9, (3, 3, 3), sizes_of(WORLD))
     embedded = reader.embed(observed(1)["visual"])
     masks = torch.rand(7, 9) < 0.5
     together = reader.join([Source(embedded, masks)])

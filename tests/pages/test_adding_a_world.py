@@ -319,14 +319,13 @@ def test_settings_are_looked_over(tmp_path, capsys):
     from mirror_ppl.commands import check_domain
 
     for line, message in (
-        ('training = {"phasez": 3}', "training has phasez, expected some of"),
-        ('training = {"phases": 0}', "phases must be at least 1, not 0"),
-        ('planning = {"horizn": 3}', "planning has horizn"),
-        ('networks = {"coder": 3}', "networks: "),
+        ('record = Record(training={"phasez": 3})', "training has phasez, expected some of"),
+        ('record = Record(training={"phases": 0})', "phases must be at least 1, not 0"),
+        ('record = Record(planning={"horizn": 3})', "planning has horizn"),
+        ('record = Record(networks={"coder": 3})', "networks: "),
     ):
         file = tmp_path / "settings.py"
-        file.write_text(
-            FILE.read_text().replace("    horizon = 8\n", f"    horizon = 8\n    {line}\n")
-        )
+        world = FILE.read_text().replace("    horizon = 8\n", f"    horizon = 8\n    {line}\n")
+        file.write_text(f"from mirror_ppl.domains import Record\n{world}")
         assert command(check_domain, f"{file}:RoundTable") == 1
         assert message in capsys.readouterr().out

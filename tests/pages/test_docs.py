@@ -37,7 +37,7 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import PEOPLE
+from mirror_ppl.people import populations_of
 from mirror_ppl.training import views as training_views
 from mirror_ppl.training.self_model import SelfModelOptions
 
@@ -127,7 +127,7 @@ def test_every_command_is_real(where, line):
         return
     domain = get_domain(options.get("domain") or "driving")
     assert options.get("setting") in (*domain.settings, None)
-    assert options.get("population") in (*PEOPLE[domain.name].populations, None)
+    assert options.get("population") in (*populations_of(domain.name), None)
     for option in ("card", "human_model"):
         path = str(options.get(option) or "").partition(":")[0]
         assert not path or path in VARIANTS or (ROOT / path).is_file()

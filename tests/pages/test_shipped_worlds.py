@@ -6,14 +6,14 @@ import torch
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import WAIT
-from mirror_ppl.domains.bomb_panel import OLD_RULES, STAGES, read_panel, right_button
+from mirror_ppl.domains.bomb_defusal.panel import OLD_RULES, STAGES, read_panel, right_button
 from mirror_ppl.errors import AssetError
 from mirror_ppl.evaluation.self_model import self_model_quality
 from mirror_ppl.inference.amortized_guide import AmortizedGuide
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.people import PEOPLE
+from mirror_ppl.people import populations_of
 from mirror_ppl.training.guide_file import network_for
 
 
@@ -33,7 +33,7 @@ def test_the_robot_acts_as_well_as_its_card_says(name):
 @pytest.mark.parametrize("name", ["driving", "search_rescue", "bomb_defusal"])
 def test_recordings_ship_of_every_setting_and_population(name):
     for setting in get_domain(name).settings:
-        for population in PEOPLE[name].populations:
+        for population in populations_of(name):
             recorded = load_demonstrations(asset_path(f"{name}_{setting}_{population}.nc"))
             assert (recorded.domain, recorded.setting) == (name, setting)
             assert recorded.num_people == 10 and recorded.round_counts.min() == 40

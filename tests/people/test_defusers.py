@@ -7,15 +7,15 @@ import torch
 
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.bomb_defusal import BombDefusal, BombState
-from mirror_ppl.errors import UnknownNameError
-from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
-from mirror_ppl.people import PEOPLE, simulate, simulated_people
-from mirror_ppl.people.bomb_defusal import Defusers
-from mirror_ppl.people.bomb_participants import (
+from mirror_ppl.domains.bomb_defusal.participants import (
     learn_notices,
     participants,
     simulated_defusers,
 )
+from mirror_ppl.domains.bomb_defusal.people import Defusers
+from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
+from mirror_ppl.people import populations_of, simulate, simulated_people
 from mirror_ppl.people.recordings import draw_starts, record
 
 WORLD = BombDefusal()
@@ -193,7 +193,7 @@ def test_the_mean_of_noticing_is_learned_from_rounds(seed):
     assert len(set(participants(5, seed, by_place=True).notices[0].tolist())) == 6
 
 
-@pytest.mark.parametrize("population", PEOPLE["bomb_defusal"].populations)
+@pytest.mark.parametrize("population", populations_of("bomb_defusal"))
 def test_the_same_seed_gives_the_same_people_in_every_setting(population):
     one, other = (simulated_defusers(setting, population, 3, 1) for setting in WORLD.settings)
     assert torch.equal(one.notices, other.notices)

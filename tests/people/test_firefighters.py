@@ -8,25 +8,25 @@ import torch
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.rescue_house import CORRIDORS, ENTRANCE, ROOMS
 from mirror_ppl.domains.search_rescue import RescueState, SearchRescue
-from mirror_ppl.errors import UnknownNameError
-from mirror_ppl.people import PEOPLE, act, record, simulate, simulated_people
-from mirror_ppl.people.recordings import draw_starts
-from mirror_ppl.people.rescue_participants import (
+from mirror_ppl.domains.search_rescue.house import CORRIDORS, ENTRANCE, ROOMS
+from mirror_ppl.domains.search_rescue.participants import (
     RADII,
     learn_transitions,
     learned_transitions,
     participants,
     transitions_of,
 )
-from mirror_ppl.people.search_rescue import (
+from mirror_ppl.domains.search_rescue.people import (
     HOME,
     SUBGOALS,
     Firefighters,
     possible_subgoals,
     subgoal_distances,
 )
+from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.people import act, people_of, record, simulate, simulated_people
+from mirror_ppl.people.recordings import draw_starts
 
 WORLD = SearchRescue()
 LEFT, RIGHT, TOP_LEFT, TOP_MIDDLE, TOP_RIGHT, ENTRY = range(6)
@@ -371,7 +371,7 @@ def test_who_sees_less_needs_longer():
 
 
 def test_populations():
-    assert PEOPLE["search_rescue"].populations == ("paper", "diverse")
+    assert people_of("search_rescue").populations == ("paper", "diverse")
     diverse = simulated_people("search_rescue", "clear", "diverse", 40, 0)
     assert set(diverse.radius.tolist()) == set(torch.tensor(RADII).tolist())
     assert set(RADII) <= set(WORLD.reach_bins)

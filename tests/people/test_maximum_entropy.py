@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from mirror_ppl.domains.driving.maximum_entropy import FEATURES, Decisions, learn_reward, log_policy
 from mirror_ppl.errors import DemonstrationsError
-from mirror_ppl.people.maximum_entropy import FEATURES, Decisions, learn_reward, log_policy
 
 HORIZON, DISCOUNT = 10, 0.9
 # Centre, cars at 0 to 4 cells, switch.

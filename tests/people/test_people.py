@@ -8,15 +8,20 @@ import torch
 from mirror_ppl.commands.simulate import DESCRIPTION, PROGRAM, Options, main
 from mirror_ppl.console import run
 from mirror_ppl.data import load_demonstrations
-from mirror_ppl.domains import get_domain
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.driving import CARS, FOG_REACH, Driving, DrivingState, lane_rewards
-from mirror_ppl.domains.lane_values import action_values
-from mirror_ppl.errors import UnknownNameError
-from mirror_ppl.people import PEOPLE, POPULATIONS, remember, simulate, simulated_drivers
-from mirror_ppl.people.driving import DISCOUNT, HORIZON, Memory, TaskDrivers, in_sight
-from mirror_ppl.people.driving_participants import learned_reward
-from mirror_ppl.people.maximum_entropy import FEATURES
-from mirror_ppl.people.populations import (
+from mirror_ppl.domains.driving.lane_values import action_values
+from mirror_ppl.domains.driving.maximum_entropy import FEATURES
+from mirror_ppl.domains.driving.participants import learned_reward, simulated_drivers
+from mirror_ppl.domains.driving.people import (
+    DISCOUNT,
+    HORIZON,
+    Memory,
+    TaskDrivers,
+    in_sight,
+    remember,
+)
+from mirror_ppl.domains.driving.populations import (
     CONSISTENCY_MEDIAN,
     CONSISTENCY_SPREAD,
     REACHES_AHEAD,
@@ -25,6 +30,8 @@ from mirror_ppl.people.populations import (
     derived_generator,
     reaches,
 )
+from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.people import populations_of, simulate
 from mirror_ppl.people.recordings import draw_starts, record
 
 DOMAIN = Driving()
@@ -180,7 +187,7 @@ def test_beyond_the_visible_road_there_is_nothing_to_learn():
 
 
 @pytest.mark.parametrize("setting", DOMAIN.settings)
-@pytest.mark.parametrize("population", POPULATIONS)
+@pytest.mark.parametrize("population", populations_of("driving"))
 def test_after_the_first_step_drivers_are_never_wrong(setting, population, seed):
     """On their own, they may miss cars, but those that they know of are where they think."""
     start = draw_starts(10, 50, seed, "a test of memory", setting)
@@ -443,7 +450,7 @@ def test_the_same_call_gives_the_same_recordings(fog):
     assert simulate("driving", "fog", "paper", people=10, rounds=20, seed=0).equals(fog)
 
 
-@pytest.mark.parametrize("domain", list(PEOPLE))
+@pytest.mark.parametrize("domain", list(DOMAINS))
 def test_what_is_told_is_recorded_and_comes_about_as_often_as_asked_for(domain):
     """Of what can be told; the people are the same, and the rounds begin alike."""
     quiet = simulate(domain, people=2, rounds=20, seed=0)
@@ -565,7 +572,7 @@ def test_command_that_cannot_write(tmp_path, capsys):
 def test_help_names_every_choice(capsys):
     assert command("--help") == 0
     text = " ".join(capsys.readouterr().out.split())
-    for name in (*PEOPLE, *DOMAIN.settings, *POPULATIONS):
+    for name in (*DOMAINS, *DOMAIN.settings, *populations_of("driving")):
         assert name in text
     for option in fields(Options):
         assert f"--{option.name.replace('_', '-')}" in text

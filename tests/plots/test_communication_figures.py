@@ -13,12 +13,12 @@ from mirror_ppl.communication.communicator import Decision, gain_over_silence
 from mirror_ppl.communication.objectives import Valued
 from mirror_ppl.communication.search import Found
 from mirror_ppl.domains.driving import CARS
+from mirror_ppl.domains.driving.people import Memory
+from mirror_ppl.domains.driving.replay import plot_frames, share_known, share_seen
+from mirror_ppl.domains.driving.road import DISTANCES
 from mirror_ppl.errors import UnknownNameError
-from mirror_ppl.people import Memory
 from mirror_ppl.plots.communication import candidate_name, in_words, plot_action, plot_utilities
-from mirror_ppl.plots.driving import DISTANCES
 from mirror_ppl.plots.reading import BLUE, GREY
-from mirror_ppl.plots.replay import plot_frames, share_known, share_seen
 
 CHANNELS = Channels(DOMAIN)
 # Silence, one car shown, two said, and one said a step later.

@@ -9,8 +9,7 @@ import pytest
 import xarray as xr
 from paths import ROOT
 
-from mirror_ppl.errors import DemonstrationsError, OutputError, UnknownNameError
-from mirror_ppl.plots.driving import (
+from mirror_ppl.domains.driving.road import (
     has_sight,
     outline,
     plot_sight,
@@ -19,16 +18,17 @@ from mirror_ppl.plots.driving import (
     sight_probability,
     true_sight,
 )
-from mirror_ppl.plots.implants import kernel_density, plot_implants, scalar_implants
-from mirror_ppl.plots.picture import Picture
-from mirror_ppl.plots.road_samples import samples_picture
-from mirror_ppl.plots.rounds import (
+from mirror_ppl.domains.driving.rounds import (
     calibration,
     lane_changes,
     plot_predictive_check,
     plot_round,
     switching,
 )
+from mirror_ppl.domains.driving.samples import samples_picture
+from mirror_ppl.errors import DemonstrationsError, OutputError, UnknownNameError
+from mirror_ppl.plots.implants import kernel_density, plot_implants, scalar_implants
+from mirror_ppl.plots.picture import Picture
 
 PEOPLE = ["anna", "ben"]
 SITES = ("sight_front_own", "sight_front_other", "sight_back_own", "sight_back_other")

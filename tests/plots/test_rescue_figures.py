@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mirror_ppl.plots.search_rescue import PLACE, sight_probability
+from mirror_ppl.domains.search_rescue.pictures import PLACE, sight_probability
 from mirror_ppl.plots.sight import sight_pictures
 
 

@@ -6,7 +6,6 @@ person 3 of a seed is the same in every setting and however many other people th
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
 
@@ -14,7 +13,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import require_known
-from mirror_ppl.domains.driving import FOG_REACH, ROAD_END, Driving
+from mirror_ppl.domains.driving.world import FOG_REACH, ROAD_END, Driving
+from mirror_ppl.people.base import derived_generator
 
 CONSISTENCY_MEDIAN = 3.0
 """Median over people of the consistency, in 1 / units of reward."""
@@ -30,19 +30,6 @@ REACHES_AHEAD = (1, 2, 3, 4, 6)
 """What reaches ahead there are in the population ``diverse``, in cells."""
 REACHES_BEHIND = (0, 1, 2, 3, 4)
 """The same behind; 0 sees nothing there."""
-
-
-def derived_generator(
-    seed: int, *purpose: str | int, device: torch.device | str = "cpu"
-) -> torch.Generator:
-    """A generator of its own for each seed and purpose.
-
-    Hashed rather than added up, so that neighbouring seeds share nothing.
-    """
-    text = "/".join(map(str, (seed, *purpose)))
-    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
-    # Torch's seeds are signed.
-    return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
 
 
 def consistencies(people: int, seed: int) -> Tensor:

@@ -53,8 +53,8 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
-from mirror_ppl.domains.bomb_knowledge import BombKnowledge
-from mirror_ppl.domains.bomb_panel import (
+from mirror_ppl.domains.bomb_defusal.knowledge import BombKnowledge
+from mirror_ppl.domains.bomb_defusal.panel import (
     BUTTONS,
     KINDS,
     OLD_RULES,
@@ -68,6 +68,8 @@ from mirror_ppl.domains.bomb_panel import (
     read_panel,
     right_button,
 )
+from mirror_ppl.domains.bomb_defusal.record import RECORD
+from mirror_ppl.domains.world import World
 
 RIGHT, WRONG, TIME = 5.0, -5.0, -1.0
 WAIT = 0
@@ -94,7 +96,7 @@ class BombState:
     symbols: Tensor
 
 
-class BombDefusal:
+class BombDefusal(World):
     """The domain of bomb defusal; see the module's description.
 
     Args:
@@ -102,6 +104,7 @@ class BombDefusal:
     """
 
     name = "bomb_defusal"
+    record = RECORD
     version = "1"
     modalities: tuple[Modality, ...] = (
         Modality(
@@ -137,19 +140,14 @@ class BombDefusal:
     scenarios: tuple[str, ...] = tuple(f"{kind} bomb" for kind in KINDS)
     reward_terms: tuple[str, ...] = ("right", "wrong", "time")
     mishap: tuple[str, str] = ("wrong", "wrong buttons")
-    counterparts: tuple[int | None, ...] = (None,) * TERMINALS
     directions: tuple[str, ...] = ("panel",)
-    direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
     reach_bins: tuple[float, ...] = (0.0,)
     """Everybody reaches every terminal: they are all in front of them."""
     reach_unit = "steps"
-    reach_practice: tuple[float, ...] = ()
     told_practice = 0.5
     # The robot takes people to be about as quick as they would have to be for waiting to pay.
     notice_practice = (0.25, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {}
-    assumptions: tuple[str, ...] = ()
-    settled = False
 
     def __init__(self, rules: Rules = RULES) -> None:
         self.rules = rules
@@ -174,8 +172,7 @@ class BombDefusal:
         def drawn(most: int, *shape: int) -> Tensor:
             return torch.randint(most, (batch, *shape), generator=generator, device=device)
 
-        if scenario is None:
-            scenario = drawn(len(self.scenarios))
+        scenario = self.scenario(batch, generator, scenario)
         nothing = torch.zeros(batch, dtype=torch.long, device=device)
         return BombState(
             stage=nothing,
@@ -262,13 +259,6 @@ class BombDefusal:
         lit = torch.arange(TERMINALS, device=live.device) == live[..., None]
         return lit & (observation["ego"][..., :1] < STAGES)
 
-    def communicable(self, observation: Observation) -> Visibility:
-        """Every terminal can be shown, and of the type can be spoken."""
-        return {
-            name: torch.ones_like(observation[name][..., 0], dtype=torch.bool)
-            for name in ("visual", "verbal")
-        }
-
     def faults(self, observation: Observation) -> dict[str, Tensor]:
         """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
         stage, since = observation["ego"].unbind(-1)
@@ -304,20 +294,6 @@ class BombDefusal:
     def known(self, knowledge: BombKnowledge) -> Visibility:
         """Terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
         return knowledge.items()
-
-    def assume(
-        self, knowledge: BombKnowledge, observation: Observation
-    ) -> tuple[dict[str, Visibility], Observation]:
-        """Nothing is taken for granted."""
-        del knowledge
-        return {}, observation
-
-    def supposed(
-        self, state: BombState, knowledge: BombKnowledge, assumes: Mapping[str, Tensor]
-    ) -> BombState:
-        """The state as it is: nothing is taken for granted."""
-        del knowledge, assumes
-        return state
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Observations in the form in which networks read them.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
-from mirror_ppl.domains.bomb_panel import TERMINALS
+from mirror_ppl.domains.bomb_defusal.panel import TERMINALS
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
-from mirror_ppl.domains.rescue_house import (
+from mirror_ppl.domains.search_rescue.house import (
     CORRIDORS,
     ENTRANCE,
     PORTION,
@@ -76,11 +76,13 @@ from mirror_ppl.domains.rescue_house import (
     reach_distances,
     walkable,
 )
-from mirror_ppl.domains.rescue_knowledge import (
+from mirror_ppl.domains.search_rescue.knowledge import (
     CORRIDOR_PORTIONS,
     ROOM_PORTIONS,
     HouseKnowledge,
 )
+from mirror_ppl.domains.search_rescue.record import RECORD
+from mirror_ppl.domains.world import World
 
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 SMOKE_REACH = 1.5
@@ -118,10 +120,11 @@ class RescueState:
     victim: Tensor
 
 
-class SearchRescue:
+class SearchRescue(World):
     """The domain of search and rescue; see the module's description."""
 
     name = "search_rescue"
+    record = RECORD
     version = "1"
     modalities: tuple[Modality, ...] = (
         Modality(
@@ -161,9 +164,7 @@ class SearchRescue:
     )
     reward_terms: tuple[str, ...] = ("found", "returned", "collision", "time")
     mishap: tuple[str, str] = ("collision", "collisions")
-    counterparts: tuple[int | None, ...] = (None,) * len(PORTIONS)
     directions: tuple[str, ...] = ("radius",)
-    direction_groups: tuple[tuple[int, ...], ...] = ((0,),)
     reach_bins: tuple[float, ...] = reach_distances()
     """Radii in cells, one of each set of those with which one sees the same from every place."""
     reach_unit = "cells"
@@ -172,16 +173,9 @@ class SearchRescue:
         4.0 if abs(radius - SMOKE_REACH) <= 1 else 1.0 for radius in reach_distances()
     )
     told_practice = 0.05
-    notice_practice = (1.0, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ("open",)
     """A corridor of which nothing is known is not blocked."""
-    settled = False
-
-    @property
-    def as_believed(self) -> SearchRescue:
-        """The world itself: the robot was taught how it is."""
-        return self
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
@@ -194,10 +188,7 @@ class SearchRescue:
             scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
         """
         device = generator.device
-        if scenario is None:
-            scenario = torch.randint(
-                len(self.scenarios), (batch,), generator=generator, device=device
-            )
+        scenario = self.scenario(batch, generator, scenario)
         never = torch.zeros(batch, dtype=torch.bool, device=device)
         return RescueState(
             place=torch.tensor(ENTRANCE, device=device).expand(batch, 2),
@@ -286,13 +277,6 @@ class SearchRescue:
         if setting == "clear":
             return {"visual": torch.ones_like(distance, dtype=torch.bool), "verbal": everything}
         return {"visual": distance <= SMOKE_REACH, "verbal": ~everything}
-
-    def communicable(self, observation: Observation) -> Visibility:
-        """Every portion can be shown, and of every corridor and room can be spoken."""
-        return {
-            name: torch.ones_like(observation[name][..., 0], dtype=torch.bool)
-            for name in ("visual", "verbal")
-        }
 
     def faults(self, observation: Observation) -> dict[str, Tensor]:
         """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
@@ -403,10 +387,6 @@ class SearchRescue:
             victim=(holds[..., len(sides) :] * rooms).sum(-1),
         )
 
-    def next_observation(self, observation: Observation, action: Tensor) -> Observation:
-        """What there is to observe after an action ``[...]``; all of it is determined."""
-        return self.observe(self.transition(self.state_behind(observation), action))
-
     def nearest(self, observation: Observation) -> Observation:
         """The observation that can be and is nearest to decoded values.
 
@@ -449,13 +429,6 @@ class SearchRescue:
         portions = torch.zeros_like(observation["visual"][..., 0], dtype=torch.bool)
         portions[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = holds
         return {"goal_and_obstacle": {"visual": portions, "verbal": holds}}
-
-    def decisive(self, observation: Observation) -> Visibility:
-        """Everything."""
-        return {
-            m.name: torch.ones_like(observation[m.name][..., 0], dtype=torch.bool)
-            for m in self.modalities
-        }
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:
         """Such as "victim in top-right", or "the middle-left of the map (left corridor clear)"."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from mirror_ppl.domains.driving import ROAD_END, Driving
+from mirror_ppl.domains.driving.world import ROAD_END, Driving
 from mirror_ppl.domains.environment import DomainEnv
 
 

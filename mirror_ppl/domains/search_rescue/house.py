@@ -8,7 +8,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.rescue_knowledge import CORRIDOR_PORTIONS, ROOM_PORTIONS
+from mirror_ppl.domains.search_rescue.knowledge import CORRIDOR_PORTIONS, ROOM_PORTIONS
 
 SIDE, PORTION = 9, 3
 """Cells along a side of the map, and of a portion of it."""

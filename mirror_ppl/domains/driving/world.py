@@ -52,13 +52,15 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
-from mirror_ppl.domains.driving_knowledge import (
+from mirror_ppl.domains.driving.knowledge import (
     ASSUMPTIONS,
     ROAD_END,
     CarKnowledge,
     assumed_cars,
 )
-from mirror_ppl.domains.lane_values import action_values
+from mirror_ppl.domains.driving.lane_values import action_values
+from mirror_ppl.domains.driving.record import RECORD
+from mirror_ppl.domains.world import World
 
 STAY, SWITCH = 0, 1
 NEAR = 2
@@ -101,10 +103,11 @@ class DrivingState:
     speed: Tensor
 
 
-class Driving:
+class Driving(World):
     """The driving domain; see the module's description."""
 
     name = "driving"
+    record = RECORD
     version = "1"
     modalities: tuple[Modality, ...] = (
         Modality(
@@ -128,7 +131,6 @@ class Driving:
     symbol_sizes: Mapping[str, int] = {"ego": 2, "visual": 50, "verbal": 53}
     actions: tuple[str, ...] = ("stay", "switch")
     horizon = 15
-    over_at_horizon = True
     settings: tuple[str, ...] = ("clear", "fog")
     scenarios: tuple[str, ...] = tuple(SCENARIO_SPEEDS)
     reward_terms: tuple[str, ...] = ("proximity", "collision", "off_road", "lane_change")
@@ -141,20 +143,13 @@ class Driving:
     """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
     cells away and none at the next edge. The last bin is the whole road."""
     reach_unit = "cells"
-    reach_practice: tuple[float, ...] = ()
     told_practice = 0.5
-    notice_practice = (1.0, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {
         "fog": (FOG_REACH, FOG_REACH, 0.0, 0.0),
         "four_ahead_two_behind": (4.0, 4.0, 2.0, 2.0),
     }
     assumptions: tuple[str, ...] = ASSUMPTIONS
     settled = True
-
-    @property
-    def as_believed(self) -> Driving:
-        """The world itself: the robot was taught how it is."""
-        return self
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
@@ -167,10 +162,7 @@ class Driving:
             scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
         """
         device = generator.device
-        if scenario is None:
-            scenario = torch.randint(
-                len(self.scenarios), (batch,), generator=generator, device=device
-            )
+        scenario = self.scenario(batch, generator, scenario)
         speeds = torch.tensor(list(SCENARIO_SPEEDS.values()), device=device)
         distance = torch.randint(
             1, ROAD_END, (batch, len(CARS)), generator=generator, device=device
@@ -180,10 +172,6 @@ class Driving:
             position=distance * torch.tensor(CAR_SIDES, device=device),
             speed=speeds[scenario],
         )
-
-    def anywhere(self, batch: int, generator: torch.Generator) -> DrivingState:
-        """States ``[batch]`` at the start of a round: cars pass by within it."""
-        return self.initial(batch, generator)
 
     def transition(self, state: DrivingState, action: Tensor) -> DrivingState:
         """State at t + 1; ``action`` ``[...]`` is 0 (stay) or 1 (switch)."""
@@ -277,7 +265,7 @@ class Driving:
     ) -> CarKnowledge:
         """Two sights of a car, one utterance, or its absence where it was assumed, make it known.
 
-        See `mirror_ppl.domains.driving_knowledge`.
+        See `mirror_ppl.domains.driving.knowledge`.
         """
         return knowledge.learn(observation, visible, sees)
 
@@ -352,10 +340,6 @@ class Driving:
             speed=torch.where(away, 0, speed),
         )
 
-    def next_observation(self, observation: Observation, action: Tensor) -> Observation:
-        """What there is to observe after an action ``[...]``; all of it is determined."""
-        return self.observe(self.transition(self.state_behind(observation), action))
-
     def nearest(self, observation: Observation) -> Observation:
         """The observation that can be and is nearest to decoded values.
 
@@ -380,13 +364,6 @@ class Driving:
         return {
             "collision_course": {"visual": course, "verbal": course},
             "closing": {"visual": closing, "verbal": closing},
-        }
-
-    def decisive(self, observation: Observation) -> Visibility:
-        """Everything."""
-        return {
-            m.name: torch.ones_like(observation[m.name][..., 0], dtype=torch.bool)
-            for m in self.modalities
         }
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:

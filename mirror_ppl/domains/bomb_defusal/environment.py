@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from mirror_ppl.domains.bomb_defusal import BombDefusal
-from mirror_ppl.domains.bomb_panel import STAGES
+from mirror_ppl.domains.bomb_defusal.panel import STAGES
+from mirror_ppl.domains.bomb_defusal.world import BombDefusal
 from mirror_ppl.domains.environment import DomainEnv
 
 

@@ -14,12 +14,9 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import require_known
-from mirror_ppl.domains.rescue_house import CORRIDORS, ROOMS
-from mirror_ppl.domains.rescue_knowledge import HouseKnowledge
-from mirror_ppl.domains.search_rescue import SMOKE_REACH, SearchRescue
-from mirror_ppl.people.populations import derived_generator
-from mirror_ppl.people.recordings import Recording, draw_starts, record
-from mirror_ppl.people.search_rescue import (
+from mirror_ppl.domains.search_rescue.house import CORRIDORS, ROOMS
+from mirror_ppl.domains.search_rescue.knowledge import HouseKnowledge
+from mirror_ppl.domains.search_rescue.people import (
     HOME,
     SUBGOALS,
     Firefighters,
@@ -27,6 +24,9 @@ from mirror_ppl.people.search_rescue import (
     possible_subgoals,
     subgoal_distances,
 )
+from mirror_ppl.domains.search_rescue.world import SMOKE_REACH, SearchRescue
+from mirror_ppl.people.base import DomainPeople, derived_generator
+from mirror_ppl.people.recordings import Recording, draw_starts, record
 
 PARTICIPANT_ROUNDS = 36
 """How many rounds a participant plays in each setting."""
@@ -196,3 +196,7 @@ def simulated_firefighters(
         transitions=learned_transitions(people, seed).to(device),
         lapse=participants(setting, people, seed).lapse.to(device),
     )
+
+
+FIREFIGHTERS = DomainPeople(tuple(RESCUE_POPULATIONS), simulated_firefighters)
+"""What the rest of the package knows of them."""

@@ -12,9 +12,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from scipy.stats import beta
 
-from mirror_ppl.domains.driving import CAR_LANES, ROAD_END, SWITCH
+from mirror_ppl.domains.driving.road import DARK_TO_LIGHT, DISTANCES, sight_probability
+from mirror_ppl.domains.driving.world import CAR_LANES, ROAD_END, SWITCH
 from mirror_ppl.errors import DemonstrationsError
-from mirror_ppl.plots.driving import DARK_TO_LIGHT, DISTANCES, sight_probability
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import (
     BLUE,
@@ -43,8 +43,8 @@ def plot_round(
 ) -> Picture:
     """Draw one round over time: the cars, what the person sees of them, and what they did.
 
-    Each lane is drawn with distances upwards and time to the right, shaded as
-    :func:`mirror_ppl.plots.driving.plot_sight` shades the road. Below stands the posterior
+    Each lane is drawn with distances upwards and time to the right, shaded as the road is by
+    :func:`mirror_ppl.domains.driving.road.plot_sight`. Below stands the posterior
     predictive probability of switching lanes, and what the person did.
 
     Args:

@@ -26,8 +26,8 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Observation, Visibility
-from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
-from mirror_ppl.domains.bomb_panel import KINDS, STAGES, read_panel, right_button
+from mirror_ppl.domains.bomb_defusal.panel import KINDS, STAGES, read_panel, right_button
+from mirror_ppl.domains.bomb_defusal.world import WAIT, BombDefusal
 from mirror_ppl.people.base import SimulatedPeople, each
 
 UNDECIDED = -1

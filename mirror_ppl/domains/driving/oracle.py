@@ -16,8 +16,8 @@ from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, every_message
 from mirror_ppl.domains.base import Observation, map_state, total_reward
-from mirror_ppl.domains.driving import Driving, DrivingState
-from mirror_ppl.people.driving import Drivers, Memory, remember
+from mirror_ppl.domains.driving.people import Drivers, Memory, remember
+from mirror_ppl.domains.driving.world import Driving, DrivingState
 from mirror_ppl.row_hashing import distinct_rows
 
 CHUNK = 2000

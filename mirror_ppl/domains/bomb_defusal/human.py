@@ -31,8 +31,8 @@ from torch import Tensor
 
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, of_each, total_reward
-from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
-from mirror_ppl.domains.bomb_panel import BUTTONS, KINDS, STAGES
+from mirror_ppl.domains.bomb_defusal.panel import BUTTONS, KINDS, STAGES
+from mirror_ppl.domains.bomb_defusal.world import WAIT, BombDefusal
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel

@@ -9,10 +9,10 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
-from mirror_ppl.domains.rescue_house import PORTION, SIDE, as_image
-from mirror_ppl.domains.search_rescue import RescueState, SearchRescue
+from mirror_ppl.domains.search_rescue.house import PORTION, SIDE, as_image
+from mirror_ppl.domains.search_rescue.world import RescueState, SearchRescue
 from mirror_ppl.models.implants import SIGHT
-from mirror_ppl.plots.picture import Picture, label_of
+from mirror_ppl.plots.picture import Picture, SightPicture, label_of
 from mirror_ppl.plots.reading import (
     BLUE,
     draws,
@@ -144,3 +144,9 @@ def _finish(ax: Axes) -> None:
         ax.axhline(line - 0.5, color="#888888", linewidth=0.4)
         ax.axvline(line - 0.5, color="#888888", linewidth=0.4)
     ax.set(xticks=[], yticks=[])
+
+
+PICTURES = {
+    "sight.png": SightPicture(has_sight, sight_picture, "the house as each person sees it"),
+}
+"""Of what each person sees, by file name."""

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import require_known
-from mirror_ppl.domains.bomb_defusal import WAIT, BombDefusal
-from mirror_ppl.domains.bomb_panel import STAGES, TERMINALS, read_panel
-from mirror_ppl.people.bomb_defusal import Defusers
-from mirror_ppl.people.populations import derived_generator
+from mirror_ppl.domains.bomb_defusal.panel import STAGES, TERMINALS, read_panel
+from mirror_ppl.domains.bomb_defusal.people import Defusers
+from mirror_ppl.domains.bomb_defusal.world import WAIT, BombDefusal
+from mirror_ppl.people.base import DomainPeople, derived_generator
 from mirror_ppl.people.recordings import Recording, draw_starts, record
 
 PARTICIPANT_ROUNDS = 36
@@ -104,3 +104,7 @@ def simulated_defusers(
     require_known(population, "population", DEFUSER_POPULATIONS, BombDefusal.name)
     reads = torch.full((people,), setting == "labelled", device=device)
     return Defusers(learned_notices(people, seed, population == "diverse").to(device), reads)
+
+
+DEFUSERS = DomainPeople(DEFUSER_POPULATIONS, simulated_defusers)
+"""What the rest of the package knows of them."""

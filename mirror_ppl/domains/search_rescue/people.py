@@ -32,9 +32,9 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility, by_eye
-from mirror_ppl.domains.rescue_house import CORRIDORS, ENTRANCE, ROOMS, SIDE, walkable
-from mirror_ppl.domains.rescue_knowledge import HouseKnowledge
-from mirror_ppl.domains.search_rescue import MOVES, SearchRescue
+from mirror_ppl.domains.search_rescue.house import CORRIDORS, ENTRANCE, ROOMS, SIDE, walkable
+from mirror_ppl.domains.search_rescue.knowledge import HouseKnowledge
+from mirror_ppl.domains.search_rescue.world import MOVES, SearchRescue
 from mirror_ppl.people.base import SimulatedPeople, each
 
 SUBGOALS: dict[str, tuple[int, int]] = {

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.models import implants as implant_priors
-from mirror_ppl.models.bomb_defusal import BombDefusalHuman
 from mirror_ppl.models.family import HardOfHearing, Late, OneOfKinds, Preferring
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.variants import NoImplants
@@ -95,3 +96,16 @@ def _everything(observation: Observation) -> Visibility:
         for name, value in observation.items()
         if name != "ego"
     }
+
+
+HUMAN_MODELS: Mapping[str, type[HumanModel]] = {
+    "mirror": BombDefusalHuman,
+    "perceptual-only": BombDefusalPerceptualOnly,
+    "policy-only": BombDefusalPolicyOnly,
+    "no-implants": BombDefusalNoImplants,
+    "late": BombDefusalLate,
+    "preferring": BombDefusalPreferring,
+    "hard-of-hearing": BombDefusalHardOfHearing,
+    "all": BombDefusalAnyKind,
+}
+"""What stands here for the human models of these names."""

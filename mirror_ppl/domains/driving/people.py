@@ -30,7 +30,9 @@ from torch import Tensor
 
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.domains.base import Observation, Visibility
-from mirror_ppl.domains.driving import (
+from mirror_ppl.domains.driving.knowledge import ASSUMPTIONS
+from mirror_ppl.domains.driving.maximum_entropy import LearnedReward
+from mirror_ppl.domains.driving.world import (
     CAR_LANES,
     CARS,
     ROAD_END,
@@ -39,9 +41,7 @@ from mirror_ppl.domains.driving import (
     known_car_values,
     lane_rewards,
 )
-from mirror_ppl.domains.driving_knowledge import ASSUMPTIONS
 from mirror_ppl.people.base import SimulatedPeople, each
-from mirror_ppl.people.maximum_entropy import LearnedReward
 
 HORIZON = 10
 """How many steps people look ahead."""

@@ -10,10 +10,12 @@ from functools import lru_cache
 
 import torch
 
-from mirror_ppl.domains.driving import Driving
-from mirror_ppl.people.driving import DISCOUNT, HORIZON, PlanningDrivers, TaskDrivers
-from mirror_ppl.people.maximum_entropy import Decisions, LearnedReward, learn_reward
-from mirror_ppl.people.populations import consistencies, derived_generator, reaches
+from mirror_ppl.domains.driving.maximum_entropy import Decisions, LearnedReward, learn_reward
+from mirror_ppl.domains.driving.oracle import Oracle
+from mirror_ppl.domains.driving.people import DISCOUNT, HORIZON, PlanningDrivers, TaskDrivers
+from mirror_ppl.domains.driving.populations import POPULATIONS, consistencies, reaches
+from mirror_ppl.domains.driving.world import Driving
+from mirror_ppl.people.base import DomainPeople, derived_generator
 from mirror_ppl.people.recordings import Recording, draw_starts, record
 
 PARTICIPANTS = 10
@@ -66,7 +68,7 @@ def simulated_drivers(
 
     Args:
         setting: a setting of the driving domain.
-        population: ``paper`` or ``diverse``, see `mirror_ppl.people.populations.reaches`.
+        population: ``paper`` or ``diverse``, see `mirror_ppl.domains.driving.populations.reaches`.
         people: number of people P.
         seed: determines their sight, consistency and reward.
         device: where they live.
@@ -78,3 +80,9 @@ def simulated_drivers(
     consistency = consistencies(people, seed).to(device)
     planning_seed = derived_generator(seed, "planning").initial_seed()
     return PlanningDrivers(reach, consistency, learned_reward(seed), planning_seed=planning_seed)
+
+
+DRIVERS = DomainPeople(
+    tuple(POPULATIONS), simulated_drivers, lambda driver, start: Oracle(driver, start).messages
+)
+"""What the rest of the package knows of them."""

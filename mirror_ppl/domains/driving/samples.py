@@ -1,7 +1,7 @@
 """The road in samples of the posterior, beside what is really seen (supplement, Fig. 11).
 
-Where `mirror_ppl.plots.driving` draws how probably a car is seen, this draws who might sit there:
-each sample is one way for the person to see.
+Where `mirror_ppl.domains.driving.road` draws how probably a car is seen, this draws who might sit
+there: each sample is one way for the person to see.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
-from mirror_ppl.domains.driving import ROAD_END
-from mirror_ppl.plots.driving import (
+from mirror_ppl.domains.driving.road import (
     HEADLIGHT,
     draw_car,
     has_sight,
     seen_of_draws,
     true_sight,
 )
+from mirror_ppl.domains.driving.world import ROAD_END
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import explain, label_columns, people
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from mirror_ppl.domains.environment import DomainEnv
-from mirror_ppl.domains.rescue_house import SIDE
-from mirror_ppl.domains.search_rescue import SearchRescue
+from mirror_ppl.domains.search_rescue.house import SIDE
+from mirror_ppl.domains.search_rescue.world import SearchRescue
 
 
 class SearchRescueEnv(DomainEnv):

@@ -1,0 +1,31 @@
+"""Driving among four cars: the world, and what the package knows of it in `record`."""
+
+from mirror_ppl.domains.driving.world import (
+    CAR_LANES,
+    CARS,
+    FOG_REACH,
+    ROAD_END,
+    SCENARIO_SPEEDS,
+    STAY,
+    SWITCH,
+    Driving,
+    DrivingState,
+    known_car_values,
+    lane_rewards,
+    task_weights,
+)
+
+__all__ = [
+    "CARS",
+    "CAR_LANES",
+    "Driving",
+    "DrivingState",
+    "FOG_REACH",
+    "ROAD_END",
+    "SCENARIO_SPEEDS",
+    "STAY",
+    "SWITCH",
+    "known_car_values",
+    "lane_rewards",
+    "task_weights",
+]

@@ -1,0 +1,73 @@
+"""What the package knows of a world besides its rules: settings, people, pictures, human models."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from mirror_ppl.errors import DomainError
+
+
+@dataclass(frozen=True)
+class Record:
+    """What other parts of the package should do differently in a world; all may be left out.
+
+    People, pictures and human models are given as they are or, so that a world can be loaded
+    without them, as ``"module:name"``.
+
+    Attributes:
+        networks: :class:`~mirror_ppl.models.sizes.Sizes` of the robot that differ in this world.
+        paper_networks: of these what differs further in the supplement, where its cost is too much.
+        training: settings of :class:`~mirror_ppl.training.self_model.SelfModelOptions`, by name.
+        planning: those of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
+        baselines: those of baselines, by the baseline's name: ``bc`` and ``sqil``.
+        slow: what `evaluate` compares here on request only, because it takes minutes: `svi` where
+            there is much to sum over at each step, and SQIL where rounds are long.
+        people: the simulated people, a :class:`~mirror_ppl.people.base.DomainPeople`; those of
+            :mod:`mirror_ppl.people.robot_like` unless given.
+        human_models: classes that stand here for the human models of these names.
+        pictures: of what people see, :class:`~mirror_ppl.plots.picture.SightPicture` by file name.
+        rounds: pictures of rounds, by what they show: see :class:`mirror_ppl.plots.fit.FitPlots`.
+    """
+
+    networks: Mapping[str, int] = field(default_factory=dict)
+    paper_networks: Mapping[str, int] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+    planning: Mapping[str, Any] = field(default_factory=dict)
+    baselines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    slow: tuple[str, ...] = ("mirror-svi", "sqil-everything", "sqil-pooled")
+    people: Any = None
+    human_models: Any = field(default_factory=dict)
+    pictures: Any = field(default_factory=dict)
+    rounds: Any = field(default_factory=dict)
+
+    def part(self, name: str) -> Any:
+        """One of the attributes; loaded, where it is the name of something in a module.
+
+        Raises:
+            DomainError: the module cannot be imported, or has no such thing.
+        """
+        value = getattr(self, name)
+        if not isinstance(value, str):
+            return value
+        module, _, attribute = value.partition(":")
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise DomainError(f'{name}: there is no "{value}": {error}') from error
+
+
+def settings_of(record: Record, kind: str, options: type) -> Mapping[str, Any]:
+    """Settings ``training`` or ``planning`` of a world.
+
+    Raises:
+        DomainError: there is no such setting.
+    """
+    own = getattr(record, kind)
+    known = [each.name for each in fields(options)]
+    for each in own:
+        if each not in known:
+            raise DomainError(f"{kind} has {each}, expected some of {', '.join(known)}")
+    return own

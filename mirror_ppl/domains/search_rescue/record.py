@@ -1,0 +1,47 @@
+"""What the package knows of search and rescue besides its rules."""
+
+from mirror_ppl.domains.record import Record
+
+RECORD = Record(
+    networks={"encoder": 128, "decoder": 64, "q_network": 200},
+    training={
+        "phases": 400,
+        "rounds": 400,
+        "steps": 40,
+        "learning_rate": 2e-3,
+        "beta": 1.0,
+        "beta_decay": 0.98,
+        "epsilon_decay": 0.9,
+        "discount": 0.95,
+        "target_rate": 0.02,
+        "world_weight": 0.01,
+        "length": 16,
+        "stride": 2,
+        "difference_weight": 4.0,
+        "exact": True,
+    },
+    planning={
+        "horizon": 16,
+        "terminal_value": True,
+        "enumerate_above": 0.4,
+        "items": 2,
+        "min_standard_errors": 1.0,
+    },
+    baselines={
+        "bc": {"learning_rate": 0.003, "weight_decay": 3.0},
+        # Rounds are long, and it takes many steps until what networks do is like what people do.
+        "sqil": {
+            "batch": 5,
+            "sampled": 5,
+            "kept": 50,
+            "epochs": 1500,
+            "check_every": 10,
+            "patience": 60,
+            "learning_rate": 0.01,
+            "weight_decay": 0.1,
+        },
+    },
+    slow=("sqil-everything", "sqil-pooled"),
+    people="mirror_ppl.domains.search_rescue.participants:FIREFIGHTERS",
+    pictures="mirror_ppl.domains.search_rescue.pictures:PICTURES",
+)
