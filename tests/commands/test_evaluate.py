@@ -268,7 +268,7 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
     args = ["--people", 1, "--seeds", 1, "--rounds", 1, "--played", 1, "--draws", 2]
     args += ["--models", "none", "all", "bc", "--jobs", 1, "--out", tmp_path]
     assert command(evaluate, "assistance", *args) == 0
-    assert "net return of a round" in capsys.readouterr().out
+    assert "net return per round" in capsys.readouterr().out
     assert command(evaluate, "relevance", *args) == 0
     out, err = capsys.readouterr()
     assert "3 were done before" in err
