@@ -27,7 +27,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
-from mirror_ppl.domains.base import Observation
+from mirror_ppl.domains.base import Observation, Visibility
+from mirror_ppl.domains.counterfactual import decisive_items
 from mirror_ppl.domains.world import World
 from mirror_ppl.errors import CheckpointError, DomainError, OutputError
 from mirror_ppl.progress import Progress
@@ -38,7 +39,7 @@ SWEEPS = 1000
 CLOSE = 1e-6
 SOONER, LITTLE = 0.95, 1e-4
 """A discount by which what is alike without one differs, and how much that counts."""
-CACHED = ("tables", "_names", "_path", "_values")
+CACHED = ("tables", "_names", "_path", "_values", "_decisive")
 """What is worked out once."""
 TRIED_TWICE = 200
 """States that are tried again when they are reached by another way: is all of them observed?"""
@@ -239,6 +240,18 @@ class GymnasiumWorld(World):
                 # Where it is the same, sooner is better: who waits as well as not never comes.
                 known[discount] = known[discount] + LITTLE * self._iterated(SOONER)
         return known[discount].to(state.number.device)[state.number]
+
+    @cached_property
+    def _decisive(self) -> Visibility:
+        values = self.reference_values(Place(torch.arange(len(self.tables.over))), 1.0)
+        names = [m.name for m in self.modalities]
+        return decisive_items(self.tables.observation, values, names)
+
+    def relevance(self, observation: Observation) -> dict[str, Visibility]:
+        """Items ``[..., K]`` of which another value would change what is best to do."""
+        number = self.state_behind(observation).number
+        masks = {name: mask.to(number.device)[number] for name, mask in self._decisive.items()}
+        return {"decisive": masks}
 
     def _iterated(self, discount: float) -> Tensor:
         tables, reward = self.tables, sum(self.tables.terms.values())

@@ -95,6 +95,30 @@ class Free(Row):
         return place, reward + 0.1, *rest
 
 
+def test_an_item_is_relevant_where_another_value_would_change_what_is_best():
+    """The prize decides everywhere but where all is done; its end of the row alone is in view."""
+    world = Shelf()
+    where = world.tables.observation
+    told = world.relevance(where)["decisive"]["visual"][:, 0]
+    # One cannot be at the prize with another prize and go on: two states differ, where not over.
+    assert torch.equal(told, ~world.tables.over & (where["ego"][:, 0] % 4 != 0))
+    one = {name: value[0] for name, value in where.items()}
+    assert world.relevance(one)["decisive"]["visual"].shape == (1,)
+
+
+def test_in_two_rooms_the_key_matters_only_where_the_door_is_in_the_way():
+    world = load_world(UNLOCKING)
+    tables, column = world.tables, world.tables.observation["ego"][:, 1]
+    key, goal = world.relevance(tables.observation)["decisive"]["visual"].unbind(-1)
+    beyond = world.distance(tables.observation)[0][:, 1] == 1
+    taken = tables.observation["ego"][:, 3] == 1
+    left = (column < 4) & ~tables.over
+    assert not key[left & ~beyond].any(), "the goal is at hand"
+    assert not key[taken & left].any(), "the key is in their hands"
+    assert key[left & beyond & ~taken].float().mean() > 0.5
+    assert goal[left].float().mean() > 0.5
+
+
 def test_who_may_wait_for_nothing_still_goes():
     world = type("Idle", (Shelf,), {"make": lambda self: Free()})()
     place = world.initial(20, torch.Generator().manual_seed(0))

@@ -1,7 +1,7 @@
 """The oracle: against plain expectimax, played rounds, and other ways to speak; and what it merges.
 
-Expectimax here goes through every message and every action with `SimulatedDrivers.step` on what they
-remember exactly; the oracle merges equal knowledge on the way.
+Expectimax here goes through every message and every action with `SimulatedDrivers.step` on what
+they remember exactly; the oracle merges equal knowledge on the way.
 """
 
 import itertools
