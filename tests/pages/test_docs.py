@@ -188,6 +188,17 @@ def test_tables_of_settings_are_the_defaults(name, heading, options):
     assert shown == {key: pytest.approx(float(value)) for key, value in settings.items()}
 
 
+def test_settings_of_other_worlds_are_those_of_their_records():
+    """Of self-models: what differs from driving's."""
+    rows = table_of(page("docs/self_model.md"), "Setting elsewhere")
+    ours = asdict(SelfModelOptions())
+    for column, world in enumerate(("search_rescue", "bomb_defusal"), start=1):
+        settings = asdict(SelfModelOptions.of(world))
+        shown = {row[0].strip("`"): float(row[column]) for row in rows}
+        assert shown == {name: pytest.approx(float(settings[name])) for name in shown}
+        assert {name for name in ours if ours[name] != settings[name]} <= set(shown)
+
+
 def test_options_and_communicators_of_assist_are_told_as_they_are():
     text, options = page("docs/communicator.md"), assist.Options()
     shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
