@@ -38,8 +38,8 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install -qq -c constraints.txt -e '.[dev]'
 	@touch $@
 
-demo: $(STAMP) ## Fit ten simulated people who drive in fog; results in runs/demo
-	$(BIN)/python -m mirror_ppl.fit --domain driving --setting fog --out runs/demo
+demo: $(STAMP) ## Fit ten simulated drivers who differ, in fog; results in runs/demo
+	$(BIN)/python -m mirror_ppl.fit --domain driving --setting fog --population diverse --out runs/demo
 
 check: $(STAMP) ## Style, format and types
 	$(BIN)/ruff check .

@@ -189,6 +189,28 @@ def test_tables_of_settings_are_the_defaults(name, heading, options):
     assert shown == {key: pytest.approx(float(value)) for key, value in settings.items()}
 
 
+def test_settings_of_other_worlds_are_those_of_their_records():
+    """Of self-models: what differs from driving's."""
+    rows = table_of(page("docs/self_model.md"), "Setting elsewhere")
+    ours = asdict(SelfModelOptions())
+    for column, world in enumerate(("search_rescue", "bomb_defusal"), start=1):
+        settings = asdict(SelfModelOptions.of(world))
+        shown = {row[0].strip("`"): float(row[column]) for row in rows}
+        assert shown == {name: pytest.approx(float(settings[name])) for name in shown}
+        assert {name for name in ours if ours[name] != settings[name]} <= set(shown)
+
+
+def test_names_of_the_glossary_are_in_the_code():
+    source = "".join(path.read_text() for path in (ROOT / "mirror_ppl").rglob("*.py"))
+    rows = re.findall(r"^\|.*\|.*\|.*\|(.*)\|$", page("docs/glossary.md"), re.MULTILINE)
+    columns = [row for row in rows if "`" in row]
+    names = re.findall(r"`-*([\w.-]+?)[.]*`", " ".join(columns))
+    assert len(columns) > 50 and len(names) > len(columns)
+    for name in names:
+        for part in name.removeprefix("fit.").replace("-", "_").split("."):
+            assert part in source, name
+
+
 def test_options_and_communicators_of_assist_are_told_as_they_are():
     text, options = page("docs/communicator.md"), assist.Options()
     shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
