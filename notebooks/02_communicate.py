@@ -333,7 +333,8 @@ pd.DataFrame(
 # New rounds, which nobody selected, each with the same start and the same action noise for all.
 # `none` is silence, `all` sends everything at every step, `mirror` is the communicator. `oracle`
 # is the ceiling: it knows the person and the world exactly. `net` is the task's reward minus the
-# cost of messages, on average over rounds; `above none` is how much more that is than with silence, and
+# cost of messages, on average over rounds; `above none` is how much more that is than with
+# silence, and
 # `±` its standard error.
 
 # %%

@@ -71,16 +71,18 @@ class Unlocking(GymnasiumWorld):
     record = Record(
         networks={"encoder": 128, "decoder": 64, "q_network": 200},
         training={
-            "phases": 300,
+            "phases": 80,
             "rounds": 200,
-            "steps": 40,
+            "steps": 50,
             "learning_rate": 2e-3,
             "beta": 1.0,
             "beta_decay": 0.98,
-            "discount": 0.95,
             "length": 12,
             "stride": 2,
+            "world_weight": 0.003,
             "difference_weight": 4.0,
+            "kinds": (0.4, 0.1, 0.5),
+            "at_means": True,
             "exact": True,
         },
     )
