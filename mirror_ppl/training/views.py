@@ -97,7 +97,7 @@ class ViewPlan:
             stride: distance between these steps.
 
         Returns:
-            Masks ``[B, T', K]`` of items seen, told or remembered, and knowledge ``[B, T']``.
+            Masks ``[B, T', K]`` of items seen, heard or remembered, and knowledge ``[B, T']``.
         """
         visible = self.visibility(domain, observation, first, stride)
         knowledge = domain.learn(
