@@ -23,7 +23,7 @@ PEOPLE_AT_ONCE = 50
 
 
 def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> Inferred:
-    """Infer so many people at once that their views fit into memory.
+    """Infer people in batches whose views fit into memory.
 
     Args:
         job: what to infer.
