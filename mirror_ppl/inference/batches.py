@@ -26,7 +26,7 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
     """Infer people in batches whose views fit into memory.
 
     Args:
-        job: what to infer.
+        job: people, rounds and settings.
         infer_batch: infers some people, given their compiled program and rounds.
     """
     people, found, files = job.rounds.num_people, [], {}

@@ -29,7 +29,7 @@ def infer_by_importance(
     """Infer each person in turn by importance sampling.
 
     Args:
-        job: what to infer.
+        job: people, rounds and settings.
         first_pass: returns the engine's name and weighted draws of a person; adaptive importance
             sampling by default.
     """

@@ -32,7 +32,7 @@ LITTLE = 0.01
 
 
 def models_by_kind(human: HumanModel) -> dict[str, HumanModel]:
-    """Human models of the kinds of people; empty if the model adds methods of its own."""
+    """Human models of the kinds of people; empty if a subclass or instance changes the model."""
     if not isinstance(human, OneOfKinds) or "members" not in vars(type(human)):
         return {}
     if any(callable(getattr(type(human), name, None)) for name in vars(human)):

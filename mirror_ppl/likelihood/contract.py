@@ -1,4 +1,4 @@
-"""What the class of a human model has to offer, tried before long work."""
+"""Check of the contract of human models, before long computations."""
 
 from __future__ import annotations
 

@@ -203,7 +203,7 @@ class RecordedActions(TorchDistribution):
     """Distribution of a person's actions ``[B, T]`` with precomputed log-likelihoods.
 
     Args:
-        log_likelihoods: of the recorded actions under each possible combination ``[..., P, C]``.
+        log_likelihoods: those of the actions under each possible combination ``[..., P, C]``.
         place: index of the person's combination ``[..., P, 1]``; ``NO_VIEW`` if impossible.
         shape: (B, T).
     """

@@ -71,8 +71,8 @@ def score(log_probabilities: Tensor, rounds: Demonstrations) -> list[dict[str, A
     """Negative log-likelihood, accuracy and floor of each person's actions.
 
     Args:
-        log_probabilities: of actions ``[S, P, B, T, A]``.
-        rounds: of P people.
+        log_probabilities: log-probabilities of actions ``[S, P, B, T, A]``.
+        rounds: rounds of P people.
 
     Returns:
         One entry a person; ``None`` for those without rounds.
