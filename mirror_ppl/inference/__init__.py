@@ -1,1 +1,1 @@
-"""Guides, variational inference with exact enumeration, training, and ArviZ export."""
+"""Inference engines, partial pooling, calibration, and the results of fits."""

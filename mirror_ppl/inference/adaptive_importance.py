@@ -1,8 +1,8 @@
-"""Posteriors by importance: how a person may decide, weighted by what their rounds say of it.
+"""Posteriors by adaptive importance sampling.
 
-Draws of the sites that perception does not read (how somebody decides) come from a proposal that is
-adapted stage by stage; what they see is marginalized exactly under each of them. So the posterior
-is right whatever the proposal, if it has enough draws (:mod:`mirror_ppl.inference.sampler`).
+Draws of the policy implants (sites that perception does not read) come from a proposal that is
+adapted stage by stage; perceptual implants are marginalized exactly under each draw. The posterior
+is consistent for every proposal, given enough draws (:mod:`mirror_ppl.inference.sampler`).
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import unconstrained
 
 PLAIN_STAGES = 2
-"""Stages after which the residual is proposed, too, where it hardly matters."""
+"""Stages after which the residual is proposed in any case."""
 LEARNED_FROM = 64.0
-"""Effective draws from which it is learned what to propose, at least: moments of fewer say little,
-and what is proposed by them might never get to where else somebody could be. If there are not so
-many, weights are tempered until there are."""
+"""Least number of effective draws to fit a proposal to: moments of fewer are unreliable, and their
+proposal might miss parts of the posterior. If there are fewer, weights are tempered until this
+number is reached."""
 FEW = 16.0
-"""Effective draws, or fewer, with which the residual is proposed at once."""
+"""Number of effective draws up to which the residual is proposed at once."""
 TAILS = 8.0
-"""Degrees of freedom of what is proposed. In unconstrained space priors of probabilities fall off
-as an exponential, which a Gaussian would miss."""
+"""Degrees of freedom of the proposal. In unconstrained space priors of probabilities have
+exponential tails, which are heavier than Gaussian ones."""
 PRUNING_DRAWS = 64
-"""Draws from the prior after which combinations of discrete sites are given up."""
+"""Draws from the prior after which combinations of discrete sites are dropped."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class ImportanceOptions:
     Attributes:
         proposals: draws of each stage.
         enough: effective draws at which no stage is added.
-        stages: the largest number of stages.
-        wider: factor on the covariance of what is proposed after the first stage, by which its
-            scale is set.
-        prune_margin: nats below the best by which a combination of discrete sites, under each of
-            the first draws, is given up.
+        stages: largest number of stages.
+        wider: factor on the covariance of weighted draws that gives the proposal's scale matrix
+            after the first stage.
+        prune_margin: nats behind the best, under each of the first draws, at which a combination
+            of discrete sites is dropped.
     """
 
     proposals: int = 512
@@ -69,18 +69,18 @@ def sample_importance(
 ) -> Weighted:
     """Weighted draws of one person by adaptive importance sampling.
 
-    The first stage draws from the prior; each that follows draws the scalar sites from a Student t
-    distribution, in unconstrained space, that has the moments of the weighted draws so far, and
-    discrete sites of the policy by how probable they are so far. Where that is not enough, stages
-    propose the residual of the policy, too. As long as few draws have all the weight, weights are
-    tempered before anything is learned from them (Koblents and Miguez, *A population Monte Carlo
-    scheme with transformed weights*, 2015).
+    The first stage draws from the prior. Each later stage draws the scalar sites, in unconstrained
+    space, from a Student t distribution with the moments of the weighted draws so far, and discrete
+    sites of the policy by their probabilities so far. If that is not enough, stages also propose
+    the residual of the policy. While few draws have all the weight, weights are tempered before
+    proposals are fitted (Koblents and Miguez, *A population Monte Carlo scheme with transformed
+    weights*, 2015).
 
     Args:
         human: the model of people.
         table: views of one person's rounds.
         options: settings.
-        near: draws from much the same posterior, whose moments are used from the first stage on.
+        near: draws from a similar posterior, whose moments are used from the first stage on.
     """
     sampler = Sampler(human, table)
     few = min(PRUNING_DRAWS, options.proposals)
@@ -96,10 +96,10 @@ def sample_importance(
 
 @torch.no_grad()
 def adapt(sampler: Sampler, options: ImportanceOptions) -> Weighted:
-    """Propose stage after stage, near to all weighted draws so far, until enough are effective.
+    """Add stages that propose near all weighted draws so far, until enough are effective.
 
     Args:
-        sampler: of one person; it has some draws. See :func:`sample_importance`.
+        sampler: sampler of one person, with some draws. See :func:`sample_importance`.
         options: settings.
     """
     for stage in range(options.stages if sampler.sites or sampler.supports else 0):
@@ -137,7 +137,7 @@ def _heavy_tailed(place: Tensor, log_weights: Tensor, wider: float) -> Multivari
     mean = (weights * place).sum(0)
     centred = place - mean
     covariance = wider * (weights * centred).T @ centred
-    # Where few draws have all the weight, their spread says nothing.
+    # Where few draws have all the weight, their spread is not informative.
     floor = 1e-3 * place.var(0) + 1e-8
     spread = torch.linalg.cholesky(covariance + torch.diag(floor))
     return MultivariateStudentT(place.new_tensor(TAILS), mean, spread)

@@ -1,16 +1,16 @@
-"""The amortized guide: a person's posterior at once, from any number of rounds in any order.
+"""The amortized guide: proposes a person's posterior from any number of rounds in any order.
 
-What a network reads of a person is what the human model says about their rounds: for a few ways to
-decide, drawn from the prior once and for all, the log-evidence of the recorded actions, with what
-the person sees marginalized exactly. Evidence adds up over rounds, so their order does not matter
-and a new round is one more term. From it the network proposes how this person decides::
+The features that the network reads come from the human model: for W fixed draws of the policy
+implants from the prior (*ways*), the log-evidence of the recorded actions, with perceptual implants
+marginalized exactly. Log-evidence is a sum over rounds, so their order does not matter and a new
+round is one more term. The network maps it to a proposal of the person's policy implants::
 
     e_w   = log sum_m p(m | psi_w) p(actions | m, psi_w)     for ways psi_w ~ prior
     psi   ~ q(. | e_1 .. e_W, number of steps)               scalar sites, a mixture of Gaussians
     m     ~ p(m | psi, actions)                              exact
 
-and importance weights correct what it gets wrong. Where too few draws are effective, the stages of
-adaptive importance sampling go on from there (:mod:`mirror_ppl.inference.adaptive_importance`).
+and importance weights correct its errors. If too few draws are effective, stages of adaptive
+importance sampling follow (:mod:`mirror_ppl.inference.adaptive_importance`).
 
 The network is trained on people drawn from the prior and simulated in the true domain (inference
 compilation: Le, Baydin and Wood, 2017), see :mod:`mirror_ppl.training.guide`.
@@ -41,11 +41,11 @@ from mirror_ppl.models.prior import unconstrained
 
 @dataclass(frozen=True)
 class AmortizedOptions:
-    """Settings of proposing by a network.
+    """Settings of the amortized guide.
 
     Attributes:
         proposals: draws from the network's density.
-        adaptation: of the stages after it, which propose near to all draws so far.
+        adaptation: settings of the later stages, which propose near all draws so far.
         refine: gradient steps on the person's rounds before the network's density is used.
     """
 
@@ -60,13 +60,13 @@ class AmortizedOptions:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the rounds of one person say about ways to decide.
+    """Evidence of one person's rounds under each way.
 
     Attributes:
-        log_evidence: of each way ``[W]``.
-        combinations: of what the person sees, those still possible.
-        joint: log joint of these G sets under each way, ``[W, G]``.
-        ways: the ways, draws ``[W, 1, 1, ...]`` of the sites that perception does not read.
+        log_evidence: log-evidence of each way ``[W]``.
+        combinations: the possible combinations of perceptual implants, in G sets.
+        joint: log joint of these sets under each way, ``[W, G]``.
+        ways: draws ``[W, 1, 1, ...]`` of the sites that perception does not read.
         table: views of the rounds.
         steps: number of recorded actions.
     """
@@ -80,13 +80,13 @@ class Evidence:
 
 
 def log_evidence(builder: ViewTableBuilder) -> Tensor:
-    """Log-evidence ``[W]`` of a person's rounds so far under each way to decide."""
+    """Log-evidence ``[W]`` of a person's rounds so far under each way."""
     alive = builder.alive
     return (builder.score[:, alive] + builder.log_prior[:, alive]).logsumexp(-1)
 
 
 def evidence_of(builder: ViewTableBuilder) -> Evidence:
-    """What a person's rounds so far say."""
+    """Evidence of a person's rounds so far."""
     table = builder.table()
     combinations = EquivalentCombinations.of(table, builder.fixed_prior)
     prior = (
@@ -106,9 +106,9 @@ def sample_amortized(
     sites: Mapping[str, Any] | None = None,
     near: Weighted | None = None,
 ) -> Weighted:
-    """Weighted draws of one person: the guide's, and the ways that evidence is about.
+    """Weighted draws of one person, from the ways and from the guide.
 
-    Where these are too few, stages of adaptive importance sampling start from them.
+    If too few are effective, stages of adaptive importance sampling are added.
 
     Args:
         human: the model of people that the guide was trained for.
@@ -116,7 +116,7 @@ def sample_amortized(
         builder: the person's rounds so far.
         options: settings.
         sites: see :class:`Sampler`.
-        near: draws from much the same posterior, which are proposed from in the network's place.
+        near: draws from a similar posterior, whose moments replace the network's proposal.
     """
     options = options or AmortizedOptions()
     evidence = evidence_of(builder)
@@ -139,7 +139,7 @@ def sample_amortized(
 
 
 def infer_amortized(job: Job) -> Inferred:
-    """Person after person, each at once."""
+    """Infer each person with the network of the job."""
     network = job.network
     assert network is not None
     options = replace(job.settings, refine=job.refine)

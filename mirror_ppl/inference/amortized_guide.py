@@ -1,6 +1,6 @@
 """The network of the amortized guide: ``q(psi | rounds)`` as a Pyro program.
 
-It reads what rounds say of some ways to decide, see :mod:`mirror_ppl.inference.amortized`.
+It reads the log-evidence of rounds under each way, see :mod:`mirror_ppl.inference.amortized`.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ SOFTPLUS_ONE = 0.5413  # its softplus is 1
 
 
 def guide_screening() -> Screening:
-    """The screening that an amortized guide needs: its ways are what the network reads."""
+    """Screening settings of an amortized guide, whose policies are the ways."""
     return Screening(policies=WAYS)
 
 
 class AmortizedGuide(nn.Module):
     """``q(psi | rounds)`` of the scalar sites of a human model, in unconstrained space.
 
-    Before it has learned anything it is about the prior.
+    Before training it approximates the prior.
 
     Args:
-        places: of the ways that evidence is about, ``[W, D]``.
-        prior: of draws from the prior, for its margins, ``[S, D]``; the ways if not given.
-        dependent: whether sites of the prior depend on each other.
-        dropout: share of the network's units that are left out in training.
+        places: the ways in unconstrained space, ``[W, D]``.
+        prior: prior draws in unconstrained space, for the margins, ``[S, D]``; by default the ways.
+        dependent: True if sites of the prior depend on each other.
+        dropout: dropout rate in training.
 
     Attributes:
-        knots: of the prior's margins, see :class:`PriorMargins`, ``[D, K]``.
-        mean, log_scale: of the prior's dependence, see :class:`PriorDependence`, ``[D, F]``.
-        ways: places of the ways, in which the prior is standard normal, ``[W, D]``.
-        gate: how much of the mean, at each temperature of the evidence, is that of importance
-            sampling from the prior, ``[temperatures, D]``.
+        knots: knots of the prior's margins, see :class:`PriorMargins`, ``[D, K]``.
+        mean, log_scale: coefficients of :class:`PriorDependence`, ``[D, F]``.
+        ways: the ways in the space where the prior is standard normal, ``[W, D]``.
+        gate: weight in the mean, at each temperature of the evidence, of the importance sampling
+            estimate from the prior, ``[temperatures, D]``.
     """
 
     ways: Tensor
@@ -99,16 +99,16 @@ class AmortizedGuide(nn.Module):
 
     @property
     def prior(self) -> dist.transforms.Transform:
-        """From standard normal numbers to places ``[..., D]``."""
+        """Transform from standard normal to unconstrained space, ``[..., D]``."""
         dependence = PriorDependence(self.mean, self.log_scale)
         return dist.transforms.ComposeTransform([dependence, PriorMargins(self.knots)])
 
     def features(self, log_evidence: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
-        """What the network reads ``[..., F]`` of evidence ``[..., W]`` of so many steps ``[...]``.
+        """Compute the network's input ``[..., F]`` from log-evidence ``[..., W]`` and step counts.
 
-        Besides the evidence itself: what importance sampling from the prior would give for mean
-        and spread, also with evidence tempered, where few ways have all the weight. These means
-        once more, ``[..., temperatures, D]``.
+        They are the log-evidence, and importance sampling estimates of means and standard
+        deviations with the ways as prior draws, at several temperatures. Also returns these means,
+        ``[..., temperatures, D]``.
         """
         relative = log_evidence - log_evidence.amax(-1, keepdim=True)
         parts, means = [relative.clamp(min=LEAST_EVIDENCE) / 10.0], []
@@ -123,31 +123,31 @@ class AmortizedGuide(nn.Module):
         return torch.cat(parts, -1), torch.stack(means, -2)
 
     def reads(self, places: Tensor) -> bool:
-        """Whether it learned to read evidence about ways at these places ``[W, D]``."""
+        """True if the network was trained for ways at these points ``[W, D]``."""
         if self.ways.shape != places.shape:
             return False
         own = torch.as_tensor(self.prior(self.ways)).cpu()
         return torch.allclose(own, places.to(own), atol=1e-3)
 
     def mixture_parameters(self, log_evidence: Tensor, steps: Tensor) -> Tensor:
-        """What the network says of this evidence: parameters ``[..., COMPONENTS, M]`` of ``q``."""
+        """Parameters ``[..., COMPONENTS, M]`` of ``q`` given this evidence."""
         features, means = self.features(log_evidence, steps)
         out = self.head(self.body(features)).unflatten(-1, (COMPONENTS, -1))
         towards = (self.gate * means).sum(-2)[..., None, :]
         return out + nn.functional.pad(towards, [1, out.shape[-1] - 1 - self.dimensions])
 
     def density(self, log_evidence: Tensor, steps: Tensor) -> dist.TorchDistribution:
-        """``q`` over places ``[..., D]`` in unconstrained space."""
+        """Density ``q`` in unconstrained space, ``[..., D]``."""
         return self.mixture(self.mixture_parameters(log_evidence, steps))
 
     def mixture(self, parameters: Tensor) -> dist.TorchDistribution:
-        """The density over places ``[..., D]`` that has parameters ``[..., COMPONENTS, M]``."""
+        """Density in unconstrained space from parameters ``[..., COMPONENTS, M]``."""
         size = self.dimensions
         logits, mean, triangle = parameters.split([1, size, size * (size + 1) // 2], -1)
         rows, columns = torch.tril_indices(size, size)
         lower = mean.new_zeros(*triangle.shape[:-1], size, size)
         lower[..., rows, columns] = triangle
-        # Without anything learned it is one, as the prior's.
+        # 1 before training, as the prior's.
         diagonal = nn.functional.softplus(lower.diagonal(dim1=-2, dim2=-1) + SOFTPLUS_ONE) + 1e-3
         lower = torch.tril(lower, -1) + torch.diag_embed(diagonal)
         mixture = GaussianMixture(
@@ -169,7 +169,7 @@ def sample_scalars(
     density: dist.TorchDistribution,
     person: pyro.plate,
 ) -> Draws:
-    """A Pyro program over the scalar sites of P people, whose places have a density ``[P, 1]``.
+    """Pyro program that samples the scalar sites of P people from a density ``[P, 1]``.
 
     Returns:
         The values ``[P, 1]`` by site.
@@ -185,9 +185,9 @@ def sample_scalars(
 
 
 def reference_places(human: HumanModel, number: int = WAYS) -> Tensor:
-    """Places ``[W, D]`` of ways from the prior; always the same of a human model.
+    """Ways from the prior in unconstrained space, ``[W, D]``; fixed for a human model.
 
-    They are on the processor: a GPU has other random numbers.
+    They are drawn on the CPU, since a GPU has other random numbers.
     """
     if next(human.parameters()).device.type != "cpu":
         human = copy.deepcopy(human).to("cpu")
@@ -198,7 +198,7 @@ def require_network_of(human: HumanModel, network: AmortizedGuide) -> None:
     """Refuse networks that were trained for another human model.
 
     Raises:
-        InputError: this is one.
+        InputError: the network is for another human model.
     """
     if not network.reads(reference_places(human)):
         raise InputError(

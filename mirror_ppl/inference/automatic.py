@@ -1,7 +1,7 @@
-"""The engine `auto`: the network proposes where there is one, `importance` serves everyone else.
+"""The engine `auto`: the amortized guide where it is reliable, `importance` otherwise.
 
-A person keeps what the network proposed if its importance weights can be relied on; otherwise that
-person is inferred by ``importance`` at once, from the same views of their rounds.
+The network's draws of a person are kept if their importance weights are reliable; otherwise the
+person is inferred by ``importance``, from the same views of their rounds.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ class AutomaticOptions:
     """Settings of the engine `auto`.
 
     Attributes:
-        amortized: of proposing by the network.
-        importance: of adaptive importance sampling.
-        enough: effective draws of a person below which the network's draws are not kept.
-        pareto_k: of a person's importance weights above which they are not kept either.
+        amortized: settings of the amortized guide.
+        importance: settings of adaptive importance sampling.
+        enough: least effective draws of a person for the network's draws to be kept.
+        pareto_k: largest Pareto k of a person's importance weights for them to be kept.
     """
 
     amortized: AmortizedOptions = AmortizedOptions()
@@ -36,9 +36,9 @@ class AutomaticOptions:
 
 
 def infer_automatically(job: Job) -> Inferred:
-    """Person after person, each by the network if there is one and its draws can be relied on."""
+    """Infer each person by the network if there is one and its draws are reliable."""
     network, options = job.network, job.settings
-    # What was measured is observed by the program, of which the network knows nothing.
+    # Measurements are observed sites of the program, which the network does not read.
     if network is None or job.rounds.measurements:
         return importance.ENGINE.run(replace(job, settings=options.importance))
 

@@ -1,4 +1,4 @@
-"""Engines that infer several people together: as many at once as fit into memory."""
+"""Batches for engines that infer several people together."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ PEOPLE_AT_ONCE = 50
 
 
 def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> Inferred:
-    """Infer so many people at once that their views fit into memory.
+    """Infer people in batches whose views fit into memory.
 
     Args:
-        job: what to infer.
-        infer_batch: does so for some people, of whom program and rounds are compiled.
+        job: people, rounds and settings.
+        infer_batch: infers some people, given their compiled program and rounds.
     """
     people, found, files = job.rounds.num_people, [], {}
     batches = [
@@ -39,7 +39,7 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
         path, run = job.checkpoint
         for begin in (some.start for some in batches):
             files[begin] = path.with_name(f"{path.name}.{begin}") if begin else path, run
-            if files[begin][0].exists():  # what cannot be continued is refused before any work
+            if files[begin][0].exists():  # refuses foreign checkpoints before any work
                 read_checkpoint(*files[begin])
     for some in batches:
         begin, own = some.start, job.of(some)
@@ -65,7 +65,7 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
 
 
 def _likely(job: Job) -> Draws | None:
-    """Roughly who people are, where that decides what stands for all they may attend to."""
+    """Approximate posterior draws, if values of attention are sampled by them."""
     if has_own_program(job.human) or not looks_twice(job.human):
         return None
     settings = coarse(ImportanceOptions())

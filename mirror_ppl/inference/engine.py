@@ -1,4 +1,4 @@
-"""What an engine is: a way to infer the implants of people, and what it is given and returns."""
+"""The interface of engines, which infer the implants of people: their input and output."""
 
 from __future__ import annotations
 
@@ -24,20 +24,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Inferred:
-    """What was inferred of P people.
+    """Posterior of P people.
 
     Attributes:
         draws: joint posterior draws by site, ``[S, P, 1, ...]``, as the human model samples them.
-        pareto_k: of importance weights ``[P]``, if there are any.
+        pareto_k: Pareto k of importance weights ``[P]``, if there are any.
         log_evidence: log marginal likelihood ``[P]`` of each person's recorded actions under the
-            model's own prior, nats, where an engine estimates it; NaN where it is not defined, with
-            factors or observed sites, or attention whose values are drawn adds noise to it.
+            model's own prior, nats, if the engine estimates it; NaN with factors or observed sites,
+            where it is not defined, and with sampled attention, which adds noise to it.
         losses: negative ELBO at each step in nats, if one was optimized.
-        population: that people are from, if they were pooled.
-        effective: number ``[P]`` of each person's own draws that pooling leaves, if they were.
+        population: posterior of the population, if people were pooled.
+        effective: effective number ``[P]`` of each person's draws after pooling, if pooled.
         engines: name of the engine that inferred each person.
-        seconds: of processors that it took, by stage; nothing of engines that infer people
-            together.
+        seconds: processor time by stage; empty for engines that infer people together.
     """
 
     draws: Mapping[str, Tensor]
@@ -51,10 +50,10 @@ class Inferred:
 
 
 def narrowed(draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Draws ``[S, P, 1, ...]`` with eight significant bits of weights, which are most of them.
+    """Store weights in draws ``[S, P, 1, ...]`` with eight significant bits.
 
-    Weights are sites of more than one number a person. The rest of their bits says nothing beside
-    the spread of the posterior, and takes two thirds of a file.
+    Weights are sites of more than one number per person. Their further bits are negligible against
+    the spread of the posterior, and take two thirds of a file.
     """
     return {
         name: value.bfloat16() if value.is_floating_point() and value.dim() > BATCH else value
@@ -63,28 +62,28 @@ def narrowed(draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def widened(value: Tensor, like: Tensor) -> Tensor:
-    """Narrowed draws of a site as its human model has them, whose parameters are like this one."""
+    """Convert narrowed draws of a site back to the human model's dtype."""
     return value.to(like.dtype) if value.dtype is torch.bfloat16 else value
 
 
 @dataclass(frozen=True)
 class Job:
-    """What an engine has to do: infer the implants of P people, each under the model's own prior.
+    """Input of an engine: infer the implants of P people, each under the model's own prior.
 
     Attributes:
         human: the model of people.
-        rounds: of P people.
-        draws: posterior draws S of each person.
-        settings: of the engine, see :attr:`Engine.settings`.
-        seed: of everything random.
-        screening: when to give up combinations of discrete sites; ``None`` for never.
-        network: of the amortized guide, if there is one.
-        report: told of progress.
-        checkpoint: a file that is written now and then and continued from if it exists, and what
-            identifies this run (a checkpoint of another run is refused).
-        refine: gradient steps on each person's rounds that refine what a network proposes.
-        workers: who does it, of engines that infer each person by themselves.
-        first: number of the first of these people among all; seeds of a person depend on it.
+        rounds: rounds of P people.
+        draws: number of posterior draws S of each person.
+        settings: settings of the engine, see :attr:`Engine.settings`.
+        seed: seed of all random draws.
+        screening: when to drop combinations of discrete sites; ``None`` for never.
+        network: network of the amortized guide, if there is one.
+        report: called with progress.
+        checkpoint: a file that is written during the run and resumed from if it exists, and the
+            identity of this run (a checkpoint of another run is refused).
+        refine: gradient steps on each person's rounds that refine the network's proposal.
+        workers: processes for engines that infer each person separately.
+        first: number of the first of these people among all; a person's seed depends on it.
     """
 
     human: HumanModel
@@ -101,31 +100,31 @@ class Job:
     first: int = 0
 
     def of(self, people: range) -> Job:
-        """The part of the job about some of the people."""
+        """The job for some of the people."""
         if len(people) == self.rounds.num_people:
             return self
         return replace(self, rounds=self.rounds.select_people(people), first=people.start)
 
     def part(self, people: People) -> Job:
-        """The part about some of the people, as another process can do it."""
+        """The job for some of the people, to be sent to another process."""
         own = self.of(people.range)
         return replace(own, report=silent, checkpoint=None, workers=Workers())
 
 
 @dataclass(frozen=True)
 class Engine:
-    """A way to infer implants.
+    """An inference method for implants.
 
     Attributes:
-        name: by which users know it.
-        run: does a job.
-        settings: class of the engine's settings; made without arguments unless they are given.
-        each_alone: whether it infers each person by themselves, so that parts of the people can be
-            inferred by several processes.
-        pooled_draws: of each person under the human model's own prior, from which pooling chooses.
-        any_program: whether it runs human models that cannot be compiled.
-        takes_network: whether it proposes by an amortized guide, if there is one.
-        needs_network: whether it does nothing without.
+        name: name for users.
+        run: function that does a job.
+        settings: class of the engine's settings; its defaults are used unless they are given.
+        each_alone: True if it infers each person separately, so that people can be distributed over
+            processes.
+        pooled_draws: draws of each person under the model's own prior that pooling reweights.
+        any_program: True if it runs human models that cannot be compiled.
+        takes_network: True if it uses an amortized guide, if there is one.
+        needs_network: True if it requires one.
     """
 
     name: str

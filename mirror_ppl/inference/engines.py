@@ -1,7 +1,7 @@
-"""The engines by name, and one way to run them all.
+"""Registry of the engines, and ``infer``, which runs any of them.
 
-All compute what the human program says, and return the same: joint draws of all its sites. Those
-that compile it sum the discrete sites that perception reads out exactly.
+All engines target the posterior of the human program, and return joint draws of all its sites.
+Those that compile the program sum the discrete sites that perception reads out exactly.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ ENGINES: Mapping[str, Engine] = {
 
 
 def engine_name(name: str, frames: int = 1) -> str:
-    """The name of an engine, also where it is given as it was called formerly.
+    """Current name of an engine, which may be given by its former name.
 
     Args:
-        name: as given.
-        frames: calls between whoever gave it and this function, whom a note is about.
+        name: current or former name.
+        frames: calls between the user's code and this function, for the warning's location.
 
     Raises:
         UnknownNameError: there is no such engine.
@@ -75,17 +75,17 @@ def engine_name(name: str, frames: int = 1) -> str:
 
 @dataclass(frozen=True)
 class InferenceOptions:
-    """How to infer.
+    """Settings of inference.
 
     Attributes:
         engine: one of ``ENGINES``.
-        draws: posterior draws S of each person.
-        settings: of the engine, such as :class:`ImportanceOptions`; its own unless given.
-        screening: when to give up combinations of discrete sites; ``None`` for never. That of the
-            amortized guide is its own.
-        pooling: ``none``, or ``partial`` to infer with the people the population that they are
-            from (:mod:`mirror_ppl.inference.population.pooling`).
-        refine: gradient steps on each person's rounds that refine what a network proposes.
+        draws: number of posterior draws S of each person.
+        settings: settings of the engine, such as :class:`ImportanceOptions`; by default its own.
+        screening: when to drop combinations of discrete sites; ``None`` for never. The amortized
+            guide has its own.
+        pooling: ``none``, or ``partial`` to infer the population together with the people
+            (:mod:`mirror_ppl.inference.population.pooling`).
+        refine: gradient steps on each person's rounds that refine the network's proposal.
         allow_contradictions: share of recorded steps, from 0 to 1, that may contradict the next
             observation.
     """
@@ -134,24 +134,24 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
     Args:
         human: the model of people.
         demonstrations: rounds of P people.
-        options: how to infer.
-        seed: of everything random.
-        network: of the amortized guide, for the engines that take one.
-        report: told of progress.
-        checkpoint: a file that is written now and then and continued from if it exists, and what
-            identifies this run (a checkpoint of another run is refused); not of ``nuts``. Of many
-            people there are more, whose names begin alike. Engines that infer each person by
-            themselves keep parts of the people in a folder, and leave those of other runs alone.
-        population: that the people are from, if it is known from others: their prior, then.
-        workers: who does it, of engines that infer each person by themselves.
-        checked: that :func:`check_contract` was called already.
+        options: settings.
+        seed: seed of all random draws.
+        network: network of the amortized guide, for the engines that take one.
+        report: called with progress.
+        checkpoint: a file that is written during the run and resumed from if it exists, and the
+            identity of this run (a checkpoint of another run is refused); not used by ``nuts``. For
+            many people there are several, with the same prefix. Engines that infer each person
+            separately keep parts of the people in a folder, and leave those of other runs alone.
+        population: a population estimated from other people, to be the prior of these.
+        workers: processes for engines that infer each person separately.
+        checked: True if :func:`check_contract` was called already.
 
     Raises:
         HumanModelError: the human model breaks its contract, or cannot be fitted by this engine.
         CheckpointError: the checkpoint is damaged or of another run.
-        InputError: an argument of another kind, rounds of another domain, no network of the
-            amortized guide, or people are to be pooled whose population is known.
-        DemonstrationsError: the rounds cannot be in the domain's world.
+        InputError: an argument of another type, rounds of another domain, no network for the
+            amortized guide, or pooling is requested although a population is given.
+        DemonstrationsError: the rounds are impossible in the domain's world.
     """
     check_rounds(human, demonstrations)
     if not checked:
@@ -207,7 +207,7 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         population = pooling.fit(own.draws, options.draws, seed, report)
     population = population.spaced(options.draws)
     pooled = pooling.pooled(own.draws, population, seed)
-    # Under the population's prior another one, which is not estimated.
+    # The evidence under the population's prior is not estimated.
     return replace(
         own,
         draws=pooled.draws,
@@ -218,7 +218,7 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
 
 
 def _each(engine: Engine, job: Job) -> Inferred:
-    """Every person under the human model's own prior."""
+    """Infer each person under the human model's own prior."""
     if not engine.any_program:
         require_standard_program(job.human, f"be inferred by the engine {engine.name}")
     if job.network is None and (engine.needs_network or job.refine):
@@ -237,13 +237,13 @@ def _each(engine: Engine, job: Job) -> Inferred:
 
 
 def _in_parts(engine: Engine, job: Job) -> Inferred:
-    """By engines that infer each person by themselves: part after part of the people."""
+    """Infer people part by part, with an engine that infers each person separately."""
     identity = "" if job.checkpoint is None else job.checkpoint[1]
     parts = job.workers.run(
         "infer", job.rounds.num_people, partial(_infer_part, engine), job.part, identity
     )
     like = next(job.human.parameters())
-    # Site after site, and narrow until then: of many people there is only just room for it.
+    # Widened site by site, since draws of many people only just fit into memory.
     draws = {
         name: widened(torch.cat([part["draws"].pop(name) for part in parts], 1), like)
         for name in list(parts[0]["draws"])
@@ -273,26 +273,26 @@ def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
 
 
 FORMAT = 2
-"""Of what is kept of a run; raised whenever that changes, so that older runs are not resumed."""
+"""Version of stored runs; raised whenever they change, so that older runs are not resumed."""
 
 
 def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequence[object]) -> str:
-    """What results belong to, as a hash: model with its source, network, and options and so on."""
+    """Hash of everything results depend on: model with its source, network, options and so on."""
     kinds = [kind for kind in type(human).__mro__ if issubclass(kind, HumanModel)]
     source = [(kind.__qualname__, _source(kind)) for kind in kinds]
     weights = [fingerprint(human), None if network is None else fingerprint(network)]
-    try:  # what it leans on elsewhere shows in what it says
+    try:  # changes in code that the model imports show in its densities
         said = said_of_made_up_rounds(human)
     except Exception:
         if not has_own_program(human):
             raise
-        said = []  # a program of one's own may need more than made-up rounds have
+        said = []  # a custom program may need more than made-up rounds have
     description = [weights, source, said, __version__, FORMAT, [str(part) for part in what]]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 
 def _source(kind: type) -> str:
-    """The whole file of a class, which may lean on anything in it."""
+    """Source of the file of a class, on all of which the class may depend."""
     try:
         return Path(inspect.getfile(kind)).read_text()
     except (OSError, TypeError):  # a class made in a notebook has no file
@@ -300,7 +300,7 @@ def _source(kind: type) -> str:
 
 
 def _code(member: Any) -> Any:
-    """What a function of a notebook does."""
+    """Bytecode of a function that was defined in a notebook."""
     code = member if isinstance(member, CodeType) else getattr(member, "__code__", None)
     if code is None:
         return None

@@ -1,12 +1,12 @@
 """Proposals for sites whose prior depends on others, such as probabilities with a common mean.
 
-In unconstrained space such sites are a funnel: how far they spread depends on their parents, which
-no Gaussian follows. Taken relative to what their prior expects of them given the parents, ::
+In unconstrained space such sites form a funnel: their spread depends on their parents, which no
+Gaussian represents. Standardized by their conditional prior given the parents, ::
 
     u = (x - m) / s        m, s  mean and standard deviation of the prior, in unconstrained space
 
-they are much nearer to one (the non-centred parametrization: Papaspiliopoulos, Roberts and Skold,
-*A general framework for the parametrization of hierarchical models*, 2007).
+they are much closer to Gaussian (the non-centred parametrization: Papaspiliopoulos, Roberts and
+Skold, *A general framework for the parametrization of hierarchical models*, 2007).
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from mirror_ppl.models.prior import sample_sites
 
 
 def dependent_sites(human: HumanModel, sites: Mapping[str, Any]) -> tuple[str, ...]:
-    """Those of the scalar sites whose prior depends on other scalar sites, and on nothing else.
+    """Scalar sites whose prior depends on other scalar sites, and on nothing else.
 
-    What depends on sites of other kinds, too, is left out: those are not proposed together with the
-    scalar ones. So is what has no moments.
+    Sites that also depend on sites of other kinds are excluded, because those are not proposed
+    together with the scalar ones. So are sites without moments.
     """
     parents = dependencies(human).prior
     with torch.random.fork_rng(devices=[]):
@@ -41,7 +41,7 @@ def dependent_sites(human: HumanModel, sites: Mapping[str, Any]) -> tuple[str, .
 
 
 def _has_moments(fn: Any, site: Any) -> bool:
-    """Whether a prior has a mean and a standard deviation in unconstrained space."""
+    """True if a prior has a mean and a standard deviation in unconstrained space."""
     try:
         middle, scale = _moments(fn, site)
     except NotImplementedError:
@@ -50,14 +50,14 @@ def _has_moments(fn: Any, site: Any) -> bool:
 
 
 class RelativeProposal:
-    """A density over scalar sites, those that depend on others relative to their prior.
+    """A density over scalar sites, in which dependent sites are standardized by their prior.
 
     Args:
         human: the model of people.
         sites: the D scalar sites, with the map from unconstrained space.
         dependent: those that depend on others.
         place: draws in unconstrained space ``[S, D]``.
-        fit: from draws ``[S, D]``, those that depend relative, to the density of these.
+        fit: fits a density to draws ``[S, D]``, with dependent sites standardized.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class RelativeProposal:
 
     @torch.no_grad()
     def _relative(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Places ``[S, D]``, those that depend relative; and by how much that shrinks space."""
+        """Standardize dependent sites of ``[S, D]``; also returns the log of the scale ``[S]``."""
         number, columns = len(place), place.unbind(-1)
         given = {
             name: site(column).view(number, 1, 1)
@@ -107,10 +107,10 @@ class RelativeProposal:
 
 
 class _Placed(Messenger):
-    """Gives scalar sites their values, parents first, as the program goes on.
+    """Effect handler that sets scalar sites while the program runs, parents first.
 
     Attributes:
-        place: of each site in unconstrained space ``[S]``.
+        place: value of each site in unconstrained space ``[S]``.
     """
 
     def __init__(self, proposal: RelativeProposal, relative: Tensor) -> None:

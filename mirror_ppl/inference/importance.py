@@ -1,4 +1,4 @@
-"""The engine `importance`: person after person, by weighted draws that are resampled."""
+"""The engine `importance`: adaptive importance sampling of each person, with resampling."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def infer_by_importance(
     job: Job,
     first_pass: Callable[[ViewTableBuilder, ImportanceOptions], tuple[str, Weighted]] | None = None,
 ) -> Inferred:
-    """Person after person.
+    """Infer each person in turn by importance sampling.
 
     Args:
-        job: what to infer.
-        first_pass: weighted draws of what the rounds of a person say, and which engine they are
-            from; adaptive importance sampling unless given.
+        job: people, rounds and settings.
+        first_pass: returns the engine's name and weighted draws of a person; adaptive importance
+            sampling by default.
     """
     estimated = has_evidence(job.human) and not job.rounds.measurements
     models = models_by_kind(job.human) if first_pass is None and estimated else {}
@@ -46,7 +46,7 @@ def infer_by_importance(
             with stage("compile"):
                 builder = next(builders)
             human = builder.human
-            # Whoever else there is, and whatever the number of draws that they took.
+            # Independent of other people, and of how many draws they took.
             torch.manual_seed((job.seed + 1) * 1_000_003 + job.first + person)
             first = coarse(job.settings) if looks_twice(human) else job.settings
             engine, own = first_pass(builder, first)
@@ -60,17 +60,17 @@ def infer_by_importance(
             drawn.append(draws)
         order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
-    # Site after site, so that draws of pooled people, which are many, are not in memory twice.
+    # Site by site, so that the many draws of pooled people are not in memory twice.
     joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
     pareto_k, log_evidence, engines = zip(*found, strict=True)
     return Inferred(joined, torch.tensor(pareto_k), torch.tensor(log_evidence), engines=engines)
 
 
 def has_evidence(human: HumanModel) -> bool:
-    """Whether averages of importance weights estimate a marginal likelihood of actions.
+    """True if averages of importance weights estimate a marginal likelihood of actions.
 
-    They do not where the program says more than it samples, as by factors, nor where values of
-    attention are drawn, which adds noise that their standard error leaves out.
+    They do not if the program has factors, observed sites, scales or masks, nor if attention is
+    sampled, which adds noise that their standard error does not include.
     """
     drawn_attention = human.has_round_latents and not human.chained
     return not (adds_to_prior(human) or dependencies(human).adds_to_actions or drawn_attention)

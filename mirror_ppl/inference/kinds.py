@@ -1,14 +1,14 @@
-"""People of several kinds, each kind inferred by its own human model: Bayesian model averaging.
+"""Bayesian model averaging: people of several kinds, each inferred by its own human model.
 
 The program of :class:`mirror_ppl.models.family.OneOfKinds` has a site for the kind, on which no
-other site of the prior depends, and implants of other kinds do not matter to what somebody does.
-So its posterior is exactly a mixture of the posteriors of the models by themselves::
+other site of the prior depends, and a person's actions do not depend on implants of other kinds.
+The posterior is therefore exactly a mixture of the separate models' posteriors::
 
     p(kind | rounds)        ~  p(kind) p(rounds | kind)
     p(implants | rounds)    =  sum_kind p(kind | rounds) p(implants | kind, rounds)
 
-in which implants of other kinds have their prior. Each model has fewer beliefs than all together,
-and its proposal is adapted to it alone.
+in which implants of other kinds have their prior. Each model has fewer beliefs than the whole
+program, and a proposal of its own.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from mirror_ppl.models.prior import draw_prior, sample_sites
 from mirror_ppl.progress import Report
 
 LITTLE = 0.01
-"""Probability of a kind up to which it does not matter how well it was inferred."""
+"""Posterior probability of a kind below which its Pareto k is ignored."""
 
 
 def models_by_kind(human: HumanModel) -> dict[str, HumanModel]:
-    """The human models of the kinds of people; none of a model that adds something of its own."""
+    """Human models of the kinds of people; empty if a subclass or instance changes the model."""
     if not isinstance(human, OneOfKinds) or "members" not in vars(type(human)):
         return {}
     if any(callable(getattr(type(human), name, None)) for name in vars(human)):
         return {}
     found = {}
     for name, kind in human.members.items():
-        # With whatever the model has learned of the world.
+        # Includes what the model has learned about the world.
         found[name] = copy(human)
         found[name].__class__ = kind
     return found
@@ -48,17 +48,17 @@ def models_by_kind(human: HumanModel) -> dict[str, HumanModel]:
 def infer_kinds(
     job: Job, models: dict[str, HumanModel], infer: Callable[[Job], Inferred]
 ) -> Inferred:
-    """Infer people by each model, and mix what was found by how probable each is of a person.
+    """Infer people by each model, and mix the posteriors by the models' probabilities.
 
     Args:
         job: what to infer.
-        models: of the kinds.
+        models: human models of the kinds.
         infer: infers by one of them, and estimates evidences.
     """
     people = job.rounds.num_people
     found = []
     for place, model in enumerate(models.values()):
-        # Each person as often as there are models, so that progress goes one way.
+        # Progress counts each person once per model, so that it only increases.
         report = partial(_report, job.report, place, len(models))
         found.append(infer(replace(job, human=model, report=report)))
     with torch.random.fork_rng(devices=[]):
@@ -103,7 +103,7 @@ def _pareto(found: Inferred) -> Tensor:
 
 
 def _kinds(shares: Tensor, number: int, seed: int) -> Tensor:
-    """So many kinds, each as often as it is probable, in any order."""
+    """Sample kinds by systematic resampling, in random order."""
     generator = torch.Generator().manual_seed(seed)
     ladder = (torch.arange(number) + torch.rand((), generator=generator)) / number
     kinds = torch.searchsorted(shares.cpu().cumsum(0), ladder.double()).clamp(max=len(shares) - 1)

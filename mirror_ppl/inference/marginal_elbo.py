@@ -1,7 +1,7 @@
-"""The evidence lower bound with what people see summed out, as one sum over combinations.
+"""Evidence lower bound with perceptual implants summed out over possible combinations.
 
-Pyro's ``TraceEnum_ELBO`` gives every discrete site a dimension of its own. Here each person has one
-dimension for the combinations of all of them that were never given up, of which there are far
+Pyro's ``TraceEnum_ELBO`` enumerates every discrete site in a dimension of its own. Here each person
+has one dimension for the combinations of all sites that were not dropped, of which there are far
 fewer::
 
     E_guide [ log p(psi) + log sum_m p(m | psi) p(actions | m, psi) - log q(psi) ]
@@ -24,10 +24,10 @@ from mirror_ppl.likelihood.enumeration import combination_values
 
 
 class MarginalELBO(ELBO):
-    """An ELBO for ``pyro.infer.SVI``, of a program that is compiled to tables of views.
+    """An ELBO for ``pyro.infer.SVI``, for a program that is compiled to tables of views.
 
     Args:
-        compiled: every discrete site is one that perception reads.
+        compiled: a program whose discrete sites are all read by perception.
     """
 
     def __init__(self, compiled: ViewTables) -> None:
@@ -36,7 +36,7 @@ class MarginalELBO(ELBO):
         self._values = combination_values(compiled.human, compiled.table)
 
     def _get_trace(self, *_: Any) -> Any:
-        """Not used: the loss takes one draw of the guide, and all combinations at once."""
+        """Unused: the loss takes one draw of the guide, and all combinations at once."""
         raise NotImplementedError
 
     def differentiable_loss(
@@ -56,7 +56,7 @@ class MarginalELBO(ELBO):
         for node in trace.nodes.values():
             if node["type"] != "sample":
                 continue
-            # Which sites depend on what is seen shows in their dimensions.
+            # Sites that depend on perceptual implants have an additional dimension.
             if node["log_prob"].dim() > PLATES:
                 joint = joint + node["log_prob"]
             else:
@@ -76,7 +76,7 @@ class MarginalELBO(ELBO):
 
 
 def elbo_of(compiled: Compiled) -> ELBO:
-    """An ELBO that sums discrete sites out, whatever samples them."""
+    """Choose the ELBO that sums out a program's discrete sites."""
     if isinstance(compiled, ViewTables) and compiled.sums_over_combinations:
         return MarginalELBO(compiled)
     return TraceEnum_ELBO(max_plate_nesting=PLATES, strict_enumeration_warning=False)

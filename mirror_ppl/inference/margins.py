@@ -1,14 +1,14 @@
-"""The map from standard normal numbers to a prior, as a guide reads and proposes them.
+"""Transform from standard normal variables to a prior, for the amortized guide.
 
 Some sites of a prior have long tails in unconstrained space: the logit of the probability of
-noticing a terminal is sometimes -40. No mixture of a few Gaussians is near such a prior. Each of
-its margins is a standard normal number ``y_d``, mapped piecewise linearly between quantiles of
-draws. Where sites of the prior depend on those before them, such as probabilities on their common
-mean, that is taken out, too::
+noticing a terminal is sometimes -40. No mixture of a few Gaussians approximates such a prior. Each
+margin is therefore a standard normal variable ``y_d``, mapped piecewise linearly between quantiles
+of prior draws. Dependence of sites on earlier ones, such as of probabilities on their common mean,
+is removed, too::
 
     y_d = m_d(y_<d) + s_d(y_<d) u_d        m_d and log s_d quadratic, u_d about standard normal
 
-so that who has learned nothing proposes about what the prior does.
+so that an untrained guide approximates the prior.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ MOST_LOG_SCALE = 4.0
 
 
 def normal_knots() -> Tensor:
-    """The standard normal numbers at which a stretch changes its slope, ``[K]``."""
+    """Knots of the piecewise linear maps in standard normal space, ``[K]``."""
     return torch.linspace(-REACH, REACH, KNOTS)
 
 
 def prior_knots(places: Tensor) -> Tensor:
-    """Where they go: quantiles ``[D, K]`` of draws ``[S, D]`` from the prior."""
+    """Images of the knots: quantiles ``[D, K]`` of draws ``[S, D]`` from the prior."""
     standard = Normal(torch.zeros(()), torch.ones(()))
     knots = places.quantile(standard.cdf(normal_knots()).to(places), dim=0).T
-    # What many draws have in common is no step: every knot lies above the one before it.
+    # Ties among draws give no flat pieces: every knot lies above the one before it.
     gaps = knots.diff(dim=-1).clamp(min=LEAST_GAP)
     return torch.cat([knots[:, :1], knots[:, :1] + gaps.cumsum(-1)], -1)
 
 
 class PriorMargins(Transform):
-    """From ``[..., D]`` standard normal numbers to places in unconstrained space.
+    """Transform from standard normal to unconstrained space, ``[..., D]``, for each margin.
 
     Args:
-        knots: of each dimension, increasing, ``[D, K]``. The first and last slopes go on beyond
-            them.
+        knots: knots of each dimension, increasing, ``[D, K]``. Beyond them the first and last
+            slopes continue.
     """
 
     bijective = True
@@ -65,7 +65,7 @@ class PriorMargins(Transform):
 
     @property
     def sign(self) -> int:
-        """Of the slope."""
+        """Sign of the slope."""
         return 1
 
     def _call(self, x: Tensor) -> Tensor:
@@ -80,11 +80,11 @@ class PriorMargins(Transform):
 
 
 class PriorDependence(Transform):
-    """From ``[..., D]`` independent numbers u to standard normal ones y that depend as the prior's.
+    """Transform from independent variables u to dependent ones y, ``[..., D]``, as in the prior.
 
     Args:
         mean: coefficients of m ``[D, F]``, see :func:`prior_dependence`.
-        log_scale: of log s ``[D, F]``.
+        log_scale: coefficients of log s ``[D, F]``.
     """
 
     bijective = True
@@ -104,7 +104,7 @@ class PriorDependence(Transform):
     __hash__ = Transform.__hash__
 
     def _conditionals(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Means m and log scales ``[..., D]``; those of each d read only what is before it."""
+        """Means m and log scales ``[..., D]``; those of each d depend on earlier y only."""
         terms, mean, scale = _quadratic(y), self.mean.to(y.device), self.log_scale.to(y.device)
         limit = MOST_LOG_SCALE
         return terms @ mean.T, (terms @ scale.T).clamp(-limit, limit)
@@ -128,9 +128,9 @@ class PriorDependence(Transform):
 
 
 def prior_dependence(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Coefficients ``[D, F]`` of means and log scales, of draws ``[S, D]`` with normal margins.
+    """Fit coefficients ``[D, F]`` of means and log scales to draws ``[S, D]`` with normal margins.
 
-    By least squares, of each number on those before it.
+    Each dimension is regressed on the earlier ones by least squares.
     """
     terms = _quadratic(normal)
     order = _quadratic(torch.arange(1.0, normal.shape[-1] + 1), torch.maximum)
@@ -146,19 +146,19 @@ def prior_dependence(normal: Tensor) -> tuple[Tensor, Tensor]:
         mean[place, before] = fitted(normal[:, place])
         left = normal[:, place] - some @ mean[place, before]
         log_scale[place, before] = fitted((left.abs() + LEAST_SCALE).log())
-        # Of the logarithms it is the spread up to a factor.
+        # The regression of logarithms gives the scale up to a factor.
         log_scale[place, 0] += (left / (some @ log_scale[place, before]).exp()).std().log()
     return mean, log_scale
 
 
 def independent(dimensions: int) -> tuple[Tensor, Tensor]:
-    """Coefficients ``[D, F]`` with which nothing depends on anything."""
+    """Coefficients ``[D, F]`` without dependence."""
     terms = len(_quadratic(torch.zeros(dimensions)))
     return torch.zeros(dimensions, terms), torch.zeros(dimensions, terms)
 
 
 def _quadratic(y: Tensor, product: Callable[[Tensor, Tensor], Tensor] = torch.mul) -> Tensor:
-    """One, the numbers and their products ``[..., F]``, of numbers ``[..., D]`` within reach."""
+    """Quadratic features ``[..., F]`` (1, y, products) of clamped variables ``[..., D]``."""
     size = y.shape[-1]
     rows, columns = torch.triu_indices(size, size)
     if product is torch.mul:
@@ -168,7 +168,7 @@ def _quadratic(y: Tensor, product: Callable[[Tensor, Tensor], Tensor] = torch.mu
 
 
 def _interpolated(place: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    """Where ``[..., D]`` go, from knots to knots ``[D, K]``, and the slopes there."""
+    """Interpolate ``[..., D]`` linearly from knots to knots ``[D, K]``; returns slopes, too."""
     size = place.shape[-1]
     flat = place.reshape(-1, size).T.contiguous()
     after = torch.searchsorted(start, flat).clamp(1, start.shape[-1] - 1)

@@ -1,8 +1,8 @@
-"""A mixture of Gaussians whose draws have gradients, as the ELBO needs them.
+"""A mixture of Gaussians with reparameterized draws, as the ELBO needs them.
 
-Which component a draw is from has no gradient, but a draw ``z`` is also where the conditional
-distribution functions ``u_d = F(z_d | z_1 .. z_d-1)`` take given values. Where parameters change
-and ``u`` stays, ``z`` moves by ``-(du/dz)^-1 du`` (Figurnov, Mohamed and Mnih, *Implicit
+The choice of a component has no gradient, but a draw ``z`` is also the point where the conditional
+distribution functions ``u_d = F(z_d | z_1 .. z_d-1)`` have given values. If parameters change at
+constant ``u``, ``z`` moves by ``-(du/dz)^-1 du`` (Figurnov, Mohamed and Mnih, *Implicit
 reparameterization gradients*, 2018).
 """
 

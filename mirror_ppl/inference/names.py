@@ -1,4 +1,4 @@
-"""Names that engines had in earlier versions; light, for commands to look up before they import."""
+"""Former names of engines; imports nothing heavy, so that commands can check them first."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ FORMER = {"exact": "importance"}
 
 
 def current_name(name: str) -> tuple[str, str | None]:
-    """An engine's name now, and a note if it was given as in earlier versions."""
+    """Current name of an engine, and a note if the given name is a former one."""
     if not isinstance(name, str) or name not in FORMER:
         return name, None
     new = FORMER[name]
@@ -16,7 +16,7 @@ def current_name(name: str) -> tuple[str, str | None]:
 
 
 def told_engine(name: str) -> str:
-    """The name now of the engine of ``--guide``; a former one is told on stderr."""
+    """Current name of the engine of ``--guide``; prints a note to stderr for a former name."""
     name, note = current_name(name)
     if note is not None:
         print(f"--guide: {note}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""The engine `nuts`: Hamiltonian Monte Carlo, to compare others with on small problems."""
+"""The engine `nuts`: Hamiltonian Monte Carlo, a reference on small problems."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class NUTSOptions:
     """Settings of Hamiltonian Monte Carlo.
 
     Attributes:
-        warmup: steps that are thrown away, in which step sizes are learned.
-        tree_depth: the largest depth of a trajectory's tree.
+        warmup: discarded steps in which step sizes are adapted.
+        tree_depth: largest depth of a trajectory's tree.
     """
 
     warmup: int = 200
@@ -38,16 +38,16 @@ class NUTSOptions:
 def sample_nuts(
     compiled: Compiled, options: NUTSOptions, number: int, seed: int, report: Report = silent
 ) -> Draws:
-    """Joint draws ``[S, P, 1, ...]`` of all sites, of one chain; they depend on each other.
+    """Joint, autocorrelated draws ``[S, P, 1, ...]`` of all sites from one chain.
 
     Discrete sites are summed out while the chain runs, and drawn afterwards.
 
     Args:
         compiled: the program and the rounds to learn from.
         options: settings.
-        number: of draws S.
-        seed: of everything random.
-        report: told of steps.
+        number: number of draws S.
+        seed: seed of all random draws.
+        report: called with the number of steps.
     """
     total, done = options.warmup + number, 0
 
@@ -71,7 +71,7 @@ def sample_nuts(
 
 
 def infer_by_nuts(job: Job) -> Inferred:
-    """All people of a batch in one chain."""
+    """Infer all people of a batch in one chain."""
 
     def infer_batch(compiled: Compiled, part: Job) -> Inferred:
         return Inferred(sample_nuts(compiled, part.settings, part.draws, part.seed, part.report))

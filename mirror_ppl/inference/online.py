@@ -1,4 +1,4 @@
-"""One person's posterior, kept up to date while rounds come in."""
+"""Online inference: one person's posterior, updated as rounds arrive."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites
 from mirror_ppl.models.recorded import check_rounds
 
 AT_ONCE = AmortizedOptions(adaptation=ImportanceOptions(128, enough=64.0))
-"""Fewer effective draws than otherwise, but enough for an answer that cannot wait."""
+"""Settings with fewer effective draws, for a fast answer."""
 
 
 class OnlinePosterior:
-    """What is known of a person so far; a round more is one term more of their likelihood.
+    """Posterior of one person given the rounds so far; each round adds a likelihood term.
 
     Args:
-        human: the model of people. One that learns about the world, such as which rules hold in
-            bomb defusal, has to have done so before (`mirror_ppl.models.world_knowledge.fit_world`,
-            which every fit calls): else all that it leaves open is up to the person.
-        network: a trained guide (see :func:`mirror_ppl.training.guide_file.load_guide`); without,
-            draws are those of ``importance``, which takes longer at each asking.
-        seed: of everything random. The same rounds, added by the same calls, with draws asked for
-            after the same of them, give the same draws. Rounds that are added together are gone
-            through in an order of their own (:mod:`mirror_ppl.likelihood.telling`), so that draws
-            may be others than if they came one by one, of the same posterior.
+        human: the model of people. If it learns about the world, such as which rules hold in bomb
+            defusal, call `mirror_ppl.models.world_knowledge.fit_world` first, as every fit does:
+            otherwise unobserved parts of the world are inferred from this person alone.
+        network: a trained guide (see :func:`mirror_ppl.training.guide_file.load_guide`); without
+            it, ``importance`` is used, which takes longer at each call of ``draws``.
+        seed: seed of all random draws. The same rounds, added by the same calls, with ``draws``
+            called after the same of them, give the same draws. Rounds that are added together are
+            processed in an order of their own (:mod:`mirror_ppl.likelihood.telling`), so that draws
+            may differ from those of rounds added one by one, but have the same posterior.
         allow_contradictions: share of the steps that are added at once, from 0 to 1, that may
             contradict the next observation.
 
     Raises:
-        InputError: one of these is of another kind.
-        HumanModelError: what people see cannot be marginalized, or reaches their actions otherwise
-            than through beliefs.
+        InputError: an argument is of another type.
+        HumanModelError: perceptual implants cannot be marginalized, or affect actions other than
+            through beliefs.
 
     Attributes:
-        person: whose rounds they are; ``None`` before the first.
-        pareto_k: of the importance weights at the last asking; above 0.7 they are not to be relied
-            on.
-        seconds: that adding took the last time, and asking.
+        person: id of the person; ``None`` before the first round.
+        pareto_k: Pareto k of the importance weights at the last call of ``draws``; above 0.7 they
+            are unreliable.
+        seconds: duration of the last calls of ``add`` and of ``draws``.
     """
 
     def __init__(
@@ -88,15 +88,15 @@ class OnlinePosterior:
         return sum(map(len, self._rounds))
 
     def add(self, demonstrations: Demonstrations) -> None:
-        """Learn from rounds that have come in.
+        """Add rounds to the likelihood.
 
         Args:
-            demonstrations: of one person, of any number of rounds.
+            demonstrations: any number of rounds of one person.
 
         Raises:
             InputError: they are no demonstrations, of more than one person, of another person than
-                those before, or of another domain.
-            DemonstrationsError: they cannot be in the domain's world.
+                earlier ones, or of another domain.
+            DemonstrationsError: they are impossible in the domain's world.
         """
         check_rounds(self.human, demonstrations, people=1)
         check_world(demonstrations, self.allow_contradictions)
@@ -110,7 +110,7 @@ class OnlinePosterior:
             raise InputError(f"the rounds are of {person!r}, those before of {self.person!r}")
         self.person = person
         began = monotonic()
-        self._near = self._last  # the same until more rounds come in, so that draws are, too
+        self._near = self._last  # fixed until more rounds arrive, so that draws are, too
         if int(demonstrations.round_counts[0]):
             rounds = rounds_of(demonstrations, 0)
             self._builder.add(rounds)
@@ -121,7 +121,7 @@ class OnlinePosterior:
         """Posterior draws ``[S, 1, 1, ...]`` of all sites, as ``Person`` takes them.
 
         Raises:
-            InputError: the number is none, or there was no round yet; see
+            InputError: the number is invalid, or there was no round yet; see
                 :func:`mirror_ppl.models.prior.draw_prior`.
         """
         number = whole_number(number, "number", *LIMITS["draws"])
@@ -144,7 +144,7 @@ class OnlinePosterior:
             first = coarse(options) if looks_twice(human) else options
             found = sample_importance(human, self._builder.table(), first, self._near)
         else:
-            # What the first asking has checked need not be checked again.
+            # Sites are checked at the first call only.
             sites = None if math.isnan(self.pareto_k) else self._sites
             found = sample_amortized(human, self.network, self._builder, AT_ONCE, sites, self._near)
         if looks_twice(human):

@@ -1,6 +1,6 @@
 """Pareto-smoothed importance weights (Vehtari, Simpson, Gelman, Yao and Gabry, JMLR 2024).
 
-ArviZ has them, too, but takes seconds to be imported, in each process that infers people.
+ArviZ has them, too, but takes seconds to import, in each process that infers people.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ from pyro.ops.stats import fit_generalized_pareto
 from torch import Tensor
 
 FEWEST = 4
-"""Weights of a tail that are too few to fit a distribution to."""
+"""Largest number of tail weights that is too few to fit a distribution."""
 
 
 def pareto_smoothed(log_weights: Tensor) -> tuple[Tensor, float]:
     """Normalized log weights ``[S]`` with a smoothed tail, and its Pareto k.
 
     The largest weights are replaced by the expected order statistics of the generalized Pareto
-    distribution that fits them; none gets larger than the largest one. Above a k of .7 they are not
-    to be relied on; it is infinite where the tail is too short, and minus infinity where all
-    weights are equal.
+    distribution that fits them; none exceeds the largest one. They are unreliable for k > 0.7. k is
+    infinite if the tail is too short, and minus infinity if all weights are equal.
 
     Args:
         log_weights: in double precision, not normalized; not all minus infinity.

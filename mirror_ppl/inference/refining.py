@@ -1,7 +1,7 @@
-"""What a network proposes, fitted to recorded rounds by ``pyro.infer.SVI``.
+"""Refinement of a network's proposal on recorded rounds by ``pyro.infer.SVI``.
 
-The network covers the scalar sites. The other continuous sites, the weights of a residual, have a
-mean-field guide beside it. Discrete sites are summed out of the ELBO.
+The network covers the scalar sites. The other continuous sites (the weights of a residual) have a
+mean-field guide. Discrete sites are summed out of the ELBO.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites
 
 REFINING_RATE = 0.02
-"""Learning rate of Adam where it starts near the end."""
+"""Learning rate of Adam, which starts near the optimum."""
 
 
 def with_mean_field(
     compiled: Compiled, density: Callable[[], dist.TorchDistribution]
 ) -> Callable[[], Draws]:
-    """A guide of P people as a Pyro program: values ``[P, 1, ...]`` of all continuous sites.
+    """Make a guide of P people: a Pyro program that samples all continuous sites ``[P, 1, ...]``.
 
     Args:
         compiled: the human program and the rounds.
-        density: makes the density ``[P, 1]`` over places of the scalar sites.
+        density: makes the density ``[P, 1]`` of the scalar sites in unconstrained space.
     """
     sites = scalar_sites(compiled.human)
     others = sample_sites(compiled.human, 1).keys() - sites.keys() - compiled.discrete
@@ -52,14 +52,14 @@ def refined(
     recorded: int,
     steps: int,
 ) -> dist.TorchDistribution:
-    """The density that the network proposes for one person, refined by gradient steps.
+    """Refine the network's density for one person by gradient steps.
 
-    It stays a mixture of the network's family, whose parameters start at what the network says.
+    It stays in the network's mixture family; its parameters start at the network's output.
 
     Args:
         network: the trained network.
         compiled: the human program and the person's rounds.
-        log_evidence: what the network reads of them, ``[W]``.
+        log_evidence: the network's input, ``[W]``.
         recorded: number of recorded actions.
         steps: gradient steps.
     """

@@ -1,14 +1,14 @@
-"""Where to look for the residual of a policy: near the weights that explain a person's rounds best.
+"""Laplace approximation of the residual of a policy, as a proposal.
 
-Given all else of a draw, the residual's last layer enters logits linearly, so what rounds say of
-its weights ``w`` is nearly Gaussian (a Laplace approximation)::
+Given all else of a draw, the residual's last layer enters logits linearly, so the posterior of its
+weights ``w`` is nearly Gaussian::
 
     q(w | rest) = Normal(mode, (prior precision + Fisher information at the mode)^-1)
 
-under rounds in which each moment counts as often as it is likely to have come about: what somebody
-saw, and attended to, is not known. Those expected counts are the gradient of the log-likelihood by
-the log-probabilities of actions (Fisher's identity), so they are right for whatever a human model
-sums out. It is a proposal only: draws are weighted by what their rounds really say.
+Percepts and attention are unobserved, so each moment is weighted by its expected count. Expected
+counts are the gradient of the log-likelihood with respect to the log-probabilities of actions
+(Fisher's identity), and are thus correct for everything that a human model sums out. As this is a
+proposal only, draws get importance weights by their exact likelihood.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from mirror_ppl.models.human import HumanModel
 
 SITE = "residual_out"
 NEWTON_STEPS, CURVATURES = 4, 2
-"""Steps to the best weights; at so many of them is it worked out how curved the likelihood is."""
+"""Newton steps to the mode, and how many of them recompute the curvature."""
 DRAWS = 128
-"""What is worked out at once; bounds memory."""
+"""Draws that are computed at once; bounds memory."""
 MOMENTS = 512
-"""So many moments are looked at, those that are expected to have come about most often."""
+"""Largest number of moments, those with the largest expected counts."""
 COUNTED = 0.97
-"""Or fewer, if this share of all that was done was done at them."""
+"""Share of all expected counts at which fewer moments are used."""
 
 
 @dataclass(frozen=True)
 class ResidualProposal:
-    """Proposes a residual's last layer for draws of all else of one person.
+    """Proposes a residual's last layer, given draws of all other sites of one person.
 
     Attributes:
         human: the model of people; it samples ``residual_in`` and ``residual_out``.
-        belief: of the moments that count ``[1, N, Z]``.
+        belief: beliefs at the selected moments ``[1, N, Z]``.
         values: action values there ``[1, N, A]``.
-        counts: how often each action is expected to have been taken there ``[N, A]``.
+        counts: expected counts of each action there ``[N, A]``.
     """
 
     human: HumanModel
@@ -55,25 +55,25 @@ class ResidualProposal:
 
     @classmethod
     def of(cls, human: HumanModel, table: ViewTable, counts: Tensor) -> ResidualProposal:
-        """Of a table of one person.
+        """Build the proposal from the table of one person.
 
         Args:
             human: the model of people.
             table: views of the person's rounds.
-            counts: how often each action is expected at each moment, ``[N, A]``.
+            counts: expected counts of each action at each moment, ``[N, A]``.
         """
         belief, values = table.belief[0], table.values[0]
         often = counts.sum(-1)
         ordered, places = often.sort(descending=True)
         most = int((ordered.cumsum(0) < COUNTED * ordered.sum()).sum()) + 1
         some = places[: min(most, MOMENTS)]
-        # Each of the others counts as the one in which somebody believes much the same.
+        # Counts of other moments are added to the moment with the nearest belief.
         nearest = torch.cdist(belief, belief[some]).argmin(-1)
         counts = counts.new_zeros(len(some), counts.shape[-1]).index_add(0, nearest, counts)
         return cls(human, belief[some][None], values[some][None], counts)
 
     def gaussian(self, draws: Mapping[str, Tensor]) -> MultivariateNormal:
-        """``q(w | rest)`` of draws ``[S, 1, 1, ...]`` of everything else, of ``[S, W]``."""
+        """``q(w | rest)`` over weights ``[S, W]``, given draws ``[S, 1, 1, ...]`` of the rest."""
         number = len(draws[SITE])
         rest = {**draws, SITE: torch.zeros_like(draws[SITE])}
         with conditioned(rest, number, 1), poutine.trace() as trace:
@@ -90,10 +90,10 @@ class ResidualProposal:
 def _laplace(
     without: Tensor, features: Tensor, counts: Tensor, scale: Tensor
 ) -> MultivariateNormal:
-    """The Laplace approximation of weights ``[S, R A]`` of a multinomial logistic regression.
+    """Laplace approximation of weights ``[S, R A]`` of a multinomial logistic regression.
 
     Args:
-        without: logits ``[S, N, A]`` that are there without it.
+        without: offset of the logits ``[S, N, A]``.
         features: ``[S, N, R]``.
         counts: ``[N, A]``.
         scale: standard deviation of the weights' prior.
@@ -102,17 +102,17 @@ def _laplace(
     for some in torch.arange(len(features)).split(DRAWS):
         best, curvature = _mode(without[some], features[some], counts, scale)
         weights.append(best)
-        precision.append((curvature + curvature.mT) / 2)  # else symmetric but for rounding
+        precision.append((curvature + curvature.mT) / 2)  # symmetric up to rounding
     return MultivariateNormal(torch.cat(weights), precision_matrix=torch.cat(precision))
 
 
 def _mode(
     without: Tensor, features: Tensor, counts: Tensor, scale: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The best weights ``[S, R A]`` by Newton's method, and the precision there."""
+    """Mode of the weights ``[S, R A]`` by Newton's method, and the precision there."""
     number, _, size = features.shape
     actions = without.shape[-1]
-    # Moments last: operations along few actions are much quicker in front of them than behind.
+    # Moments last: operations over few actions are much faster on a leading dimension.
     without, counts, across = (part.mT.contiguous() for part in (without, counts, features))
     weights = without.new_zeros(number, actions, size)
     precision = factor = without.new_zeros(0)
@@ -137,7 +137,7 @@ def _mode(
 
 
 def _pairs(size: int) -> Tensor:
-    """The unordered pair that each ``[size, size]`` is, in the order of the upper triangle."""
+    """Index ``[size, size]`` of each unordered pair, in the order of the upper triangle."""
     first, second = torch.triu_indices(size, size)
     which = torch.zeros(size, size, dtype=torch.long)
     which[first, second] = which[second, first] = torch.arange(len(first))

@@ -5,10 +5,10 @@ With draws ``psi_s ~ q`` of a person::
     w_s = p(psi_s) sum_m p(m | psi_s) p(actions | m, psi_s) / q(psi_s)
 
 where ``m`` runs over all combinations of the discrete sites that perception reads, and densities
-are those of the program with all that it observes, scales or adds by factors. ``q`` is the
-mixture of all that was proposed (Veach and Guibas, *Optimally combining sampling techniques for
-Monte Carlo rendering*, 1995), so that weights are bounded. Pareto k tells whether there are enough
-draws (Vehtari, Simpson, Gelman, Yao and Gabry, *Pareto smoothed importance sampling*, 2015).
+are those of the program with its observed sites, scales and factors. ``q`` is the mixture of all
+proposals (Veach and Guibas, *Optimally combining sampling techniques for Monte Carlo rendering*,
+1995), so that weights are bounded. Pareto k diagnoses whether there are enough draws (Vehtari,
+Simpson, Gelman, Yao and Gabry, *Pareto smoothed importance sampling*, 2015).
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
 
 DEFENSIVE_SHARE = 0.1
-"""Share of what is proposed that is not by what was learned, of the residual and of discrete sites.
+"""Share of draws of the residual and of discrete sites from a defensive proposal near the prior.
 """
 RESIDUAL_DRAWS = 64
-"""Draws by which it is learned where to look for the residual."""
+"""Draws from which the proposal of the residual is fitted."""
 HIGH_PARETO_K = 0.7
-"""Above it, importance weights are not to be relied on (Vehtari et al., 2015)."""
+"""Pareto k above which importance weights are unreliable (Vehtari et al., 2015)."""
 HALVINGS = 20
-"""Steps of the search for the power to which weights are raised."""
+"""Bisection steps for the power to which weights are raised."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class Weighted:
 
     Attributes:
         policy: values of the sites that perception does not read, ``[S, 1, 1, ...]``.
-        combinations: those of the discrete sites that it reads, still possible; G sets.
-        log_joint: log-probability of each of these sets and of the recorded actions under each
-            draw, ``[S, G]``, up to what all of them share.
+        combinations: possible combinations of the discrete sites that it reads; G sets.
+        log_joint: log joint probability of each of these sets and the recorded actions under each
+            draw, ``[S, G]``, up to a common constant.
         log_weights: normalized and Pareto-smoothed, ``[S]``.
-        pareto_k: of the weights.
-        log_evidence: log of the marginal likelihood of the recorded actions, nats; an estimate
-            whose standard error is about ``(1 / effective - 1 / S) ** 0.5``.
-        proposed_residual: whether the residual was proposed by what the rounds say of it.
+        pareto_k: Pareto k of the weights.
+        log_evidence: estimated log marginal likelihood of the recorded actions, nats; its standard
+            error is about ``(1 / effective - 1 / S) ** 0.5``.
+        proposed_residual: True if the residual was proposed by its Laplace approximation.
     """
 
     policy: Draws
@@ -80,9 +80,9 @@ class Weighted:
         return float(1 / self.log_weights.exp().square().sum())
 
     def tempered(self, effective: float) -> Weighted:
-        """The same with weights to a power, 1 if possible, at which so many draws are effective.
+        """Temper the weights until this many draws, at most a quarter of all, are effective.
 
-        But at most a quarter of all draws.
+        The power is 1 if possible.
         """
         effective = min(effective, len(self.log_weights) / 4)
         if self.effective >= effective:
@@ -101,14 +101,14 @@ class Weighted:
         """Joint draws ``[number, 1, 1, ...]`` of all sites from the global random state.
 
         Args:
-            number: of draws.
-            values: of the discrete sites for every combination, ``[M]``.
+            number: number of draws.
+            values: values of the discrete sites for every combination, ``[M]``.
         """
-        # Systematic resampling, in random order: draws are repeated as little as can be.
+        # Systematic resampling in random order repeats draws as little as possible.
         ladder = (torch.arange(number) + torch.rand(())) / number
         place = torch.searchsorted(self.log_weights.exp().cumsum(0), ladder.to(self.log_weights))
         place = place.clamp(max=len(self.log_weights) - 1)[torch.randperm(number)]
-        # By the inverse of their distribution; multinomial is slow where there are many.
+        # Inverse transform sampling, since multinomial is slow for many combinations.
         distinct, which = place.unique(return_inverse=True)
         ladder = torch.softmax(self.log_joint[distinct].double(), -1).cumsum(-1)[which]
         chosen = torch.searchsorted(ladder, ladder[:, -1:] * torch.rand_like(ladder[:, :1]))
@@ -120,7 +120,7 @@ class Weighted:
 
 
 class Proposal(Protocol):
-    """A density over the scalar sites in unconstrained space; torch distributions are such."""
+    """Protocol of a density over the scalar sites in unconstrained space, as in torch."""
 
     def sample(self, sample_shape: torch.Size) -> Tensor:
         """Draws ``[S, D]``."""
@@ -132,10 +132,10 @@ class Proposal(Protocol):
 
 
 class NoScalars:
-    """The proposal of no scalar sites."""
+    """Proposal for models without scalar sites."""
 
     def sample(self, sample_shape: torch.Size) -> Tensor:
-        """Nothing, ``[S, 0]``."""
+        """Empty draws ``[S, 0]``."""
         return torch.zeros(*sample_shape, 0)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -145,13 +145,13 @@ class NoScalars:
 
 @dataclass(frozen=True)
 class _Stage:
-    """How some draws were proposed.
+    """Proposal of a stage.
 
     Attributes:
-        number: of draws.
+        number: number of draws.
         scalars: proposal of the scalar sites; ``None`` for the prior.
-        residual: whether the residual was proposed, too.
-        log_chances: of the values of discrete sites ``[n]``, where they were.
+        residual: True if the residual was proposed, too.
+        log_chances: log-probabilities of values of the proposed discrete sites ``[n]``.
     """
 
     number: int
@@ -161,25 +161,25 @@ class _Stage:
 
 
 class Sampler:
-    """Draws of one person from several proposals, the first of which is the prior.
+    """Importance sampler of one person with several proposals, the first of which is the prior.
 
-    Proposals are of the scalar sites and, where that was learned, of the residual of the policy and
-    of discrete sites that perception does not read; all others are drawn from the prior.
+    Proposals are over the scalar sites and, once fitted, over the residual of the policy and
+    discrete sites that perception does not read; all other sites are drawn from the prior.
 
     Args:
         human: the model of people.
         table: views of one person's rounds.
         combinations: the possible combinations, if they are known.
-        sites: see :func:`scalar_sites`, of a model that is known to act on beliefs alone; looked
-            up and checked unless given.
+        sites: result of :func:`scalar_sites` for a model that is known to act on beliefs alone;
+            computed and checked by default.
 
     Raises:
-        HumanModelError: actions depend on what is seen otherwise than through beliefs.
+        HumanModelError: percepts affect actions other than through beliefs.
 
     Attributes:
-        combinations: of the discrete sites, those that are still possible.
+        combinations: the combinations of discrete sites that are still possible.
         place: the scalar sites of all draws, in unconstrained space ``[S, D]``.
-        supports: of the discrete sites of the policy ``[n]``.
+        supports: supports of the discrete sites of the policy ``[n]``.
     """
 
     def __init__(
@@ -218,19 +218,19 @@ class Sampler:
         self.add_prior_draws(policy, self._joint(policy, number))
 
     def add_prior_draws(self, policy: Draws, joint: Tensor) -> None:
-        """Take draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
+        """Add given draws ``[S, 1, 1, ...]`` from the prior, with their log joint ``[S, G]``."""
         place = unconstrained(self.sites, policy, len(joint))
-        # All of it is given: priors may depend on any of these sites.
+        # All sites are given, since priors may depend on any of them.
         own = (*self.sites, *self.supports)
         _, log_priors = complete(self.human, self.table, policy, len(joint), own)
         self._add(policy, joint, place, log_priors)
         self._stages.append(_Stage(len(joint)))
 
     def prune(self, margin: float) -> None:
-        """Give up combinations that are behind the best by more than that under every draw.
+        """Drop combinations that are behind the best by more than ``margin`` nats under every draw.
 
-        Of draws from the prior. None is given up if the program says more of the person, and hardly
-        any of the draws is probable by that.
+        Draws have to be from the prior. None is dropped if the program adds factors or observed
+        sites under which too few of the draws are effective.
         """
         joint, said = torch.cat(self._joints), torch.cat(self._corrections)
         if float(said.max() - said.min()) > 0 and effective(said) < min(ENOUGH, len(said) / 2):
@@ -245,14 +245,13 @@ class Sampler:
 
     @property
     def proposes_residual(self) -> bool:
-        """Whether the residual is proposed."""
+        """True if the residual is proposed."""
         return self._residual is not None
 
     def learn_residual(self, found: Weighted) -> None:
-        """From now on propose the residual, too, by these weighted draws of the person.
+        """Fit a proposal of the residual to these weighted draws, and use it from now on.
 
-        A share of :data:`DEFENSIVE_SHARE` of what is proposed has a residual from the prior all
-        the same.
+        A share of :data:`DEFENSIVE_SHARE` of later draws still has a residual from the prior.
         """
         if SITE not in found.policy or not self.table.real.any():
             return
@@ -270,10 +269,10 @@ class Sampler:
         self._log_residual = self._residual_densities(own, self._residual.gaussian(own))
 
     def learn_discrete(self, found: Weighted) -> None:
-        """From now on propose discrete sites of the policy, too, by what is known so far.
+        """Fit proposals of discrete sites of the policy, and use them from now on.
 
-        Each by itself; a share of :data:`DEFENSIVE_SHARE` is as often as in the first draws, which
-        are from the prior, or any value alike.
+        Sites are independent. A share of :data:`DEFENSIVE_SHARE` is defensive, in equal parts by
+        the first draws, which are from the prior, and uniform.
         """
         for name, support in self.supports.items():
             own = found.policy[name].flatten()[:, None] == support
@@ -285,12 +284,12 @@ class Sampler:
             ).log()
 
     def _residual_densities(self, policy: Draws, gaussian: MultivariateNormal) -> Tensor:
-        """Log densities ``[2, S]`` of residuals, by the prior and as proposed."""
+        """Log densities ``[2, S]`` of residuals under the prior and under the proposal."""
         _, prior = complete(self.human, self.table, policy, len(policy[SITE]), (SITE,))
         return torch.stack([prior[SITE], gaussian.log_prob(policy[SITE].flatten(1))])
 
     def propose(self, proposal: Proposal, number: int) -> None:
-        """Draw some more."""
+        """Add draws from a proposal."""
         place = proposal.sample(torch.Size([number]))
         given: dict[str, Tensor] = {
             name: site(place[:, column]).view(number, 1, 1)
@@ -335,7 +334,7 @@ class Sampler:
         }
 
     def weighted(self) -> Weighted:
-        """All draws, with their weights."""
+        """All draws so far, with their weights."""
         joint, policy = torch.cat(self._joints), self._policy()
         of_scalars, of_discrete = self._log_prior
         prior = either = torch.zeros_like(of_scalars)
@@ -388,11 +387,11 @@ def complete(
     number: int,
     asked: Sequence[str] | None = None,
 ) -> tuple[Draws, dict[str, Tensor]]:
-    """Draws ``[S, 1, 1, ...]`` of every site that views do not depend on, some of them given.
+    """Complete draws ``[S, 1, 1, ...]`` of all sites that views do not depend on.
 
     Returns:
-        The draws, those that are not given from the prior; and the log prior density ``[S]`` of
-        each site that is asked about, of the given ones unless some are.
+        The draws, with missing sites from the prior; and log prior densities ``[S]`` of the sites
+        ``asked``, by default of the given ones.
     """
     nodes = sample_sites(human, 1, number, given)
     values = values_of(nodes)
@@ -417,7 +416,7 @@ def _policy_supports(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
 
 
 def _log_abs_det(sites: Mapping[str, Any], place: Tensor) -> Tensor:
-    """Log of by how much space is stretched on the way from unconstrained space, ``[S]``."""
+    """Log absolute determinant of the Jacobian of the map from unconstrained space, ``[S]``."""
     total = place.new_zeros(len(place))
     for column, site in enumerate(sites.values()):
         total = total + site.log_abs_det_jacobian(place[:, column], site(place[:, column]))

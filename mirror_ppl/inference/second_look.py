@@ -1,8 +1,8 @@
-"""Going through a person's rounds twice, where what they attend to differs from round to round.
+"""Two passes over a person's rounds, for models with sampled attention.
 
-What stands for all that they may have attended to is chosen by who they are
-(:mod:`mirror_ppl.likelihood.attention`), which is not known when their rounds are seen for the
-first time. The first look tells roughly; the second chooses by that.
+The values of attention are best proposed from the person's posterior
+(:mod:`mirror_ppl.likelihood.attention`), which is unknown in the first pass. The first pass gives a
+coarse posterior; the second proposes attention from it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel
 
 LIKELY_DRAWS, COARSE_DRAWS = 64, 256
-"""Draws of the person by which attention is chosen, and proposals of a stage of the first look."""
+"""Posterior draws that propose attention, and proposals of a stage of the first pass."""
 
 
 def looks_twice(human: HumanModel) -> bool:
-    """Whether what stands for all that people may attend to depends on who they are."""
+    """True if attention is sampled, so that a second pass improves its proposal."""
     return human.has_round_latents and not human.chained
 
 
 def coarse(options: ImportanceOptions) -> ImportanceOptions:
-    """Settings under which one learns roughly who somebody is."""
+    """Reduced settings for the first pass."""
     return replace(
         options,
         proposals=min(COARSE_DRAWS, options.proposals),
@@ -42,18 +42,18 @@ def second_look(
     builder: ViewTableBuilder,
     found: Weighted,
 ) -> tuple[ViewTableBuilder, Weighted]:
-    """Weighted draws of one person, from the global random state.
+    """Run the second pass of one person (global random state).
 
     Args:
         human: the model of people; see :func:`looks_twice`.
-        rounds: all that is recorded of the person.
-        screening: when to give up combinations of discrete sites.
-        options: settings of the second time.
-        builder: of the first time.
-        found: of the first time.
+        rounds: all rounds of the person.
+        screening: when to drop combinations of discrete sites.
+        options: settings of the second pass.
+        builder: views of the first pass.
+        found: weighted draws of the first pass.
 
     Returns:
-        The rounds as seen the second time, and what they say.
+        Views and weighted draws of the second pass.
     """
     likely = found.sample(LIKELY_DRAWS, builder.grid)
     again = ViewTableBuilder(human, screening, likely=likely)

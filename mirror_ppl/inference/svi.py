@@ -1,8 +1,8 @@
 """The engine `svi`: ``pyro.infer.SVI`` with discrete sites summed out.
 
-The evidence lower bound enumerates every discrete site of the human program in parallel, so a guide
-is needed for the continuous sites alone. Mean-field guides on relaxed sight thresholds get stuck
-between plateaus of the likelihood; enumeration has no such trap.
+The ELBO enumerates every discrete site of the human program in parallel, so that a guide is needed
+for the continuous sites only. Mean-field guides on relaxed sight thresholds get stuck on plateaus
+of the likelihood; enumeration avoids that.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class SVIOptions:
 
     Attributes:
         steps: gradient steps.
-        learning_rate: of Adam at the start; it falls to a twentieth on a cosine.
+        learning_rate: initial rate of Adam, annealed to a twentieth on a cosine.
         checkpoint_every: steps between checkpoints.
-        prune_every: steps after which combinations of discrete implants are given up that have
-            become hopeless under the guide.
-        prune_margin: nats by which the log-likelihood of such a combination has fallen behind.
+        prune_every: steps after which combinations of discrete implants are dropped that are far
+            behind the best under the guide.
+        prune_margin: nats behind the best at which a combination is dropped.
     """
 
     steps: int = 300
@@ -74,10 +74,10 @@ class SVIOptions:
 
 @dataclass(frozen=True)
 class ImplantPosterior:
-    """What was inferred of P people.
+    """Posterior of P people.
 
     Attributes:
-        guide: over the continuous sites.
+        guide: guide over the continuous sites.
         draws: joint posterior draws of all sites, ``[S, P, 1, ...]``.
         losses: negative ELBO at each step, in nats.
     """
@@ -88,11 +88,11 @@ class ImplantPosterior:
 
 
 class PriorScaledNormal(AutoNormal):
-    """A mean-field guide whose vectors start as wide as their prior.
+    """A mean-field guide whose vector sites start with the scale of their prior.
 
-    Weights of which the data say nothing are right from the first step. Sites of one number start
-    narrow: a site that is known to .01 would have gradients thousands of times as large under a
-    wide guide, and Adam, which remembers them, would take steps that are far too small.
+    Weights that the data do not identify are thus correct from the first step. Scalar sites start
+    narrow: under a wide guide, a site with posterior scale 0.01 would have gradients thousands of
+    times as large, which Adam remembers, so that its steps would be far too small.
     """
 
     def _setup_prototype(self, *args: Any, **kwargs: Any) -> None:
@@ -113,13 +113,13 @@ class PriorScaledNormal(AutoNormal):
 
 
 def continuous_guide(compiled: Compiled, without: Collection[str] = ()) -> PriorScaledNormal:
-    """A mean-field guide over the continuous sites of a human program, one factor a person.
+    """Make a mean-field guide over the continuous sites of a human program.
 
     Args:
         compiled: the program and the rounds.
         without: names of sites that another guide covers.
     """
-    # Parameters are the guide's own until SVI takes them into Pyro's store.
+    # Parameters are local to the guide until SVI registers them in Pyro's store.
     with pyro.settings.context(module_local_params=True):
         program = poutine.block(compiled.program, hide=[*compiled.discrete, *without])
         guide = PriorScaledNormal(program, init_loc_fn=init_to_median)
@@ -129,7 +129,7 @@ def continuous_guide(compiled: Compiled, without: Collection[str] = ()) -> Prior
 
 @contextmanager
 def own_parameters(seed: int) -> Iterator[None]:
-    """A random state and a parameter store that end with what is done in them."""
+    """Context with its own random state and parameter store."""
     with torch.random.fork_rng(devices=[]), pyro.get_param_store().scope():
         torch.manual_seed(seed)
         yield
@@ -143,16 +143,16 @@ def fit_implants(
     report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
 ) -> ImplantPosterior:
-    """Posterior of the implants of P people.
+    """Fit the posterior of the implants of P people.
 
     Args:
         compiled: the program and the rounds to learn from.
         options: settings.
         draws: number of posterior draws S.
-        seed: seed of everything random here.
-        report: told of gradient steps and of draws.
-        checkpoint: a file that is written now and then and continued from if it exists, and what
-            identifies this run (a checkpoint of another run is refused).
+        seed: seed of all random draws.
+        report: called with progress: gradient steps, draws.
+        checkpoint: a file that is written during the run and resumed from if it exists, and the
+            identity of this run (a checkpoint of another run is refused).
 
     Raises:
         CheckpointError: the checkpoint is damaged or of another run.
@@ -171,13 +171,13 @@ def optimize(
     report: Report = silent,
     checkpoint: tuple[Path, str] | None = None,
 ) -> list[float]:
-    """Fit a guide by ``pyro.infer.SVI``. Of tables, hopeless combinations are given up.
+    """Fit a guide by ``pyro.infer.SVI``; combinations in tables are pruned during the fit.
 
     Args:
         compiled: the program and the rounds.
-        guide: over the continuous sites; a module, if there is a checkpoint.
+        guide: guide over the continuous sites; a module, if there is a checkpoint.
         options: settings.
-        report: told of gradient steps.
+        report: called with the number of gradient steps.
         checkpoint: see :func:`fit_implants`.
 
     Returns:
@@ -201,7 +201,7 @@ def optimize(
     if checkpoint is not None and checkpoint[0].exists():
         losses = _restore(*checkpoint, cast(AutoGuide, guide), optimizer, compiled)
     while len(losses) < options.steps:
-        # What is wrong with a model shows at the first step; checking all of them costs a third.
+        # Validate at the first step only: validation takes a third of the time.
         with pyro.validation_enabled(not losses):
             losses.append(cast(float, svi.step()))
         optimizer.step()
@@ -217,7 +217,7 @@ def optimize(
 
 @torch.no_grad()
 def _refuse_scales(compiled: Compiled) -> None:
-    """Refuse scales around what is summed out: Pyro's TraceEnum_ELBO takes them out of the sum."""
+    """Refuse scales of enumerated sites: Pyro's TraceEnum_ELBO moves them out of the sum."""
     program = cast(Callable[[], None], config_enumerate(compiled.program, "parallel"))
     with (
         torch.random.fork_rng(devices=[]),
@@ -238,9 +238,9 @@ def _refuse_scales(compiled: Compiled) -> None:
 
 @torch.no_grad()
 def _prune(compiled: ViewTables, guide: Callable[[], Draws], margin: float) -> None:
-    """Give up combinations that are behind the best one by more than the margin.
+    """Drop combinations that are behind the best one by more than the margin.
 
-    Each is scored under the guide's draw that suits it best.
+    Each is scored under its best draw of the guide.
     """
     human, table, best = compiled.human, compiled.table, None
     grid = combination_values(human, table)
@@ -250,7 +250,7 @@ def _prune(compiled: ViewTables, guide: Callable[[], Draws], margin: float) -> N
         try:
             prior = log_priors(human, grid, one, table.people)
         except HumanModelError:
-            return  # other sites depend on these, so that none has a prior of its own
+            return  # other sites depend on these, so no combination has a prior
         with (
             poutine.block(),
             poutine.condition(data=drawn),
@@ -313,7 +313,7 @@ def draw_implants(
 
 
 def infer_by_svi(job: Job) -> Inferred:
-    """All people of a batch together."""
+    """Infer all people of a batch together."""
 
     def infer_batch(compiled: Compiled, part: Job) -> Inferred:
         found = fit_implants(

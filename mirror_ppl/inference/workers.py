@@ -1,4 +1,4 @@
-"""Work on many people, part by part: in this process, in several, or on a cluster."""
+"""Distribution of work on many people: in this process, in several, or on a cluster."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from mirror_ppl.jobs import Runner, TensorFormat
 from mirror_ppl.progress import Report, Reported, silent
 
 PART = 2
-"""People of a part: few, so that processes end at about the same time and little is lost when they
+"""People of a part: few, so that processes end at about the same time, and little is lost if they
 are stopped."""
 PEOPLE_OF_A_PROCESS = 4
-"""People that are worth the seconds in which a further process starts."""
+"""People per process for which starting a further process pays."""
 
 
 def parts_of(checkpoint: Path) -> Path:
-    """The folder in which a run with this checkpoint keeps what is done for some of the people."""
+    """Folder in which a run with this checkpoint stores results of parts of the people."""
     return checkpoint.with_name(f"{checkpoint.name}.parts")
 
 
 @dataclass(frozen=True)
 class People:
-    """Some of the people, one after the other.
+    """A range of people.
 
     Attributes:
-        first: number of the first one.
-        last: of the one after the last one.
+        first: number of the first person.
+        last: number after that of the last person.
     """
 
     first: int
@@ -38,7 +38,7 @@ class People:
 
     @property
     def label(self) -> str:
-        """Who they are."""
+        """Name of the range, for progress reports."""
         return f"people {self.first + 1} to {self.last}"
 
     @property
@@ -49,13 +49,13 @@ class People:
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work on many people. What comes of it does not depend on that.
+    """Processes or cluster for work on many people. Results do not depend on this choice.
 
     Attributes:
-        jobs: processes; 1 for this one, -1 for one a core, ``None`` for as many as pay.
-        scheduler: address of a Dask cluster that does the work instead.
-        folder: where results of finished parts are kept, so that a run that is stopped goes on.
-        report: told of people done.
+        jobs: processes; 1 for this one, -1 for one per core, ``None`` for a suitable number.
+        scheduler: address of a Dask cluster to use instead.
+        folder: folder for results of finished parts, from which a stopped run resumes.
+        report: called with the number of people done.
     """
 
     jobs: int | None = 1
@@ -78,16 +78,16 @@ class Workers:
         """Do some work on people 0 to P - 1.
 
         Args:
-            name: of the work.
-            people: P.
-            work: of what some of them need; can be pickled. Returns tensors and plain values.
-            given: what the work needs of some of them.
-            identity: of everything that results depend on.
+            name: name of the work.
+            people: number of people P.
+            work: picklable function of a part's input; returns tensors and plain values.
+            given: makes the input of a part.
+            identity: identifies everything that results depend on.
 
         Returns:
             Results of the parts, in order.
         """
-        # Of one size whoever does the work: what is computed together may differ in its last digit.
+        # Parts have one size everywhere: batching may change results in the last digit.
         cells = [People(first, min(first + PART, people)) for first in range(0, people, PART)]
         runner = Runner(
             self.folder,
@@ -102,7 +102,7 @@ class Workers:
         return found  # pyright: ignore[reportReturnType] - none is None
 
     def clean(self) -> None:
-        """Remove what was kept."""
+        """Remove stored results."""
         Runner(self.folder).clean()
 
     def _processes(self, people: int) -> int:

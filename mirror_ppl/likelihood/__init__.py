@@ -1,1 +1,1 @@
-"""The compilation of a human program and recorded rounds: what they say, computed at once."""
+"""Compilation of a human program and recorded rounds to tables of their likelihood."""

@@ -1,9 +1,9 @@
-"""A trial that what engines compute of a human model is its program, number by number.
+"""Check that the density that engines compute for a human model equals that of its program.
 
-Every site of ``prior`` and ``act`` has the same density for a person whoever else there is. And
-made-up rounds have a density under the program, run as it is for one draw at a time, and another
-one that is put together as engines do it, for all draws at once. Both are the same unless a method
-says something that the parts leave out, count twice, or take from somebody else.
+Every site of ``prior`` and ``act`` must have the same density for a person alone and among others.
+The density of made-up rounds is computed twice: by running the program for one draw at a time, and
+by combining its parts for all draws at once, as engines do. They differ if a method adds something
+that engines leave out or count twice, or if it depends on other people.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from mirror_ppl.models.sites import latent_sites, sample_nodes
 DRAWS, ROUNDS, STEPS = 6, 2, 4
 SEED = 0
 TOLERANCE = 1e-3
-"""In nats, and of what the density is; both are sums of the same numbers in 32 bits."""
+"""Absolute (nats) and relative; both densities are sums of the same numbers in 32 bits."""
 COMPARED = 16
-"""Draws of two people, of whom each is compared with all of them."""
+"""Draws of two people; each person alone is compared with all of them together."""
 OF_A_SITE = 2e-5
-"""As TOLERANCE, of one site."""
+"""Tolerance for one site, absolute (nats) and relative."""
 
 
 @torch.no_grad()
 def check_agreement(human: HumanModel) -> None:
-    """Compare the densities.
+    """Compare the densities of a human model.
 
     Raises:
         HumanModelError: they differ.
@@ -69,7 +69,7 @@ def check_agreement(human: HumanModel) -> None:
 
 
 def _check_each_alone(human: HumanModel) -> None:
-    """Compare every site of ``prior`` and ``act`` of each of some people with that of all."""
+    """Compare every site of ``prior`` and ``act`` for people alone and for all of them together."""
     draws = draw_prior(human, 2, COMPARED, SEED)
     together, again = (_said_by_site(human, draws, COMPARED, 2, seed) for seed in range(2))
     for (method, name), value in together.items():
@@ -106,7 +106,7 @@ def _said_by_site(
 ) -> dict[tuple[str, str], Tensor]:
     """Log densities ``[S, P, B]`` by method and site, of draws ``[S, P, 1, ...]`` and one belief.
 
-    Of an action, that of the first one.
+    The recorded action is the first one of the domain.
     """
     generator = torch.Generator().manual_seed(SEED)
     like = next(human.parameters())
@@ -135,7 +135,7 @@ def _said_by_site(
 
 
 def made_up_rounds(domain: Domain, device: torch.device) -> Demonstrations:
-    """Short rounds of one person, of arbitrary actions and messages; always the same."""
+    """Short rounds of one person with random actions and messages; deterministic."""
     generator = torch.Generator(device).manual_seed(SEED)
     steps = min(STEPS, domain.horizon)
     actions = torch.randint(
@@ -169,15 +169,15 @@ def made_up_rounds(domain: Domain, device: torch.device) -> Demonstrations:
 def log_densities(
     human: HumanModel, rounds: Demonstrations, draws: Mapping[str, Tensor]
 ) -> tuple[Tensor, Draws]:
-    """Of the program as it is, for each of some draws by itself.
+    """Run the program for one draw at a time, and return its log densities.
 
     Args:
         human: the model of people.
-        rounds: of one person.
+        rounds: rounds of one person.
         draws: values ``[S, 1, 1, ...]`` of all sites of ``prior``.
 
     Returns:
-        Log densities ``[S]``, and the latents of rounds ``[S, 1, B]`` that they are of.
+        Log densities ``[S]``, and the sampled latents of rounds ``[S, 1, B]``.
     """
     found, latents = [], []
     number = len(next(iter(draws.values()), (0,)))
@@ -198,7 +198,7 @@ def log_densities(
 
 
 def said_of_made_up_rounds(human: HumanModel) -> list[str]:
-    """Log densities of made-up rounds to five digits: they tell a program from another one."""
+    """Log densities of made-up rounds to five digits, as a fingerprint of a program."""
     rounds = made_up_rounds(human.domain, next(human.parameters()).device)
     found, _ = log_densities(human, rounds, draw_prior(human, 1, DRAWS, SEED))
     return [f"{value:.5g}" for value in found.tolist()]
@@ -210,7 +210,7 @@ def _put_together(
     draws: Mapping[str, Tensor],
     latents: Mapping[str, Tensor],
 ) -> Tensor:
-    """Log densities ``[S]`` of the same, of the parts that engines compute."""
+    """Log densities ``[S]`` of the rounds and draws, combined as engines do."""
     read = perceived_sites(human)
     number, every = DRAWS, torch.arange(DRAWS, device=rounds.actions.device)
     policy = {name: value for name, value in draws.items() if name not in read}
@@ -252,7 +252,7 @@ def _beliefs(
     grid: Mapping[str, Tensor],
     latents: Mapping[str, Tensor],
 ) -> list[BeliefState]:
-    """After each step, of somebody of each draw in each round, ``[S B]``."""
+    """Beliefs after each step under each draw in each round, ``[S B]``."""
     number, count = DRAWS, rounds.shape[1]
     implants = {name: value.repeat_interleave(count) for name, value in grid.items()}
     implants |= {name: value.flatten() for name, value in latents.items()}

@@ -1,21 +1,21 @@
-"""Values of what differs from round to round, chosen to stand for all there could be.
+"""Weighted samples of the latents of a round (attention), to sum them out approximately.
 
 A person's attention ``m`` in a round cannot be enumerated: its sites have too many combinations of
 values. Sums over them, ``sum_m p(m | psi) f(m)``, are estimated from G values, the same for all
-``psi``, so that what is estimated is smooth in ``psi``. Values are drawn without replacement from a
-product ``q`` of one distribution for each site, and each is weighted by the inverse of the
-probability ``pi(m)`` with which it is among those drawn::
+``psi``, so that the estimate is smooth in ``psi``. Values are drawn without replacement from a
+product ``q`` of one distribution for each site, and each is weighted by the inverse of its
+inclusion probability ``pi(m)``::
 
     sum_m p(m | psi) f(m)  ~=  sum_g w_g f(m_g),    w_g = p(m_g | psi) / pi(m_g)
 
-which is right on average whatever ``q`` is, and exact where there are no more combinations than are
-kept. Divided by ``sum_g w_g`` it would not be: where ``q`` is what explains what was done, a
-``psi`` under which few of these values are probable would be favoured.
+The estimate is unbiased for every ``q``, and exact if all combinations are kept. Normalizing it by
+``sum_g w_g`` would bias it: since ``q`` depends on the recorded actions, it would favour a ``psi``
+under which few of these values are probable.
 
-Probable values are taken for certain and the improbable by systematic resampling (Fearnhead and
-Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by site. Of
-the G values, those that could explain what was done are kept in the same way. ``pi`` is the product
-of the probabilities with which a value was kept on the way.
+Values of high probability are kept with certainty, the others by systematic resampling (Fearnhead
+and Clifford, *On-line inference for hidden Markov models via particle filters*, 2003), site by
+site. The G values are then thinned in the same way to those that explain the recorded actions.
+``pi`` is the product of the probabilities with which a value was kept at each stage.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
 
 VALUES, KEPT = 512, 96
-"""Values of attention that stand for all in a round, and how many are kept for what was done."""
+"""Number of sampled values of attention per round, and how many are kept given the actions."""
 ANY_WAY, ANY_VALUE = 0.08, 0.02
-"""Shares of ``q`` for what is probable of anybody, and for everything alike."""
+"""Shares of ``q`` that follow the prior and a uniform distribution."""
 ANY_USE = 0.05
-"""Share of what is kept that goes to everything alike."""
+"""Share of the kept values that are chosen uniformly."""
 
 
 @dataclass(frozen=True)
 class AttentionValues:
-    """G values of what differs from round to round.
+    """G weighted values of the round latents of one round.
 
     Attributes:
-        values: of each site ``[G]``.
+        values: values of each site ``[G]``.
         log_weights: ``-log pi``, ``[G]``.
-        kept: which of them are looked at ``[G']``.
+        kept: indices of the values that are evaluated ``[G']``.
         log_kept: log-probability with which each of these was kept ``[G']``.
-        covariates: of the round, see `HumanModel.covariates`.
+        covariates: covariates of the round, see `HumanModel.covariates`.
     """
 
     values: dict[str, Tensor]
@@ -62,7 +62,7 @@ class AttentionValues:
         return len(self.log_weights)
 
     def thinned(self, useful: Tensor, number: int, seed: int) -> AttentionValues:
-        """With only so many kept, by how useful each of the G is, ``[G]``, adding up to 1."""
+        """Keep ``number`` of the G values, sampled by their usefulness ``[G]``, which sums to 1."""
         generator = torch.Generator(useful.device).manual_seed(seed)
         shares = (1 - ANY_USE) * useful + ANY_USE / len(self)
         kept, log_kept = _resampled(shares.double().log(), number, generator)
@@ -81,7 +81,7 @@ def attention_sites(human: HumanModel) -> dict[str, Tensor]:
 
 
 def attention_nodes(human: HumanModel, implants: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Nodes of the sites of attention in one round; runs inside the person plate."""
+    """Trace nodes of the sites of attention in one round; runs inside the person plate."""
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
         human.round_latents(implants)
     return latent_sites(trace.trace)
@@ -93,13 +93,13 @@ def site_probabilities(
     weights: Tensor | None = None,
     covariates: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:
-    """How probable each value of each site of attention is, ``[n]``.
+    """Probability of each value of each site of attention, ``[n]``, averaged over draws.
 
     Args:
         human: the model of people.
-        policies: draws ``[W, 1, 1, ...]`` of implants; those of sites that are left out are drawn.
-        weights: of each of them ``[W]``; alike unless given.
-        covariates: of the round, see `HumanModel.covariates`.
+        policies: draws ``[W, 1, 1, ...]`` of implants; missing sites are sampled.
+        weights: weights of the draws ``[W]``; equal by default.
+        covariates: covariates of the round, see `HumanModel.covariates`.
     """
     number = len(next(iter(policies.values())))
     with (
@@ -129,10 +129,10 @@ def choose_values(
     """Draw values from the product of distributions, without replacement.
 
     Args:
-        supports: of each site ``[n]``.
+        supports: support of each site ``[n]``.
         chances: probabilities of these values ``[n]``, none of them 0.
-        number: of values G; fewer if there are no more combinations.
-        generator: source of the draws.
+        number: number of values G; fewer if there are fewer combinations.
+        generator: source of randomness.
     """
     device = generator.device
     places = torch.zeros(1, 0, dtype=torch.long, device=device)
@@ -164,14 +164,14 @@ def choose_values(
 def _resampled(
     log_weights: Tensor, number: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Which of N are kept, ``number`` of them, and the log-probability with which each was."""
+    """Resample ``number`` of N without replacement: indices, and log inclusion probabilities."""
     if len(log_weights) <= number:
         return torch.arange(len(log_weights), device=log_weights.device), log_weights * 0
     weights = torch.softmax(log_weights, 0)
     # The probability is min(1, scale * weight), with the scale that adds up to the number.
     ordered = weights.sort(descending=True).values
     certain = torch.arange(number, device=weights.device)
-    rest = 1 - ordered.cumsum(0)[:number] + ordered[:number]  # what is left with so many certain
+    rest = 1 - ordered.cumsum(0)[:number] + ordered[:number]  # left if so many are certain
     scale = (number - certain) / rest
     enough = scale * ordered[:number] <= 1
     scale = scale[int(enough.long().argmax())] if bool(enough.any()) else scale[-1]
@@ -183,13 +183,13 @@ def _resampled(
 
 
 class Proposal:
-    """Proposes values of attention for round after round of a person.
+    """Proposes values of attention for the rounds of a person, one by one.
 
     Args:
         human: the model of people; it has round latents.
         anybody: draws ``[W, 1, 1, ...]`` of implants from the prior.
-        likely: draws of what this person may be like; unknown unless given.
-        number: of values G.
+        likely: approximate posterior draws of this person, if available.
+        number: number of values G.
     """
 
     def __init__(
@@ -213,14 +213,14 @@ class Proposal:
         covariates: Mapping[str, Tensor] | None = None,
         log_proposal: Mapping[str, Tensor] | None = None,
     ) -> AttentionValues:
-        """Values for a round.
+        """Sample values for a round.
 
         Args:
-            weights: of the draws from the prior, as the rounds so far have it, ``[W]``; looked at
-                unless it is known what the person may be like.
-            seed: of the draws.
-            covariates: of the round, see `HumanModel.covariates`.
-            log_proposal: of what was done, see `HumanModel.log_proposal`.
+            weights: weights of the prior draws given the rounds so far, ``[W]``; ignored if
+                ``likely`` was given.
+            seed: seed of the draws.
+            covariates: covariates of the round, see `HumanModel.covariates`.
+            log_proposal: proposal given the recorded actions, see `HumanModel.log_proposal`.
         """
         covariates = dict(covariates or {})
         prior = self._known("anybody", self.anybody, covariates)
@@ -242,7 +242,7 @@ class Proposal:
     def _known(
         self, whom: str, draws: Mapping[str, Tensor], covariates: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Probabilities of values; the same for the same covariates."""
+        """Probabilities of values, cached by covariates."""
         key = (whom, *((name, *value.flatten().tolist()) for name, value in covariates.items()))
         if key not in self._found:
             self._found[key] = site_probabilities(self.human, draws, None, covariates)

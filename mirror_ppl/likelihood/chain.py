@@ -1,16 +1,16 @@
-"""Attention that is read at one stretch of a round after another, summed out exactly.
+"""Exact marginalization of attention that is read span by span.
 
-Where each site of ``round_latents`` counts at certain steps only (its :class:`Span`), what a person
-may have attended to need not be gone through combination by combination. What is left of the values
-read so far is the belief and the knowledge that they led to; many lead to the same. So the sum runs
-from the end of the round to its beginning, over *states* in which a span may begin::
+Where each site of ``round_latents`` is read at certain steps only (its :class:`Span`), attention
+need not be enumerated combination by combination. The values read so far matter only through the
+belief and the knowledge that they led to, and many values lead to the same. The sum therefore runs
+backwards through the round, over the *states* in which a span may begin::
 
     L_i(h) = sum_m p(m_i = m | psi) prod_{t in span i} p(a_t | zH_t(h, m)) L_{i+1}(h'(h, m))
 
 where ``h'`` is the state in which the next span begins. This is the forward-backward recursion of
-hidden Markov models (Rabiner, *A tutorial on hidden Markov models*, 1989), with spans for steps.
+hidden Markov models (Rabiner, *A tutorial on hidden Markov models*, 1989), with spans as steps.
 
-P stands for people, B for their rounds, S for states, K for values, V for views.
+Dimensions: P people, B rounds, S states, K values, V views.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from mirror_ppl.models.human import HumanModel, Implants
 NO_VALUE = -1
 """Index of a value in padding."""
 NEVER = -1e30
-"""Logarithm of as good as no probability; finite, so that gradients are numbers."""
+"""Log-probability that stands for 0; finite, so that gradients are finite."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """All that may happen at the span of one site.
+    """Transitions at the span of one site: from each state, by each value.
 
     Attributes:
-        view: of the steps of that span, ``[P, S, K]``, an index into the V views.
-        value: that leads to it, an index into what :meth:`Chain.log_chances` gives of the site,
+        view: view of the span's steps, ``[P, S, K]``, an index into the V views.
+        value: the value that leads to it, an index into the site's :meth:`Chain.log_chances`,
             ``[P, S, K]``; ``NO_VALUE`` in padding.
-        following: the state in which the next span begins ``[P, S, K]``; of no meaning at the last.
-        rounds: the round of each state ``[P, S]``; ``NO_VALUE`` in padding.
+        following: state in which the next span begins ``[P, S, K]``; unused at the last span.
+        rounds: round of each state ``[P, S]``; ``NO_VALUE`` in padding.
     """
 
     view: Tensor
@@ -50,20 +50,20 @@ class Level:
     rounds: Tensor
 
     def at(self, states: Tensor) -> Level:
-        """Only some states ``[s]``."""
+        """Select states ``[s]``."""
         return Level(*(part[:, states] for part in vars(self).values()))
 
 
 @dataclass(frozen=True)
 class Chain:
-    """What people may have attended to in their rounds, span after span.
+    """Attention of people in their rounds, as a chain of spans.
 
     A combination of a person's implants has one *sight* of a round: a state of the first level.
 
     Attributes:
-        supports: of the sites of ``round_latents``, ``[n]``, in the order of their spans.
-        levels: of each site.
-        covariates: of the rounds ``[P, B]``, see `HumanModel.covariates`.
+        supports: supports of the sites of ``round_latents``, ``[n]``, in the order of their spans.
+        levels: one level for each site.
+        covariates: covariates of the rounds ``[P, B]``, see `HumanModel.covariates`.
     """
 
     supports: Mapping[str, Tensor]
@@ -78,16 +78,16 @@ class Chain:
     def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
         """Log-probabilities of values ``[..., P, B, I, 2 n]`` of the I sites.
 
-        Of each value, then of each value or any that follows it. Runs inside the person plate.
+        First of each value, then of it or any later one. Runs inside the person plate.
 
         Args:
             human: the model of people.
             implants: as :meth:`HumanModel.prior` returned them, ``[..., P, 1]``.
-            rounds: B.
+            rounds: number of rounds B.
         """
         people = self.levels[0].view.shape[0]
         most = max(len(support) for support in self.supports.values())
-        # Shorter supports are filled up with their last value, which is then left out.
+        # Shorter supports are padded with their last value, which is then dropped.
         values = {
             name: torch.cat([support, support[-1:].expand(most - len(support))]).expand(
                 people, rounds, most
@@ -112,10 +112,10 @@ class Chain:
         return torch.stack(torch.broadcast_tensors(*parts), -2)
 
     def marginal(self, likelihoods: Tensor, log_chances: Tensor) -> Tensor:
-        """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.
+        """Log-likelihood ``[..., P, U]`` of sights, given that of views ``[..., P, V]``.
 
         Args:
-            likelihoods: of the recorded actions under each view.
+            likelihoods: log-likelihood of the recorded actions under each view.
             log_chances: see :meth:`log_chances`.
         """
         after = None
@@ -129,13 +129,13 @@ class Chain:
         return after
 
     def chances(self, log_chances: Tensor, number: int) -> Tensor:
-        """Of the values of one level, ``[..., P, S, K]``; see :meth:`log_chances`."""
+        """Log-probabilities of one level's values, ``[..., P, S, K]``; see :meth:`log_chances`."""
         level, own = self.levels[number], log_chances[..., number, :]
         place = level.rounds[..., None].clamp(min=0) * own.shape[-1] + level.value.clamp(min=0)
         return _taken(own.flatten(-2), place)
 
     def kept(self, sights: Tensor) -> tuple[Chain, Tensor]:
-        """Of one person only some sights ``[u]``, and the views ``[v]`` that they lead to."""
+        """Select sights ``[u]`` of one person; also returns the views ``[v]`` that they lead to."""
         levels, states = [], sights
         for level in self.levels:
             own = level.at(states)
@@ -148,7 +148,7 @@ class Chain:
         return replace(self, levels=tuple(levels)).of_views(place), views
 
     def of_views(self, place: Tensor) -> Chain:
-        """With the view ``place[v]`` for each view v."""
+        """Renumber views: v becomes ``place[v]``."""
         levels = tuple(
             replace(
                 one, view=place[torch.where(one.value == NO_VALUE, one.view[0, 0, 0], one.view)]
@@ -158,7 +158,7 @@ class Chain:
         return replace(self, levels=levels)
 
     def of_person(self, person: int) -> Chain:
-        """Of one of the P people."""
+        """Select one of the P people."""
         levels = tuple(
             Level(*(part[person : person + 1] for part in vars(level).values()))
             for level in self.levels
@@ -168,7 +168,7 @@ class Chain:
 
     @classmethod
     def one_after_another(cls, rounds: Sequence[Chain], views: Sequence[int]) -> Chain:
-        """Of one person's rounds, of which each has so many ``views``."""
+        """Concatenate the chains of one person's rounds, with ``views`` views each."""
         begins = [sum(views[:place]) for place in range(len(views))]
         levels = []
         for number in range(len(rounds[0].levels)):
@@ -198,7 +198,7 @@ class Chain:
 
     @classmethod
     def of_people(cls, people: Sequence[Chain]) -> Chain:
-        """Of P people, of each of whom there is one, with covariates of as many rounds."""
+        """Stack the chains of P people, whose covariates have the same number of rounds."""
         levels = []
         for own in zip(*(chain.levels for chain in people), strict=True):
             states = max(level.view.shape[1] for level in own)
@@ -221,7 +221,7 @@ class Chain:
 
 
 def _padded(parts: Sequence[Tensor], states: int, width: int, fill: int) -> Tensor:
-    """Of P people ``[1, s, k]`` as ``[P, states, width]``."""
+    """Pad and stack parts ``[1, s, k]`` of P people to ``[P, states, width]``."""
     return torch.cat(
         [
             pad(part, [0, width - part.shape[2], 0, states - part.shape[1]], value=fill)
@@ -231,23 +231,23 @@ def _padded(parts: Sequence[Tensor], states: int, width: int, fill: int) -> Tens
 
 
 def _log_sum_exp(values: Tensor) -> Tensor:
-    """As `torch.logsumexp` of the last dimension, in a third of the time where much is padding.
+    """`torch.logsumexp` over the last dimension, in a third of the time if most is padding.
 
-    What is as good as nothing beside the largest is taken for e**-80 of it, because exponentials
-    that underflow are slow.
+    Terms below e**-80 of the largest are raised to that, because exponentials that underflow are
+    slow.
     """
     highest = values.amax(-1, keepdim=True).detach()
     return (values - highest).clamp(min=-80.0).exp().sum(-1).log() + highest.squeeze(-1)
 
 
 def _taken(values: Tensor, place: Tensor) -> Tensor:
-    """Of values ``[..., P, n]`` those at ``[P, S, K]``: ``[..., P, S, K]``."""
+    """Gather values ``[..., P, n]`` at indices ``[P, S, K]``: ``[..., P, S, K]``."""
     found = values.gather(-1, place.flatten(-2).expand(*values.shape[:-1], -1))
     return found.unflatten(-1, place.shape[-2:])
 
 
 def _renumbered(following: Tensor, real: Tensor) -> tuple[Tensor, Tensor]:
-    """The states that are reached ``[s]``, and what follows, numbered among them."""
+    """Reached states ``[s]``, and ``following`` as indices into them."""
     states = following[real].unique()
     place = states.new_zeros(int(following.max()) + 1)
     place[states] = torch.arange(len(states), device=states.device)

@@ -1,8 +1,8 @@
-"""The views of rounds span by span, where it is known when each site of attention is read.
+"""Views of rounds span by span, for models that declare when each site of attention is read.
 
-What is left of all that a person may have attended to so far is a belief, what the domain says they
-know, and the values that are read throughout the round. Histories that agree in that are one state
-(:mod:`mirror_ppl.likelihood.chain`). Rounds are gone through together, step by step.
+A history of attention matters only through the belief, the domain's knowledge, and the values that
+are read throughout the round. Histories that agree in these are one state
+(:mod:`mirror_ppl.likelihood.chain`). Rounds are processed together, step by step.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 def chained_views(
     human: HumanModel, combinations: Mapping[str, Tensor], number: int, rounds: Rounds
 ) -> tuple[ManyViews, list[Chain]]:
-    """The distinct views of R rounds, and of each a chain of one sight for each combination.
+    """Compute the distinct views of R rounds, and for each round a chain with M sights.
 
     Args:
         human: the model of people; its attention is :attr:`HumanModel.chained`.
         combinations: values ``[M]`` of the discrete implants.
-        number: M.
-        rounds: of one person.
+        number: number of combinations M.
+        rounds: rounds of one person.
 
     Returns:
-        The views, and chains that lead to these, by their number among those of the round.
+        The views, and chains; these index views within their round.
 
     Raises:
         HumanModelError: ``spans`` breaks its contract.
@@ -86,23 +86,23 @@ def chained_views(
 
 @dataclass
 class _RoundWays:
-    """All ways in which a person may go through one round, up to some step.
+    """All distinct histories of attention in one round, up to some step.
 
     Attributes:
-        round: its number.
-        supports: of the sites of attention ``[n]``.
+        round: number of the round.
+        supports: supports of the sites of attention ``[n]``.
         combinations: values ``[M]`` of the discrete implants.
-        spans: of the sites of attention.
-        steps: of the round.
-        covariates: of the round ``[1, 1]``.
-        combination: of which each of n ways is, ``[n]``.
-        belief: the number of the belief of each way ``[n]``.
-        knowledge: what is known by it ``[n]``.
+        spans: spans of the sites of attention.
+        steps: number of steps of the round.
+        covariates: covariates of the round ``[1, 1]``.
+        combination: combination of each of n histories, ``[n]``.
+        belief: number of the belief of each history ``[n]``.
+        knowledge: knowledge of each history ``[n]``.
         implants: the values that are read now, ``[n]``.
         throughout: those of them that are read throughout the round ``[n]``.
-        moments: of the span that is under way ``[n, T]``.
-        rows: moments of the spans before.
-        levels: of the spans before.
+        moments: moments of the current span ``[n, T]``.
+        rows: moments of earlier spans.
+        levels: levels of earlier spans.
     """
 
     round: int
@@ -124,28 +124,28 @@ class _RoundWays:
 
     @property
     def end(self) -> int:
-        """The step before which the span that is under way ends."""
+        """End of the current span (exclusive)."""
         return self._begins[len(self.levels) + 1]
 
     @property
     def chain(self) -> Chain:
-        """All spans, when the round is over."""
+        """The chain of all spans, once the round is over."""
         return Chain(self.supports, tuple(self.levels), self.covariates)
 
     def go_on(self, step: int) -> None:
-        """Go on to the spans that begin before a step."""
+        """Advance to the span that begins at this step, if one does."""
         while len(self.levels) < len(self.spans) and self.end == step:
             self._merge()
             if len(self.levels) < len(self.spans):
                 self._branch()
 
     def take(self, state: BeliefState, moments: Tensor, steps: slice) -> None:
-        """What people of each way believe after some steps."""
+        """Store the beliefs and moments of each history after some steps."""
         self.belief, self.knowledge = state.belief, state.knowledge
         self.moments[:, steps] = moments[:, steps]
 
     def _branch(self) -> None:
-        """Each way goes on with each value that is read at the span that begins."""
+        """Begin a span: continue each history with each value of its site."""
         site, span = list(self.spans.items())[len(self.levels)]
         states = len(self.combination)
         parent = torch.arange(states, device=self.belief.device).repeat_interleave(span.values)
@@ -165,7 +165,7 @@ class _RoundWays:
         self._shape = (1, states, span.values)
 
     def _merge(self) -> None:
-        """The span is over: ways that lead to the same are one from now on."""
+        """End the span: merge histories that lead to the same state."""
         device = self.belief.device
         others = [self.combination, *map(as_whole_numbers, self.throughout.values())]
         state = replace(self.start, belief=self.belief, knowledge=self.knowledge)

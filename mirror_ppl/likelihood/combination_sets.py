@@ -1,7 +1,7 @@
-"""Combinations of discrete implants that have seen the same in every round, taken together.
+"""Sets of combinations of discrete implants that have the same view of every round.
 
-Nothing recorded tells them apart, so their likelihood is one and their posterior is their prior.
-After few rounds there are far fewer sets of them than combinations.
+The recordings do not distinguish them: they have the same likelihood, so within a set the posterior
+is proportional to the prior. After few rounds there are far fewer sets than combinations.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import distinct_rows
 
 TRIED = 8
-"""Draws of other implants under which priors of combinations are compared,"""
+"""Draws of other implants under which priors of combinations are compared."""
 COMPARED = 256
-"""of so many combinations, some of all."""
+"""Combinations in that comparison, a random subset."""
 
 
 @torch.no_grad()
@@ -36,7 +36,7 @@ def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
     found = dependencies(human)
     for name, parents in found.prior.items():
         if name in grid or parents & grid.keys():
-            # What scales or masks a sampled site depends on its value, too.
+            # Scales and masks of a sampled site may depend on its own value.
             own = {name} & found.latent
             if (parents | own) - grid.keys():
                 return None
@@ -47,7 +47,7 @@ def fixed_prior(human: HumanModel, grid: Mapping[str, Tensor]) -> Tensor | None:
     some = order[:COMPARED].to(next(human.parameters()).device)
     few = {name: value[some] for name, value in grid.items()}
     tried = log_priors(human, few, policy, 1)[:, 0]
-    # Provenance is lost where parts of a tensor are assigned.
+    # Tracking of dependencies misses in-place assignment to parts of a tensor.
     if bool((tried != tried[:1]).any()):
         return None
     return log_priors(human, grid, {}, 1)[0, 0]
@@ -59,12 +59,12 @@ class EquivalentCombinations:
 
     Attributes:
         first: one combination of each set, ``[G]``.
-        log_prior: of each set, ``[G]``; 0 where priors of combinations differ from draw to draw of
-            the other implants, in which case every combination is a set of its own.
-        fixed: whether priors do not.
+        log_prior: log prior of each set, ``[G]``; 0 if priors of combinations depend on the other
+            implants, in which case every combination is a set of its own.
+        fixed: True if priors do not depend on the other implants.
         members: the combinations, set after set, ``[C]``.
-        share: prior probability of all members up to each, ``[C]``.
-        end: how many members there are up to each set, ``[G]``.
+        share: cumulative prior probability of the members, ``[C]``.
+        end: cumulative number of members of the sets, ``[G]``.
     """
 
     first: Tensor
@@ -76,7 +76,7 @@ class EquivalentCombinations:
 
     @classmethod
     def of(cls, table: ViewTable, log_prior: Tensor | None) -> EquivalentCombinations:
-        """Of the possible combinations of a table of one person.
+        """Group the possible combinations of a table of one person.
 
         Args:
             table: views of the person's rounds.
@@ -90,10 +90,10 @@ class EquivalentCombinations:
             return cls(combinations, none, False, combinations, number.double(), number)
         own = log_prior[combinations]
         first, which = distinct_rows(table.index[0][:, combinations].T)
-        # In the order of combinations, however views are numbered.
+        # In the order of combinations, independent of how views are numbered.
         first, place = first.sort()
         which = place.argsort()[which]
-        # Relative to the largest: many observations of a person may make all of them tiny.
+        # Relative to the largest, since many observations may make all of them tiny.
         largest = own.max()
         prior = (own.double() - largest).exp()
         order = which.argsort(stable=True)
@@ -111,7 +111,7 @@ class EquivalentCombinations:
         return len(self.first)
 
     def kept(self, sets: Tensor) -> EquivalentCombinations:
-        """Only some sets ``[G]``, as truth values."""
+        """Select sets by a mask ``[G]``."""
         some = sets.repeat_interleave(self.sizes)
         chance = self.share.diff(prepend=self.share.new_zeros(1))
         return replace(
@@ -125,15 +125,15 @@ class EquivalentCombinations:
 
     @property
     def sizes(self) -> Tensor:
-        """Members of each set ``[G]``."""
+        """Number of members of each set ``[G]``."""
         return self.end.diff(prepend=self.end.new_zeros(1))
 
     def draw(self, sets: Tensor) -> Tensor:
-        """One combination of each of these sets ``[n]``, by its prior; from the global state."""
+        """Draw a combination of each of these sets ``[n]`` by its prior (global random state)."""
         upper = self.share[self.end - 1]
         lower = upper.roll(1).index_fill(0, self.end.new_zeros(1), 0)
         place = lower[sets] + (upper - lower)[sets] * torch.rand_like(upper[sets])
         chosen = torch.searchsorted(self.share, place)
         begin = (self.end - self.sizes)[sets]
-        # Rounding may lead over the border.
+        # Rounding may lead into a neighbouring set.
         return self.members[torch.minimum(torch.maximum(chosen, begin), self.end[sets] - 1)]

@@ -43,14 +43,14 @@ def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
 
 
 def require_own_attention(human: HumanModel, sites: Iterable[str]) -> None:
-    """Refuse models whose attention depends on what people see otherwise.
+    """Refuse models whose round latents depend on perceptual implants.
 
     Args:
         human: the model of people.
         sites: names of the discrete sites that ``perceive`` reads.
 
     Raises:
-        HumanModelError: it does.
+        HumanModelError: a round latent depends on one of the sites.
     """
     for name, parents in dependencies(human).round_latents.items():
         if parents & set(sites):
@@ -61,7 +61,7 @@ def require_own_attention(human: HumanModel, sites: Iterable[str]) -> None:
 
 
 def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
-    """Supports ``[n]`` of those discrete sites that ``perceive`` reads, in the program's order.
+    """Supports ``[n]`` of the discrete sites that ``perceive`` reads, in the program's order.
 
     Raises:
         HumanModelError: ``perceive`` reads a site that cannot be enumerated, one whose values are
@@ -89,11 +89,11 @@ _unread: WeakKeyDictionary[HumanModel, tuple[Sites, Sites]] = WeakKeyDictionary(
 
 
 def unread_sites(human: HumanModel, supports: Mapping[str, Tensor] | None = None) -> Sites:
-    """Those discrete sites of the prior that ``perceive`` does not read, in rounds of some kinds.
+    """Discrete sites of the prior that ``perceive`` does not read in some trial rounds.
 
     Args:
         human: the model of people.
-        supports: of all discrete sites; those for which this was found last unless given.
+        supports: supports of all discrete sites; by default those of the last call.
 
     Raises:
         HumanModelError: ``perceive`` reads a site that cannot be enumerated.
@@ -107,7 +107,7 @@ def unread_sites(human: HumanModel, supports: Mapping[str, Tensor] | None = None
 
 
 def _read(human: HumanModel, supports: Mapping[str, Tensor]) -> set[str]:
-    """Sites that ``perceive`` reads, where nothing is communicated and where all that can be is."""
+    """Sites that ``perceive`` reads in a round without messages and in one with all messages."""
     domain, device = human.domain, next(human.parameters()).device
     sites = {**supports, **attention_sites(human)}
     implants = Readable({name: support[:1] for name, support in sites.items()})
@@ -131,7 +131,7 @@ def require_unread(human: HumanModel, names: Iterable[str]) -> None:
     """Refuse sites that ``perceive`` reads.
 
     Raises:
-        InputError: one of these is such a site.
+        InputError: ``perceive`` reads one of these.
     """
     read = perceived_sites(human)
     for name in names:
@@ -143,10 +143,10 @@ def require_unread(human: HumanModel, names: Iterable[str]) -> None:
 
 
 def grid_of(supports: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Values ``[M]`` of sites, one for each combination, row-major."""
+    """Values ``[M]`` of sites for each of their M combinations, row-major."""
     if not supports:
         return {}
-    # Of places, since supports may be of different kinds of numbers.
+    # A grid of indices, since supports may have different dtypes.
     places = [torch.arange(len(support), device=support.device) for support in supports.values()]
     axes = torch.meshgrid(*places, indexing="ij")
     return {
@@ -161,12 +161,12 @@ def log_priors(
 ) -> Tensor:
     """Log prior probability ``[S, P, M]`` of each combination.
 
-    With all that ``prior`` observes, adds by a factor, scales or masks, as far as it depends on
-    these sites; the rest is :func:`mirror_ppl.likelihood.densities.log_correction`.
+    Includes factors, observed sites, scales and masks of ``prior`` that depend on these sites; the
+    rest is :func:`mirror_ppl.likelihood.densities.log_correction`.
 
     Args:
         human: the model of people.
-        grid: values ``[M]`` of the discrete sites; others are not looked at.
+        grid: values ``[M]`` of the discrete sites.
         draws: values of all other sites ``[S, P, 1, ...]``, on which the prior may depend.
         people: number of people P.
 
@@ -200,9 +200,9 @@ def _log_prior(node: Any, value: Tensor) -> Tensor:
     """Log-probability ``[M, S, P, 1]`` of values ``[M]``; S may be 1 if draws do not differ."""
     fn = node["fn"]
     plain = node["mask"] is None and isinstance(node["scale"], (int, float))
-    if len(fn.batch_shape) > BATCH or not plain:  # depends on other discrete sites, perhaps
+    if len(fn.batch_shape) > BATCH or not plain:  # may depend on other discrete sites
         return log_prob(node)
-    # The prior of most sites has nothing to do with others, so that it is one table.
+    # The prior of most sites depends on no other site, so that it is one table.
     values, index = value.unique(return_inverse=True)
     table = fn.log_prob(values[:, None, None, None])
     if (table == table[:, :1]).all():

@@ -1,8 +1,8 @@
 """A human program with recorded rounds, ready for engines.
 
-:func:`compile` gives tables of views, on which perception and beliefs are worked out once. A human
-model that overrides ``model`` or ``choose`` is not what the tables compute, so it stays the program
-that it is: slower, and for the engines that run any Pyro program.
+:func:`compile` builds tables of views, so that perception and beliefs are computed once. A human
+model that overrides ``model`` or ``choose`` cannot be represented by tables. It is run as is, which
+is slower and limited to engines that run any Pyro program.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mirror_ppl.models.sites import discrete_names, latent_sites, sample_nodes
 
 
 class Compiled(ABC):
-    """What the recorded rounds of P people say under a human program.
+    """Recorded rounds of P people under a human program.
 
     Attributes:
         human: the model of people.
@@ -58,12 +58,12 @@ class Compiled(ABC):
     def log_joint(self, draws: Mapping[str, Tensor]) -> Tensor:
         """Log density ``[S, P]`` of draws ``[S, P, 1, ...]`` of all sites and of the rounds.
 
-        Latents of rounds are summed out.
+        Round latents are summed out.
         """
 
     @abstractmethod
     def predict(self, draws: Mapping[str, Tensor]) -> Tensor:
-        """Log-probabilities ``[S, P, B, T, A]`` of actions, given what was done before them."""
+        """Log-probabilities ``[S, P, B, T, A]`` of actions, each given the earlier ones."""
 
     @cached_property
     def discrete(self) -> set[str]:
@@ -97,12 +97,12 @@ class Compiled(ABC):
 
 
 class ViewTables(Compiled):
-    """Compiled to tables of views.
+    """A program compiled to tables of views.
 
     Args:
         human: the model of people.
-        table: of the rounds of P people.
-        builders: that made it, for each person, where rounds are to be added.
+        table: views of the rounds of P people.
+        builders: its builders, one for each person, if rounds are to be added.
     """
 
     def __init__(
@@ -122,14 +122,14 @@ class ViewTables(Compiled):
         TableProgram(self.human)(self.table)
 
     def restrict(self, alive: Tensor) -> None:
-        """Give up the combinations ``[P, M]`` of discrete sites that are not alive."""
+        """Drop the combinations ``[P, M]`` of discrete sites that are not alive."""
         self.table = restricted(self.table, alive)
 
     def add(self, rounds: Demonstrations) -> None:
-        """Take in more rounds of the same people.
+        """Add rounds of the same people.
 
         Args:
-            rounds: as many of each person as of the others.
+            rounds: the same number of rounds for each person.
 
         Raises:
             InputError: they were not compiled with ``growing=True``.
@@ -142,13 +142,13 @@ class ViewTables(Compiled):
 
     @cached_property
     def sums_over_combinations(self) -> bool:
-        """Whether every discrete site is one that perception reads, and nothing else reads it."""
+        """True if every discrete site is read by perception, and by nothing else."""
         sites = set(self.table.sites)
         return sites == set(discrete_sites(self.human)) == self.discrete
 
     @cached_property
     def acts_on_beliefs(self) -> bool:
-        """Whether what a person sees reaches their actions through beliefs alone."""
+        """True if percepts affect actions through beliefs alone."""
         return acts_on_beliefs(self.human, self.table.sites)
 
     @torch.no_grad()
@@ -165,7 +165,7 @@ class ViewTables(Compiled):
         return _added(sample_nodes(trace.trace).values(), number, self.people)
 
     def predict(self, draws: Mapping[str, Tensor]) -> Tensor:
-        """Log-probabilities ``[S, P, B, T, A]`` of actions, given what was done before them."""
+        """Log-probabilities ``[S, P, B, T, A]`` of actions, each given the earlier ones."""
         return predict_actions(self.human, self.table, draws)
 
     def _with_discrete(self, continuous: Mapping[str, Tensor]) -> Draws:
@@ -178,18 +178,18 @@ class ViewTables(Compiled):
 
 
 class Sequential(Compiled):
-    """Not compiled: the program itself, step after step.
+    """A program that is run as is, step by step, without compilation.
 
     Args:
         human: the model of people, whose ``model`` may be any Pyro program with the sites of
-            ``prior``, an observed site ``action_<t>`` for each step, and whatever else it observes.
-        rounds: of P people.
+            ``prior``, an observed site ``action_<t>`` for each step, and other observed sites.
+        rounds: rounds of P people.
 
     Raises:
         HumanModelError: it is not such a program.
 
     Attributes:
-        joint: sites outside of a plate of people, which say something of all of them together.
+        joint: sites outside of a plate of people, whose density is not a sum over people.
     """
 
     def __init__(self, human: HumanModel, rounds: Demonstrations) -> None:
@@ -210,7 +210,7 @@ class Sequential(Compiled):
         """Log density ``[S, P]`` of draws ``[S, P, 1, ...]`` of all sites and of the rounds.
 
         Raises:
-            HumanModelError: part of the density is of all people together.
+            HumanModelError: part of the density is not a sum over people.
         """
         if self.joint:
             raise HumanModelError(
@@ -229,7 +229,7 @@ class Sequential(Compiled):
         return total + _added(of_people, number, self.people)
 
     def predict(self, draws: Mapping[str, Tensor]) -> Tensor:
-        """Log-probabilities ``[S, P, B, T, A]`` of actions, given what was done before them."""
+        """Log-probabilities ``[S, P, B, T, A]`` of actions, each given the earlier ones."""
         number = len(next(iter(draws.values())))
         shape = (number, *self.rounds.shape[:2])
         so_far, found = torch.zeros(shape, device=self.rounds.actions.device), []
@@ -245,7 +245,7 @@ class Sequential(Compiled):
 
     @torch.no_grad()
     def _run(self, draws: Mapping[str, Tensor]) -> dict[str, dict]:
-        """Nodes of the program under draws ``[S, P, 1, ...]``; latents of rounds enumerated."""
+        """Trace nodes under draws ``[S, P, 1, ...]``, with round latents enumerated."""
         number = len(next(iter(draws.values())))
         with (
             poutine.block(),
@@ -258,7 +258,7 @@ class Sequential(Compiled):
         return sample_nodes(trace.trace)
 
     def _check(self) -> list[str]:
-        """Refuse programs that cannot be inferred; names of the sites of all people together."""
+        """Refuse programs that cannot be inferred; returns sites outside of the plate of people."""
         kind = type(self.human).__name__
         with torch.random.fork_rng(devices=[]), poutine.block():
             nodes = sample_nodes(poutine.trace(self.program).get_trace())
@@ -284,7 +284,7 @@ class Sequential(Compiled):
 
 
 def _of_rounds(node: Mapping[str, Any]) -> bool:
-    """Whether a site is one of each round, and not of each person."""
+    """True if a site is in the plate of rounds."""
     return -1 in _plates(node)
 
 
@@ -298,14 +298,14 @@ def _quoted(names: Iterable[str]) -> str:
 
 
 def _over_latents(values: Tensor, dimensions: int) -> Tensor:
-    """Sum, in logarithms, over the dimensions of latents of rounds, to the left of the others."""
+    """Log-sum-exp over the dimensions of round latents, which are leftmost."""
     while values.dim() > dimensions:
         values = values.logsumexp(0)
     return values
 
 
 def _added(nodes: Iterable[Mapping[str, Any]], number: int, people: int) -> Tensor:
-    """Log densities of nodes of each person, ``[S, P]``."""
+    """Sum of the nodes' log densities for each person, ``[S, P]``."""
     total: Tensor | int = 0
     for node in nodes:
         total = total + log_prob(node)
@@ -326,11 +326,11 @@ def compile(  # noqa: A001 - the word for it
 
     Args:
         human: the model of people.
-        rounds: of P people, of whom the same sites were measured, if any were.
-        screening: when to give up combinations of discrete sites on the way; never unless given.
-        likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`ViewTableBuilder`.
+        rounds: rounds of P people; measured sites, if any, must be the same for all of them.
+        screening: when to drop combinations of discrete sites during compilation; never by default.
+        likely: approximate posterior draws ``[S, P, 1, ...]``, see :class:`ViewTableBuilder`.
         report: called with the number of people done.
-        growing: whether rounds are to be added, for which more is kept in memory.
+        growing: True if rounds are to be added later, which takes more memory.
 
     Raises:
         HumanModelError: the model breaks its contract.

@@ -1,4 +1,4 @@
-"""What the class of a human model has to offer, tried before long work."""
+"""Check of the contract of human models, before long computations."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ AXES = (
 )
 """Names of dimensions and other variables in posterior files."""
 PREFIXES = ("told_", "truth_", "measured_")
-"""With which names of variables of recordings begin."""
+"""Prefixes of variables of recordings, which sites must not have."""
 
 
 @torch.no_grad()
 def check_contract(human: HumanModel) -> None:
-    """Try a human model on a made-up round, so that faults are found before long work.
+    """Run a human model on a made-up round, to find errors before long computations.
 
     Raises:
         HumanModelError: a method fails or returns the wrong thing; names the method and the line.
@@ -118,7 +118,7 @@ def check_contract(human: HumanModel) -> None:
 
 
 def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
-    """Runs inside the person plate, of people with a round each; of beliefs ``[P, Z]``."""
+    """Check ``act`` at beliefs ``[P, Z]``, one round per person; runs inside the person plate."""
     belief = belief[:, None]
     with WithoutSites("action_values"):
         values = human.action_values(belief)
@@ -147,7 +147,7 @@ def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
 
 
 def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[str, Tensor]:
-    """What differs from round to round, in one round of each ``[people]``."""
+    """Check ``round_latents``, and sample it in one round of each person, ``[people]``."""
     with poutine.block(), poutine.trace() as trace, pyro.plate("round", 1, dim=-1):
         returned = human.round_latents(implants)
     sites = latent_sites(trace.trace)
@@ -179,7 +179,7 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
 
 
 def _check_names(domain: Domain, sites: Iterable[str]) -> None:
-    """Refuse names of sites that posterior files have for something else, or cannot have."""
+    """Refuse names of sites that are reserved or invalid in posterior files."""
     taken = {*AXES, *(f"{m.name}_item" for m in domain.modalities)}
     taken |= {part for m in domain.modalities for part in (m.name, f"{m.name}_feature")}
     for name in sites:
@@ -187,7 +187,7 @@ def _check_names(domain: Domain, sites: Iterable[str]) -> None:
             raise HumanModelError(f'"{name}" cannot be the name of a site: use plain words')
         if name in taken or name.startswith(PREFIXES):
             raise HumanModelError(
-                f'"{name}" cannot be the name of a site: posterior files call something else so'
+                f'"{name}" cannot be the name of a site: posterior files reserve it'
             )
 
 
@@ -208,7 +208,7 @@ def _refuse_plates(trace: poutine.Trace) -> None:
 
 
 def _check_returned(method: str, returned: Mapping[str, Any], sites: Mapping[str, Any]) -> None:
-    """Refuse values under the name of a site that are not its own: engines go by the sites."""
+    """Refuse returned values that differ from the sampled ones: engines read the sites."""
     for name in returned:
         if name in sites:
             own = torch.as_tensor(sites[name]["value"])
@@ -221,13 +221,13 @@ def _check_returned(method: str, returned: Mapping[str, Any], sites: Mapping[str
 
 
 def _check_sites(trace: poutine.Trace, people: int) -> None:
-    """Refuse what could be sampled, but not inferred."""
+    """Refuse sites that can be sampled but not inferred."""
     _refuse_parameters(trace)
     _refuse_plates(trace)
     for name, site in sample_nodes(trace).items():
         if site["is_observed"]:
             value = torch.as_tensor(site["value"])
-            if value.numel():  # a factor has none
+            if value.numel():  # factors are empty
                 check_plates(name, value[(..., *(0,) * site["fn"].event_dim)], people)
             check_plates(name, log_prob(site), people)
     for name, site in latent_sites(trace).items():

@@ -1,8 +1,8 @@
 """Log densities of runs of a human program, as Pyro counts them.
 
-Whatever a program samples, observes or adds by ``pyro.factor`` is a site of its trace, with the
-scale and the mask of the handlers around it. What engines compute is made of these sites, so
-nothing that a method of a human model says is left out.
+Everything that a program samples, observes or adds by ``pyro.factor`` is a site of its trace, with
+the scale and the mask of the handlers around it. Engines compute densities from these sites, which
+include everything that the methods of a human model add.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from mirror_ppl.models.human import ACTION, HumanModel, require_standard_program
 from mirror_ppl.models.sites import sample_nodes
 
 BATCH = 3
-"""Dimensions of draws, people and their rounds; combinations of discrete values go before them."""
+"""Dimensions of draws, people and rounds; combinations of discrete values are to their left."""
 PLATES = 2
-"""People and their rounds; what is summed over goes to the left of them."""
+"""Dimensions of people and rounds; enumerated sites are to their left."""
 SPARE = 6
 """Dimensions that draws and enumeration may take to the left of people and rounds."""
 
@@ -33,10 +33,10 @@ def require_compilable(human: HumanModel) -> None:
     """Refuse human models whose program is not the one that is compiled.
 
     Raises:
-        HumanModelError: this is one.
+        HumanModelError: the model overrides its program.
     """
     require_standard_program(human, "be compiled")
-    # Of data of several people it is noticed here that they are no one person's.
+    # Observed data of several people have the wrong shape for one person.
     for name, node in prior_nodes(human, {}, 1, 1).items():
         check_plates(name, log_prob(node), 1)
 
@@ -48,9 +48,9 @@ def log_prob(node: Mapping[str, Any]) -> Tensor:
 
 
 def correction(node: Mapping[str, Any]) -> Tensor | None:
-    """By how much a node's log density differs from that of drawing its value; ``None`` if not.
+    """Difference of a node's log density and that of sampling its value; ``None`` if there is none.
 
-    Of a factor or an observed site it is all of it, of a sampled one what scales and masks change.
+    The whole density of factors and observed sites; of sampled sites the effect of scale and mask.
     """
     if is_observed(node):
         return log_prob(node)
@@ -60,12 +60,12 @@ def correction(node: Mapping[str, Any]) -> Tensor | None:
 
 
 def is_observed(node: Mapping[str, Any]) -> bool:
-    """Whether a node is observed in the program itself, or a factor of it."""
+    """True if a node is a factor or an observed site of the program itself."""
     return node["is_observed"] and not node["infer"].get("was_given", False)
 
 
 class Given(ConditionMessenger):
-    """Conditions on values of sites, and marks these as given from outside of the program."""
+    """Effect handler that conditions on values of sites, and marks them as given from outside."""
 
     def _pyro_sample(self, msg: Any) -> None:
         super()._pyro_sample(msg)
@@ -76,10 +76,10 @@ class Given(ConditionMessenger):
 def log_correction(
     human: HumanModel, sites: Mapping[str, Tensor], draws: Mapping[str, Tensor], people: int
 ) -> Tensor:
-    """What ``prior`` adds to the density by which draws are proposed, ``[S, P]``.
+    """Log density ``[S, P]`` that ``prior`` adds to that of sampling its draws.
 
-    Its factors and observed sites, scales and masks, but for those that depend on the discrete
-    sites that perception reads; they are part of :func:`log_priors`.
+    Sums its factors, observed sites, scales and masks. Those that depend on the discrete sites that
+    perception reads are excluded; they are part of :func:`log_priors`.
 
     Args:
         human: the model of people.
@@ -101,13 +101,13 @@ def log_correction(
 def whole_correction(
     human: HumanModel, draws: Mapping[str, Tensor], people: int, without: Collection[str]
 ) -> Tensor:
-    """All that ``prior`` adds to the density ``[S, P]`` by which draws ``[S, P, 1, ...]`` are made.
+    """Log density ``[S, P]`` that ``prior`` adds to that of sampling draws ``[S, P, 1, ...]``.
 
     Args:
         human: the model of people.
-        draws: of all sites.
+        draws: values of all sites.
         people: number of people P.
-        without: names of sites whose own density does not count.
+        without: names of sites whose own density is excluded.
     """
     number = len(next(iter(draws.values())))
     total = next(human.parameters()).new_zeros(number, people, 1)
@@ -120,14 +120,14 @@ def whole_correction(
 
 
 def adds_to_prior(human: HumanModel) -> bool:
-    """Whether ``prior`` is more than what it samples."""
+    """True if ``prior`` has factors, observed sites, scales or masks."""
     return any(correction(node) is not None for node in prior_nodes(human, {}, 1, 1).values())
 
 
 def prior_nodes(
     human: HumanModel, given: Mapping[str, Tensor], number: int, people: int
 ) -> dict[str, Any]:
-    """Nodes of ``prior`` for some draws, given values of sites."""
+    """Trace nodes of ``prior`` for ``number`` draws, given values of sites."""
     with (
         torch.random.fork_rng(devices=[]),
         poutine.block(),
@@ -141,10 +141,10 @@ def prior_nodes(
 
 
 def check_plates(name: str, found: Tensor, people: int, rounds: int = 1) -> None:
-    """Refuse a log density that is not one of each person (and round).
+    """Refuse a log density without one number for each person (and round).
 
     Raises:
-        HumanModelError: it has other dimensions, as data of other people have.
+        HumanModelError: it has other dimensions, as with data of other people.
     """
     shape = (1, 1, *found.shape)[-2:]
     if shape[0] not in (1, people) or shape[1] not in (1, rounds):
@@ -162,17 +162,17 @@ def choices(
     values: Tensor,
     acted: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Log-probabilities ``[..., P, N, A]`` of actions at moments, and ``[..., P, N]`` of what was.
+    """Log-probabilities of actions ``[..., P, N, A]`` and of the record ``[..., P, N]`` at moments.
 
-    The second is of everything that the program says at such a moment: of the recorded action, and
-    of whatever else ``act`` observes or adds. Runs inside the person plate.
+    The second includes the recorded action and everything else that ``act`` observes or adds. Runs
+    inside the person plate.
 
     Args:
         human: the model of people.
         implants: as :meth:`HumanModel.prior` returned them, ``[..., P, 1]``.
-        belief: at each of N moments of each person, ``[P, N, Z]``.
+        belief: belief at each of N moments of each person, ``[P, N, Z]``.
         values: the self-model's action values there, ``[P, N, A]``.
-        acted: what was done there, ``[P, N]``.
+        acted: the recorded action there, ``[P, N]``.
     """
     with (
         poutine.block(),
@@ -201,15 +201,15 @@ def log_latents(
 ) -> dict[str, Tensor]:
     """Log-probability ``[..., P, B, G]`` of G values of each round latent, by name.
 
-    With all that ``round_latents`` observes or adds by a factor. Runs inside the person plate.
+    Includes factors and observed sites of ``round_latents``. Runs inside the person plate.
 
     Args:
         human: the model of people.
         implants: as :meth:`HumanModel.prior` returned them, ``[..., P, 1]``.
-        values: of the sites, ``[P, B, G]``.
-        covariates: of the rounds ``[P, B]``, see :meth:`HumanModel.covariates`.
+        values: values of the sites, ``[P, B, G]``.
+        covariates: covariates of the rounds ``[P, B]``, see :meth:`HumanModel.covariates`.
     """
-    # Far to the left of whatever dimensions draws and enumeration take.
+    # Far to the left of the dimensions of draws and enumeration.
     given = {
         name: value.movedim(-1, 0).reshape(value.shape[-1], *(1,) * SPARE, *value.shape[:-1])
         for name, value in values.items()
@@ -240,19 +240,19 @@ def log_weighted_latents(
     log_weights: Tensor,
     covariates: Mapping[str, Tensor] | None = None,
 ) -> Tensor:
-    """``log p(m_b | psi_p)`` of G values that stand for all in a round, ``[..., P, B, G]``.
+    """Weighted ``log p(m_b | psi_p)`` of G sampled values of a round, ``[..., P, B, G]``.
 
-    Runs inside the person plate. Each is multiplied by that for how many it stands, so that sums
-    over the G values estimate sums over all of them without bias. They are therefore not divided by
-    their own sum, which is 1 on average only: values are proposed by what was done, so that where
-    few of them are probable of a person the actions would seem probable.
+    Runs inside the person plate. With the inverse inclusion probabilities as weights, sums over the
+    G values are unbiased estimates of sums over all values. They are not normalized: their sum is 1
+    on average only, and the proposal depends on the recorded actions, so normalizing would favour
+    people for whom few of the G values are probable.
 
     Args:
         human: the model of people.
         implants: as :meth:`HumanModel.prior` returned them, ``[..., P, 1]``.
-        values: of the round latents, ``[P, B, G]``.
-        log_weights: for how many each of them stands, ``[P, B, G]``.
-        covariates: of the rounds ``[P, B]``, see :meth:`HumanModel.covariates`.
+        values: values of the round latents, ``[P, B, G]``.
+        log_weights: log inverse inclusion probabilities, ``[P, B, G]``.
+        covariates: covariates of the rounds ``[P, B]``, see :meth:`HumanModel.covariates`.
     """
     found = log_latents(human, implants, values, covariates)
     return torch.stack(torch.broadcast_tensors(*found.values())).sum(0) + log_weights

@@ -1,7 +1,7 @@
-"""Exact posteriors over the discrete implants, given how a person decides.
+"""Exact posteriors over the perceptual implants, given the policy implants.
 
-The reference for every approximate guide: all combinations of the discrete sites that perception
-depends on, each with its prior and likelihood, without sampling or optimization.
+Enumerates all combinations of the discrete sites that perception depends on, each with its prior
+and likelihood, without sampling or optimization: the reference for every approximate guide.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 
 CHUNK = 2**21
-"""Views and moments, of all draws together, that are worked out at once; bounds memory."""
+"""Views and moments, summed over draws, that are computed at once; bounds memory."""
 
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
-    """Values ``[M]`` of the discrete sites of a table, one for each combination."""
+    """Values ``[M]`` of the discrete sites of a table, for each of their M combinations."""
     supports = discrete_sites(human)
     return grid_of({site: supports[site] for site in table.sites})
 
@@ -41,16 +41,16 @@ def log_joints(
     combinations: Tensor | None = None,
     log_prior: Tensor | None = None,
 ) -> Tensor:
-    """Log prior and likelihood of each combination under S draws, ``[S, P, M]``.
+    """Log prior plus log-likelihood of each combination under S draws, ``[S, P, M]``.
 
-    Right for models in which :func:`acts_on_beliefs`.
+    Valid only if :func:`acts_on_beliefs`.
 
     Args:
         human: the model of people.
         table: the recorded rounds.
-        draws: of all other sites, ``[S, P, 1, ...]`` or ``[S, 1, 1, ...]``.
-        combinations: which are asked about ``[M]``; all unless given.
-        log_prior: of these ``[M]`` in place of their own.
+        draws: values of all other sites, ``[S, P, 1, ...]`` or ``[S, 1, 1, ...]``.
+        combinations: numbers ``[M]`` of the combinations; all by default.
+        log_prior: log prior ``[M]`` of these, which replaces the model's.
     """
     number = len(next(iter(draws.values()))) if draws else 1
     grid = {}
@@ -74,7 +74,7 @@ def log_joints(
 
 @contextmanager
 def conditioned(draws: Mapping[str, Tensor], number: int, people: int) -> Iterator[None]:
-    """The program runs for S draws ``[S, P, 1, ...]`` of its sites; the rest is sampled."""
+    """Condition the program on S draws ``[S, P, 1, ...]``; missing sites are sampled."""
     with (
         torch.random.fork_rng(devices=[]),
         poutine.block(),
@@ -93,18 +93,18 @@ def expected_counts(
     combinations: Tensor,
     log_prior: Tensor | None,
 ) -> Tensor:
-    """How often each action is expected to have been taken at each moment, ``[N, A]``.
+    """Expected counts of each action at each moment, ``[N, A]``.
 
-    It is not known what somebody saw and attended to. By Fisher's identity this is the gradient of
-    the log-likelihood by that of the moments.
+    The expectation is over the unobserved percepts and attention. By Fisher's identity it is the
+    gradient of the log-likelihood with respect to that of the moments.
 
     Args:
         human: the model of people.
         table: views of one person's rounds.
-        draws: of the other sites ``[S, 1, 1, ...]``.
-        log_weights: of these, ``[S]``.
-        combinations: of discrete sites that are possible, ``[G]``.
-        log_prior: of these ``[G]``, if it does not depend on the other sites.
+        draws: values of the other sites ``[S, 1, 1, ...]``.
+        log_weights: log weights of the draws, ``[S]``.
+        combinations: possible combinations of the discrete sites, ``[G]``.
+        log_prior: log prior of these ``[G]``, if it does not depend on the other sites.
     """
     number = len(log_weights)
     grid = {name: one[combinations] for name, one in combination_values(human, table).items()}
@@ -126,19 +126,19 @@ def expected_counts(
 
 
 def acts_on_beliefs(human: HumanModel, sites: Iterable[str]) -> bool:
-    """Whether what a person sees reaches their actions through beliefs alone.
+    """True if percepts affect actions through beliefs alone.
 
-    If ``act`` reads one of the ``sites`` that ``perceive`` reads, likelihoods of views are not
-    enough.
+    If ``act`` reads one of the ``sites`` that ``perceive`` reads, likelihoods of views do not
+    suffice.
     """
     return not dependencies(human).actions & set(sites)
 
 
 def require_acting_on_beliefs(human: HumanModel, sites: Iterable[str]) -> None:
-    """Refuse models whose likelihoods of views are not enough; see :func:`acts_on_beliefs`.
+    """Refuse models for which :func:`acts_on_beliefs` is false.
 
     Raises:
-        HumanModelError: this is one.
+        HumanModelError: ``act`` reads one of the sites.
     """
     if not acts_on_beliefs(human, sites):
         raise HumanModelError(
@@ -150,7 +150,7 @@ def require_acting_on_beliefs(human: HumanModel, sites: Iterable[str]) -> None:
 def draw_combinations(
     human: HumanModel, table: ViewTable, log_weights: Tensor, number: int
 ) -> dict[str, Tensor]:
-    """Draws ``[S, P, 1]`` of the table's sites, from log weights ``[P, M]``."""
+    """Draw ``[S, P, 1]`` values of the table's sites by log weights ``[P, M]``."""
     chosen = torch.multinomial(torch.softmax(log_weights, -1), number, replacement=True).T
     return {
         site: value[chosen][..., None] for site, value in combination_values(human, table).items()

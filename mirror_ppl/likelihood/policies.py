@@ -1,7 +1,7 @@
-"""Draws that stand for whoever a person may be, under which combinations are given up and merged.
+"""Representative draws of the policy implants, used to drop combinations and to merge moments.
 
-Draws from the prior do, unless the program knows more of people than what it samples: a factor, an
-observed site, a scale or a mask. Then draws are repeated as often as that makes them probable.
+They are draws from the prior. If the program has a factor, an observed site, a scale or a mask,
+draws are resampled by the density that it adds.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, draw_prior
 
 ENOUGH = 32
-"""So many draws from the prior have to be probable, or none of them is relied on."""
+"""Least effective number of prior draws; with fewer, none is used."""
 BATCHES = 16
 AT_ONCE = 512
-"""Draws from the prior that are looked at, AT_ONCE in each of BATCHES, until ENOUGH are."""
+"""Prior draws that are tried, AT_ONCE in each of BATCHES, until ENOUGH are effective."""
 ENTRIES = 4_000_000
-"""Of tables of priors; bounds memory."""
+"""Largest size of tables of priors; bounds memory."""
 
 
 @torch.no_grad()
 def draw_policies(
     human: HumanModel, grid: Mapping[str, Tensor], number: int, seed: int
 ) -> Draws | None:
-    """So many policies ``[S, 1, 1, ...]``; always the same.
+    """Draw policies ``[S, 1, 1, ...]``; deterministic given the seed.
 
     Args:
         human: the model of people.
         grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
-        number: of policies S.
-        seed: of their draws.
+        number: number of policies S.
+        seed: seed of the draws.
 
     Returns:
-        The policies; ``None`` if hardly any draw from the prior is probable. With a site by which
-        people are of different kinds, so many for each of its values in turn.
+        The policies; ``None`` if too few prior draws are effective. If ``stratified_by`` names a
+        site, S for each of its values in turn.
 
     Raises:
         HumanModelError: ``stratified_by`` is no discrete site.
@@ -86,28 +86,27 @@ def _drawn_policies(
 
 
 def effective(log_weights: Tensor) -> float:
-    """Effective number of draws of log weights ``[S]``."""
+    """Effective sample size of log weights ``[S]``."""
     return float(1 / torch.softmax(log_weights.double(), 0).square().sum())
 
 
 def within(human: HumanModel, log_joint: Tensor, margin: float) -> Tensor:
-    """Which combinations ``[M]`` are worth keeping.
+    """Mask ``[M]`` of the combinations to keep.
 
     Args:
         human: the model of people.
-        log_joint: of each combination and what was recorded, under each policy ``[S, M]``.
-        margin: nats by which one may fall behind the best, each under the policy that suits it
-            best.
+        log_joint: log joint of each combination and the recordings, under each policy ``[S, M]``.
+        margin: nats by which a combination may fall behind the best, each under its best policy.
     """
     if dependencies(human).adds_to_actions:
-        # What is recorded besides actions may tell of a person whom no policy resembles.
+        # Recordings besides actions may be of a person whom no policy resembles.
         log_joint = log_joint - log_joint.amax(-1, keepdim=True)
     best = log_joint.amax(0)
     return best >= best.max() - margin
 
 
 def _said(human: HumanModel, grid: Mapping[str, Tensor], draws: Draws) -> Tensor:
-    """By how much the program makes draws more probable than they are drawn, ``[S]``."""
+    """Log ratio ``[S]`` of the program's density of draws and the density of sampling them."""
     policy = {name: value for name, value in draws.items() if name not in grid}
     number = len(next(iter(draws.values()), (0,)))
     found = log_correction(human, grid, policy, 1)[:, 0].expand(number)

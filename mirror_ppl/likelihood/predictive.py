@@ -1,7 +1,7 @@
-"""What people do next: the posterior predictive of their actions, step after step.
+"""Posterior predictive of people's actions, step by step.
 
-Each action is predicted given what was done before it in its round. Attention, where it differs
-from round to round, is summed out, weighted by what those actions say of it.
+Each action is predicted given the earlier actions of its round. Round latents are summed out, with
+their posterior given those actions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
 from mirror_ppl.models.human import HumanModel
 
 MOST_NUMBERS = 4_000_000
-"""Numbers in the beliefs that are looked up at once; bounds memory."""
+"""Numbers in the beliefs that are gathered at once; bounds memory."""
 DRAWS = 50
 """Draws for which attention is summed out at once; bounds memory."""
 
@@ -30,8 +30,8 @@ DRAWS = 50
 def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
     """Log-probabilities ``[S, P, B, T, A]`` of actions, for each draw of the implants.
 
-    Runs the same program as fitting, with the implants conditioned on the draws and each person
-    seeing what the draw says they see.
+    Runs the program of fitting, conditioned on the draws: each person has the views that follow
+    from the draw.
     """
     number = next(iter(draws.values())).shape[0]
     if isinstance(table.attention, Chain):
@@ -57,19 +57,19 @@ def predict_actions(human: HumanModel, table: ViewTable, draws: Mapping[str, Ten
             pyro.plate("person", table.people, dim=-PLATES),
         ):
             implants = human.prior()
-            # Rounds that a person does not have are as their first view, whoever else is there.
+            # Missing rounds take the first view, so that results do not depend on other people.
             sight = table.sight_of(implants).clamp(min=0).expand(table.people, table.rounds)
             results.append(_attentive(human, implants, table, table.attention, sight))
     return torch.stack(results)
 
 
 def _looked_up(human: HumanModel, table: ViewTable, draws: Mapping[str, Tensor]) -> Tensor:
-    """Log-probabilities ``[S, P, B, T, A]`` where a person sees one thing in each round."""
+    """Log-probabilities ``[S, P, B, T, A]`` where a draw has one view of each round."""
     number = len(next(iter(draws.values())))
     person = torch.arange(table.people, device=table.index.device)[:, None]
     with conditioned(draws, number, table.people):
         implants = human.prior()
-        # Rounds that a person does not have are as their first view, whoever else is there.
+        # Missing rounds take the first view, so that results do not depend on other people.
         sight = table.sight_of(implants).clamp(min=0).expand(number, table.people, table.rounds)
         moments = table.moments[person, sight].clamp(min=0)  # [S, P, B, T]
         belief, values = (
@@ -86,7 +86,7 @@ def _attentive(
     attention: Attention,
     sight: Tensor,
 ) -> Tensor:
-    """Log-probabilities ``[P, B, T, A]`` with attention summed out, given what was done so far."""
+    """Log-probabilities ``[P, B, T, A]`` given earlier actions, with attention summed out."""
     person = torch.arange(table.people, device=sight.device)[:, None]
     views = attention.sights[person, sight]  # [P, B, G']
     moments = table.moments[person[..., None], views].clamp(min=0)  # [P, B, G', T]
@@ -97,7 +97,7 @@ def _attentive(
     weights = log_weighted_latents(
         human, implants, attention.values, attention.log_weights, attention.covariates
     )
-    # What was done before a step tells what they attend to at it.
+    # Earlier actions inform about attention.
     before = torch.nn.functional.pad(along[..., :-1], [1, 0])
     before = torch.log_softmax(before + attention.shares(weights)[..., None], 2)
     return torch.logsumexp(before[..., None] + found, 2)
@@ -106,7 +106,7 @@ def _attentive(
 def _chained(
     human: HumanModel, table: ViewTable, chain: Chain, draws: Mapping[str, Tensor]
 ) -> Tensor:
-    """Log-probabilities ``[S, P, B, T, A]`` where attention is a chain: its forward recursion."""
+    """Log-probabilities ``[S, P, B, T, A]`` for chained attention, by forward recursion."""
     number = len(next(iter(draws.values())))
     with conditioned(draws, number, table.people):
         implants = human.prior()
@@ -146,13 +146,13 @@ def _chained(
 def _along(
     moments: Tensor, chosen: Tensor, each: Tensor, log_chance: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The steps of a span.
+    """Forward recursion through the steps of a span.
 
     Args:
-        moments: of E courses ``[E, T]``.
-        chosen: log-likelihood of what was recorded at each moment ``[S, N]``.
-        each: of every action ``[S, N, A]``.
-        log_chance: of each course before the span ``[S, E]``.
+        moments: moments of E courses ``[E, T]``.
+        chosen: log-likelihood of the record at each moment ``[S, N]``.
+        each: log-probability of every action ``[S, N, A]``.
+        log_chance: log-probability of each course before the span ``[S, E]``.
 
     Returns:
         The log-likelihood of each course ``[S, E]``, and log-probabilities ``[S, T, A]`` of
@@ -163,7 +163,7 @@ def _along(
     total = taken.cumsum(-1)
     weights = torch.softmax(total - taken + log_chance[..., None], 1)
     draws, _, steps = weights.shape
-    # Many courses are at the same moment.
+    # Many courses share moments.
     place = torch.arange(steps, device=which.device) * len(used) + which
     share = weights.new_zeros(draws, steps * len(used))
     share.index_add_(1, place.flatten(), weights.flatten(1))
@@ -172,7 +172,7 @@ def _along(
 
 
 def _gathered(log_chance: Tensor, following: Tensor) -> Tensor:
-    """Log-probabilities ``[S, H]`` of states, of those ``[S, E]`` that lead to them."""
+    """Log-probabilities ``[S, H]`` of states: sums over courses ``[S, E]`` that lead to them."""
     highest = log_chance.amax(1, keepdim=True)
     total = log_chance.new_zeros(len(log_chance), int(following.max()) + 1)
     total.index_add_(1, following, (log_chance - highest).exp())

@@ -1,4 +1,4 @@
-"""Distinct views of rounds."""
+"""Distinct views of rounds, and the moments that they consist of."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Rounds:
 
     Attributes:
         observation: ``[R, T, ...]``.
-        told: what was communicated, ``[R, T, K]``.
-        actions: ``[R, T]``; some action in padding.
-        real: which steps are no padding ``[R, T]``; it comes at the end.
+        told: communicated items, ``[R, T, K]``.
+        actions: ``[R, T]``; arbitrary in padding.
+        real: False in padding, which is at the end, ``[R, T]``.
     """
 
     observation: Observation
@@ -41,11 +41,11 @@ class Rounds:
         return len(self.actions)
 
     def at(self, first: int, last: int) -> Rounds:
-        """From the first one to that before the last."""
+        """Select rounds ``first`` to ``last`` (exclusive)."""
         return self.chosen(slice(first, last))
 
     def chosen(self, some: slice | list[int]) -> Rounds:
-        """Some of them, in this order."""
+        """Select some rounds, in this order."""
         return Rounds(
             {name: value[some] for name, value in self.observation.items()},
             {name: mask[some] for name, mask in self.told.items()},
@@ -54,12 +54,12 @@ class Rounds:
         )
 
     def each(self) -> Iterator[Rounds]:
-        """One after the other."""
+        """Iterate over the rounds."""
         return (self.at(number, number + 1) for number in range(len(self)))
 
     @classmethod
     def joined(cls, parts: Sequence[Rounds]) -> Rounds:
-        """All of them, which are of as many steps."""
+        """Concatenate rounds with equal numbers of steps."""
         return cls(
             {
                 name: torch.cat([one.observation[name] for one in parts])
@@ -72,11 +72,11 @@ class Rounds:
 
     @property
     def steps(self) -> list[int]:
-        """How many steps of each are no padding."""
+        """Number of steps of each round, without padding."""
         return self.real.sum(-1).tolist()
 
     def so_far(self, number: int) -> tuple[Observation, Tensor]:
-        """What there was to observe in one round ``[t, ...]``, and what was done ``[t]``."""
+        """Observations ``[t, ...]`` and actions ``[t]`` of one round, without padding."""
         real = self.real[number]
         observation = {name: value[number, real] for name, value in self.observation.items()}
         return observation, self.actions[number, real]
@@ -84,7 +84,7 @@ class Rounds:
 
 @dataclass(frozen=True)
 class RoundViews:
-    """V distinct views of one round, and the moments that they share; see :class:`ViewTable`.
+    """V distinct views of one round, and their N moments; see :class:`ViewTable`.
 
     Attributes:
         moments: ``[V, T]``.
@@ -92,8 +92,8 @@ class RoundViews:
         values: ``[N, A]``.
         acted: ``[N]``.
         sights: the view under each value of attention, ``[U, G]``; ``None`` if a sight is a view.
-        rounds: of each sight ``[U]``, if there is more than one round.
-        chain: attention that is summed out exactly, of one person; views are of its spans.
+        rounds: round of each sight ``[U]``, if there is more than one round.
+        chain: one person's attention, if it is summed out exactly; views are then of its spans.
     """
 
     moments: Tensor
@@ -111,14 +111,14 @@ class RoundViews:
         return len(self.moments if self.sights is None else self.sights)
 
     def lengthened(self, steps: int) -> RoundViews:
-        """The same with padding at the end, as part of a table of longer rounds."""
+        """Pad the views to ``steps`` steps."""
         more = steps - self.moments.shape[1]
         if not more:
             return self
         return replace(self, moments=pad(self.moments, [0, more], value=NO_VIEW))
 
     def kept(self, sights: Tensor) -> RoundViews:
-        """Only some sights, and the views and moments that they have."""
+        """Select sights, with their views and moments."""
         if self.chain is not None:
             chain, views = self.chain.kept(sights)
             return replace(replace(self, chain=None).kept(views), chain=chain)
@@ -132,7 +132,7 @@ class RoundViews:
         used, place = torch.unique(moments[real], return_inverse=True)
         moments = moments.clone()
         moments[real] = place
-        if not len(used):  # of padding alone; act() is asked about something all the same
+        if not len(used):  # padding only; act() still needs an input
             used = used.new_zeros(1)
         return RoundViews(moments, self.belief[used], self.values[used], self.acted[used])
 
@@ -142,13 +142,13 @@ class ManyViews:
     """Distinct views of R rounds, one round after the other.
 
     Attributes:
-        moments: of each step of the V views, which of the N moments it is, ``[V, T]``.
+        moments: number of the moment at each step of the V views, ``[V, T]``.
         belief: ``[N, Z]``.
         values: ``[N, A]``.
         acted: ``[N]``.
-        views: the round that each view is of ``[V]``, in order.
-        rounds: the round that each moment is of ``[N]``, in order.
-        number: R.
+        views: round of each view ``[V]``, in order.
+        rounds: round of each moment ``[N]``, in order.
+        number: number of rounds R.
     """
 
     moments: Tensor
@@ -160,7 +160,7 @@ class ManyViews:
     number: int
 
     def split(self) -> list[tuple[slice, RoundViews]]:
-        """Of each round which of the views are its, and these by themselves."""
+        """Split into rounds: the slice of each round's views, and these views."""
         views, moments = (_begins(part, self.number) for part in (self.views, self.rounds))
         found = []
         for number in range(self.number):
@@ -169,7 +169,7 @@ class ManyViews:
             named = self.moments[own]
             named = torch.where(named == NO_VIEW, NO_VIEW, named - moments[number])
             part = RoundViews(named, self.belief[some], self.values[some], self.acted[some])
-            if not len(part.acted):  # of padding alone; act() is asked about something all the same
+            if not len(part.acted):  # padding only; act() still needs an input
                 part = replace(
                     part,
                     belief=self.belief.new_zeros(1, self.belief.shape[-1]),
@@ -181,13 +181,13 @@ class ManyViews:
 
 
 def _begins(groups: Tensor, number: int) -> list[int]:
-    """Where each of so many groups begins ``[number + 1]``, of the group of each ``[n]``."""
+    """First index of each group ``[number + 1]``, given the sorted group of each item ``[n]``."""
     edges = torch.arange(number + 1, device=groups.device)
     return torch.searchsorted(groups, edges).tolist()
 
 
 def distinct_in_groups(rows: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
-    """As `distinct_rows` of rows ``[n, ...]`` in groups ``[n]``; one group after the other."""
+    """`distinct_rows` within groups ``[n]`` of rows ``[n, ...]``, ordered by group."""
     first, which = distinct_rows(torch.cat([groups[:, None], rows], 1))
     order = groups[first].argsort(stable=True)
     place = torch.empty_like(order)
@@ -199,19 +199,19 @@ def distinct_in_groups(rows: Tensor, groups: Tensor) -> tuple[Tensor, Tensor]:
 def views_of_rounds(
     human: HumanModel, implants: Mapping[str, Tensor], row: Tensor, rounds: Rounds
 ) -> tuple[ManyViews, Tensor]:
-    """Distinct views of R rounds, and which of them somebody has who looks at one of these.
+    """Distinct views of R rounds, and the view ``[n]`` of each combination of implants.
 
     Args:
         human: the model of people.
         implants: combinations of values ``[n]`` of the discrete sites that perception reads.
-        row: which of the rounds each is to look at ``[n]``.
-        rounds: of one person.
+        row: the round that each combination sees ``[n]``.
+        rounds: rounds of one person.
     """
     state = BeliefState.initial(human, len(row), Memory.of_rounds(human, rounds.observation))
     lengths = rounds.real.sum(-1)
     numbers = torch.full((len(row), rounds.actions.shape[1]), NO_VIEW, device=row.device)
     own, begin, under_way = row, 0, torch.arange(len(row), device=row.device)
-    for end in lengths.unique().tolist():  # those whose round is over look at nothing more
+    for end in lengths.unique().tolist():  # rows whose round is over are dropped
         going = lengths[own] >= end
         if not bool(going.all()):
             state, own, under_way = state.at(going), own[going], under_way[going]
@@ -229,11 +229,11 @@ def moments_along(
     row: Tensor,
     steps: range,
 ) -> tuple[BeliefState, Tensor]:
-    """Track beliefs through some steps of rounds; arguments as of :func:`views_of_rounds`.
+    """Track beliefs through some steps of rounds; arguments as for :func:`views_of_rounds`.
 
     Returns:
-        The state after these steps, and the number of the moment at each, ``[n, T]``, ``NO_VIEW``
-        outside of them: a belief of the state and what was done there.
+        The state after these steps, and the number of the moment (belief and action) at each step,
+        ``[n, T]``; ``NO_VIEW`` at other steps.
     """
     number, action_count = len(state.belief), len(state.human.domain.actions)
     moments = torch.full((number, rounds.actions.shape[1]), NO_VIEW, device=row.device)
@@ -257,13 +257,13 @@ def moments_along(
 def views_of_moments(
     state: BeliefState, numbers: Tensor, row: Tensor, number: int
 ) -> tuple[ManyViews, Tensor]:
-    """Distinct views of rounds, and which of them each has.
+    """Distinct views of rounds, and the view ``[n]`` of each row.
 
     Args:
-        state: of which moments are numbered, see :func:`moments_along`.
-        numbers: of moments ``[n, T]``.
-        row: which of the rounds it is ``[n]``.
-        number: of rounds R.
+        state: state whose moments are numbered, see :func:`moments_along`.
+        numbers: numbers of moments ``[n, T]``.
+        row: round of each row ``[n]``.
+        number: number of rounds R.
     """
     human = state.human
     first, which = distinct_in_groups(numbers, row)

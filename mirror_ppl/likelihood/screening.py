@@ -1,4 +1,4 @@
-"""When combinations of discrete implants are given up while rounds are compiled."""
+"""Settings of screening: when combinations of discrete implants are dropped."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Screening:
-    """When a combination of discrete implants is given up.
+    """Settings of screening, which drops combinations of discrete implants during compilation.
 
     Attributes:
-        margin: nats by which its log-likelihood may fall behind the best one's, each under the
-            policy that suits it best.
-        policies: number of policies: of draws of the implants from the prior.
+        margin: nats by which a combination's log-likelihood may fall behind the best one's, each
+            under its best policy.
+        policies: number of policies, which are draws of the implants from the prior.
         seed: seed of those draws.
-        resolution: moments of a round are merged when the log-probabilities of what was done there,
-            each under ``merge_policies`` of those policies, fall on the same points of a grid of
-            this width. 0 for never.
-        merge_policies: see there.
+        resolution: grid width for merging moments of a round: they are merged if their recorded
+            actions' log-probabilities under ``merge_policies`` policies round to the same grid
+            points. 0 for never.
+        merge_policies: number of policies in that comparison.
     """
 
     margin: float = 15.0

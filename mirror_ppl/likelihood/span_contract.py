@@ -1,4 +1,4 @@
-"""Whether what a human model says of its spans is so, tried on a made-up round."""
+"""Check of the spans that a human model declares, on a made-up round."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ STEPS = 12
 
 @torch.no_grad()
 def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
-    """Make sure that attention can be summed out span by span.
+    """Check that attention can be summed out span by span.
 
     Args:
         human: the model of people; its attention is :attr:`HumanModel.chained`.
-        discrete: values ``[1]`` of the discrete implants of somebody.
+        discrete: values ``[1]`` of the discrete implants of a person.
 
     Raises:
-        HumanModelError: spans are not as :meth:`HumanModel.spans` says: they overlap, a site is
-            read outside of its span, values that are said to show the same do not, or a site
+        HumanModelError: spans break the contract of :meth:`HumanModel.spans`: they overlap, a site
+            is read outside of its span, values declared equivalent differ in the percept, or a site
             depends on another one.
     """
     domain = human.domain
@@ -36,7 +36,7 @@ def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
     state, observed, steps = domain.initial(1, generator), [], min(STEPS, domain.horizon)
     while len(observed) < steps and not bool(domain.over(state)):
         observed.append(domain.observe(state))
-        # Every other action is the first one, lest the round is over at once.
+        # Every other action is the first one, so that the round does not end at once.
         action = torch.randint(len(domain.actions), (1,), generator=generator, device=device)
         state = domain.transition(state, action * (len(observed) % 2))
     so_far = {name: torch.cat([one[name] for one in observed]) for name in observed[0]}
@@ -44,7 +44,7 @@ def check_spans_hold(human: HumanModel, discrete: Mapping[str, Tensor]) -> None:
     _check_independence(human)
     supports = attention_sites(human)
     check_spans(spans, {name: len(support) for name, support in supports.items()}, len(observed))
-    # What one site hides at its first value it may show at its last.
+    # A site may hide at its first value what it shows at its last.
     for place in (0, -1):
         others = {name: own[place].view(1) for name, own in supports.items()}
         _check_looks(human, spans, supports, {**discrete, **others}, observed)
@@ -57,7 +57,7 @@ def _check_looks(
     usual: Mapping[str, Tensor],
     observed: Sequence[Observation],
 ) -> None:
-    """No value of a site changes what is seen where its span says so; all others are usual."""
+    """Check that no value of a site changes the percept outside of what its span declares."""
     knowledge = human.domain.nothing_known(1, device=observed[0]["ego"].device)
     for step, now in enumerate(observed):
         can_be = human.domain.communicable(now)
@@ -88,7 +88,7 @@ def _check_looks(
 
 
 def _check_independence(human: HumanModel) -> None:
-    """None of the sites of attention depends on another."""
+    """Check that no site of attention depends on another."""
     found = dependencies(human).round_latents
     for site, parents in found.items():
         if parents & found.keys():

@@ -1,4 +1,4 @@
-"""Sums of chosen numbers: what was recorded adds up along views, and along rounds."""
+"""Sparse sums: log-likelihoods of recorded steps add up along views."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch.nn.functional import embedding_bag
 
 @dataclass(frozen=True)
 class Sums:
-    """V sums a person, each of some of that person's N numbers.
+    """V sums per person, each over a subset of that person's N numbers.
 
-    As a matrix nearly all entries would be zero. Each sum reads its numbers of all draws at once,
-    which is many times as fast as gathering them draw by draw.
+    As a matrix it would be nearly all zeros. Each sum reads its numbers of all draws at once, which
+    is many times as fast as gathering them draw by draw.
 
     Attributes:
-        chosen: which of the P N numbers are added up, one sum after the other, ``[n]``.
+        chosen: indices into the P N numbers, one sum after the other, ``[n]``.
         begins: where each of the P V sums begins ``[P V]``.
         shape: (P, V).
     """
@@ -28,12 +28,12 @@ class Sums:
 
     @classmethod
     def of(cls, chosen: Tensor, real: Tensor, number: int) -> Sums:
-        """Sums of some of so many numbers.
+        """Build the sums from padded indices.
 
         Args:
-            chosen: of each person, ``[P, V, T]``.
-            real: which of these count ``[P, V, T]``.
-            number: N.
+            chosen: indices of each person's numbers, ``[P, V, T]``.
+            real: False in padding ``[P, V, T]``.
+            number: numbers of a person N.
         """
         people, sums = chosen.shape[:2]
         begin = torch.arange(people, device=chosen.device)[:, None, None] * number
@@ -44,7 +44,7 @@ class Sums:
         """The sums ``[..., P, V]`` of numbers ``[..., P, N]``."""
         draws = numbers.shape[:-2]
         rows = numbers.flatten(-2).reshape(draws.numel(), -1).T.contiguous()
-        if not len(self.chosen):  # of padding alone
+        if not len(self.chosen):  # padding only
             return numbers.new_zeros(*draws, *self.shape)
         found = embedding_bag(self.chosen, rows, self.begins, mode="sum")
         return found.T.reshape(*draws, *self.shape)

@@ -1,4 +1,4 @@
-"""A human program on a table of views: its likelihood, and the program for Pyro's engines."""
+"""A human program on a table of views: likelihoods, and the Pyro program for engines."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mirror_ppl.models.human import HumanModel
 
 
 def log_likelihoods(human: HumanModel, implants: Mapping[str, Tensor], table: ViewTable) -> Tensor:
-    """Log-likelihood ``[..., P, U]`` of what was recorded under each sight of a round.
+    """Log-likelihood ``[..., P, U]`` of the recordings under each sight of a round.
 
     Runs inside the person plate. Round latents are summed out.
 
     Args:
         human: the model of people.
         implants: as :meth:`HumanModel.prior` returned them, ``[..., P, 1]``.
-        table: the rounds of P people and the distinct views of them.
+        table: the rounds of P people and their distinct views.
     """
     _, moments = choices(human, implants, table.belief, table.values, table.acted)
     return of_moments(human, implants, table, moments)
@@ -29,7 +29,7 @@ def log_likelihoods(human: HumanModel, implants: Mapping[str, Tensor], table: Vi
 def of_moments(
     human: HumanModel, implants: Mapping[str, Tensor], table: ViewTable, moments: Tensor
 ) -> Tensor:
-    """The log-likelihood ``[..., P, U]``, given that of each moment ``[..., P, N]``."""
+    """Log-likelihood ``[..., P, U]`` of sights, given that of moments ``[..., P, N]``."""
     if table.attention is None:
         return table.along_views(moments)
     chances = table.attention.log_chances(human, implants, table.rounds)
@@ -47,7 +47,7 @@ class TableProgram:
         self.human = human
 
     def __call__(self, table: ViewTable) -> None:
-        """Run it on the rounds of P people, conditioned on what was recorded."""
+        """Run the program on the rounds of P people, conditioned on the recorded actions."""
         human = self.human
         with pyro.plate("person", table.people, dim=-2):
             implants = human.prior()

@@ -1,4 +1,4 @@
-"""Building tables of views: which distinct ways there are to have seen the recorded rounds."""
+"""Construction of tables of views: the distinct ways to see the recorded rounds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mirror_ppl.models.measured import with_measurements
 
 
 def restricted(table: ViewTable, alive: Tensor) -> ViewTable:
-    """The table with only the combinations ``[P, M]`` that are alive, and the views they had."""
+    """Restrict a table to the combinations ``[P, M]`` that are alive, and to their views."""
     index = torch.where(alive[:, None], table.index, NO_VIEW)
     people = []
     for person, row in enumerate(index):
@@ -65,7 +65,7 @@ def views_of(table: ViewTable, person: int) -> RoundViews:
 
 
 def _padded(people: Sequence[RoundViews]) -> dict[str, Tensor]:
-    """Views of P people as the fields of a table."""
+    """Views of P people, padded, as fields of a table."""
     views = max(len(own.moments) for own in people)
     moments = max(len(own.acted) for own in people)
     return {
@@ -77,13 +77,13 @@ def _padded(people: Sequence[RoundViews]) -> dict[str, Tensor]:
 
 
 def _joined_chain(people: Sequence[RoundViews], covariates: Mapping[str, Tensor]) -> Chain:
-    """The chains of P people as one."""
+    """Stack the chains of P people."""
     chains = [replace(own.chain, covariates={}) for own in people if own.chain is not None]
     return replace(Chain.of_people(chains), covariates=covariates)
 
 
 def _padded_sights(people: Sequence[RoundViews]) -> dict[str, Tensor]:
-    """Sights of P people as the fields of a table."""
+    """Sights of P people, padded, as fields of a table."""
     most = max(len(own) for own in people)
     sights = [own.sights for own in people if own.sights is not None]
     widest = max(part.shape[1] for part in sights)
@@ -102,8 +102,8 @@ def combination_scores(
 
     Args:
         table: the recorded rounds.
-        likelihood: of each sight ``[..., P, U]``, see :meth:`HumanModel.log_likelihoods`.
-        combinations: numbers ``[M]`` of those that are asked for; all unless given.
+        likelihood: log-likelihood of each sight ``[..., P, U]``, see `log_likelihoods`.
+        combinations: numbers ``[M]`` of the combinations; all by default.
     """
     scores = []
     for person, index in enumerate(table.index):
@@ -131,17 +131,17 @@ def build_view_table(
     likely: Mapping[str, Tensor] | None = None,
     values: int = VALUES,
 ) -> ViewTable:
-    """Every distinct view of the recorded rounds, with the beliefs that they lead to.
+    """Build the table of all distinct views of recorded rounds, with their beliefs.
 
     Args:
-        human: whose ``perceive`` and ``believe`` are called (and ``act`` for screening).
+        human: its ``perceive`` and ``believe`` are called (and ``act`` for screening).
         demonstrations: rounds of P people.
-        candidates: for each person, the combinations that are considered at all (see
-            :meth:`ViewTable.combination`); all of them unless given.
-        screening: when to give up combinations on the way; never unless given.
+        candidates: for each person, the combinations to consider (see
+            :meth:`ViewTable.combination`); all by default.
+        screening: when to drop combinations during construction; never by default.
         report: called with the number of people done.
-        likely: draws ``[S, P, 1, ...]`` of what they may be like, see :class:`ViewTableBuilder`.
-        values: of attention that stand for all in a round, see there.
+        likely: approximate posterior draws ``[S, P, 1, ...]``, see :class:`ViewTableBuilder`.
+        values: number of sampled values of attention per round.
 
     Raises:
         HumanModelError: ``perceive`` reads a site that cannot be enumerated, or there are too many
@@ -160,9 +160,9 @@ def person_builders(
     values: int = VALUES,
     report: Callable[[int], None] = lambda people: None,
 ) -> Iterator[ViewTableBuilder]:
-    """Person after person, a builder with their rounds; see `build_view_table`.
+    """Yield a builder with the rounds of each person in turn; see `build_view_table`.
 
-    What was measured of a person is observed by the human model of their builder.
+    Measurements of a person are observed sites of their builder's human model.
     """
     for person in range(demonstrations.num_people):
         own = None
@@ -181,11 +181,11 @@ def person_builders(
 def join_tables(
     tables: Sequence[ViewTable], shape: tuple[int, int, int] | None = None
 ) -> ViewTable:
-    """The table of P people of the tables of each of them.
+    """Join the tables of single people to a table of P people.
 
     Args:
-        tables: of one person each.
-        shape: (P, B, T), to which they are padded; as far as the longest reaches unless given.
+        tables: tables of one person each.
+        shape: (P, B, T), to which they are padded; by default the largest of each.
     """
     if shape is None:
         rounds, steps = (max(table.recorded.shape[axis] for table in tables) for axis in (1, 2))
@@ -238,7 +238,7 @@ def join_tables(
 def rounds_of(demonstrations: Demonstrations, person: int) -> Rounds:
     """A person's rounds, as :meth:`ViewTableBuilder.add` takes them.
 
-    Of somebody without rounds there is one of padding, so that there is something to look up.
+    A person without rounds has one that is all padding, so that tables are not empty.
     """
     steps = demonstrations.shape[2]
     rounds = max(int(demonstrations.round_counts[person]), 1)

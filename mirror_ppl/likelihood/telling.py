@@ -1,4 +1,4 @@
-"""Which rounds tell most: gone through first, they spare others most of the combinations."""
+"""Order of rounds in screening: the most informative first, so that combinations drop early."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 SAMPLE = 64
-"""Combinations by which it is known which rounds tell most."""
+"""Combinations that determine the order of rounds."""
 MANY = 4 * SAMPLE
-"""Combinations that are worth trying some of them first."""
+"""Least number of combinations for which ordering the rounds pays."""
 
 
 def some_of(combinations: Tensor) -> Tensor:
-    """A sample of combinations ``[M]``; always the same."""
+    """A random subset of combinations ``[M]``; deterministic."""
     order = torch.randperm(len(combinations), generator=torch.Generator().manual_seed(0))
     return combinations[order[:SAMPLE].to(combinations.device)]
 
@@ -21,9 +21,9 @@ def telling_first(log_likelihoods: Tensor, log_prior: Tensor, margin: float) -> 
     """The order of rounds in which combinations fall behind the best ones soonest.
 
     Args:
-        log_likelihoods: of rounds under policies and combinations, ``[S, R, M]``.
-        log_prior: of combinations under policies, with rounds before, ``[S, M]``.
-        margin: nats; who is as far behind is given up.
+        log_likelihoods: log-likelihood of rounds under policies and combinations, ``[S, R, M]``.
+        log_prior: log prior of combinations under policies, with earlier rounds, ``[S, M]``.
+        margin: nats behind the best at which combinations are dropped.
 
     Returns:
         Numbers of the R rounds.

@@ -1,8 +1,8 @@
 """Tables of views: every distinct way in which a person may have seen their rounds.
 
-Perceptual implants reach the likelihood only through what is seen, and beliefs depend on nothing
-else. Many combinations of implants see the same, so beliefs are computed once for each distinct
-view of a round and kept; the program then looks up the view that its implants lead to.
+Perceptual implants affect the likelihood only through percepts, which alone determine beliefs. Many
+combinations of implants have the same view of a round, so beliefs are computed once for each
+distinct view; the program then looks up the view that its implants lead to.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.models.human import HumanModel, Implants
 
 NO_VIEW = -1
-"""Index of a combination of implants that was given up."""
+"""Index of a combination of implants that was dropped."""
 IMPOSSIBLE = -1e6
-"""Log-likelihood in nats of such a combination; finite, so that gradients are numbers."""
+"""Log-likelihood in nats of such a combination; finite, so that gradients are finite."""
 
 
 def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
-    """Number of the combination that implants ``[...]`` are, row-major over these sites."""
+    """Number of the combination of implants ``[...]``, row-major over these sites."""
     number = torch.zeros((), dtype=torch.long)
     for site, size in sizes.items():
         value = implants[site].long()
@@ -38,22 +38,22 @@ def combination_number(implants: Implants, sizes: Mapping[str, int]) -> Tensor:
 
 @dataclass(frozen=True)
 class Attention:
-    """Values of what differs from round to round, G a round, that stand for all there could be.
+    """G weighted values of the round latents of each round, to sum them out approximately.
 
-    A combination of a person's implants then has not one view of a round, but one under each of
-    these values. Those views together are a *sight* of the round; there are U.
+    A combination of a person's implants then has one view of a round for each of these values.
+    These views together are a *sight* of the round; there are U.
 
     Attributes:
-        values: of the sites of ``round_latents``, ``[P, B, G]``.
-        log_weights: for how many of all that there could be each of them stands, ``[P, B, G]``;
-            minus infinity in padding.
-        kept: those that could explain what was done, ``[P, B, G']``, an index into the G.
+        values: values of the sites of ``round_latents``, ``[P, B, G]``.
+        log_weights: log inverse inclusion probability of each value, ``[P, B, G]``; minus infinity
+            in padding.
+        kept: the values that explain the actions, ``[P, B, G']``, an index into the G.
         log_kept: log-probability with which each of these was kept, ``[P, B, G']``; infinity in
             padding.
         sights: the view of each sight under each value kept, ``[P, U, G']``, an index into the V
             views.
-        rounds: the round that each sight is of, ``[P, U]``.
-        covariates: of the rounds ``[P, B]``, see `HumanModel.covariates`.
+        rounds: round of each sight, ``[P, U]``.
+        covariates: covariates of the rounds ``[P, B]``, see `HumanModel.covariates`.
     """
 
     values: Mapping[str, Tensor]
@@ -65,16 +65,16 @@ class Attention:
     covariates: Mapping[str, Tensor] = field(default_factory=dict)
 
     def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
-        """See `log_weighted_latents`, ``[..., P, B, G]``; runs inside the person plate."""
+        """Weighted log-probabilities of the values ``[..., P, B, G]``, inside the person plate."""
         del rounds
         return log_weighted_latents(human, implants, self.values, self.log_weights, self.covariates)
 
     def marginal(self, likelihoods: Tensor, log_weights: Tensor) -> Tensor:
-        """Log-likelihood ``[..., P, U]`` of sights, of views ``[..., P, V]``.
+        """Log-likelihood ``[..., P, U]`` of sights, given that of views ``[..., P, V]``.
 
         Args:
-            likelihoods: of the recorded actions under each view.
-            log_weights: of each value, see :meth:`log_chances`, ``[..., P, B, G]``.
+            likelihoods: log-likelihood of the recorded actions under each view.
+            log_weights: weights of values, see :meth:`log_chances`, ``[..., P, B, G]``.
         """
         shape = self.sights.shape[1:]
         views = self.sights.flatten(1).expand(*likelihoods.shape[:-1], -1)
@@ -84,7 +84,7 @@ class Attention:
         return torch.logsumexp(found + shares.gather(-2, rounds), -1)
 
     def shares(self, log_weights: Tensor) -> Tensor:
-        """Log-weights ``[..., P, B, G']`` of the values that are kept, of those of all."""
+        """Log weights ``[..., P, B, G']`` of the kept values, given those of all values."""
         kept = self.kept.expand(*log_weights.shape[:-1], -1)
         return log_weights.gather(-1, kept) - self.log_kept
 
@@ -99,19 +99,19 @@ class ViewTable:
         sites: names of the discrete sites that views depend on.
         sizes: number of values of each of those sites.
         index: sight of each person, round and combination of those sites' values, ``[P, B, M]``,
-            an index into the person's U sights or ``NO_VIEW``. Where attention does not differ
-            from round to round a sight is a view, and U is V.
-        moments: of each step of a view, which of the N beliefs it is, ``[P, V, T]``; ``NO_VIEW`` in
+            an index into the person's U sights or ``NO_VIEW``. Without round latents a sight is a
+            view, and U is V.
+        moments: number of the moment at each step of a view, ``[P, V, T]``; ``NO_VIEW`` in
             padding.
         belief: ``[P, N, Z]``.
         values: the self-model's action values ``[P, N, A]``.
-        acted: what was done there, ``[P, N]``.
+        acted: the recorded action there, ``[P, N]``.
         recorded: actions ``[P, B, T]``, 0 in padding.
-        steps: which steps are real ``[P, B, T]``.
-        view_counts: number of real views of each person ``[P]``.
-        attention: what differs from round to round, if anything does: values that stand for all, or
-            a chain that is summed out exactly. Of a chain views are of spans: their moments
-            outside of these are ``NO_VIEW``.
+        steps: False in padding ``[P, B, T]``.
+        view_counts: number of views of each person ``[P]``, without padding.
+        attention: round latents, if the model has any: sampled values, or a chain that is summed
+            out exactly. Views of a chain are of spans: their moments outside of these are
+            ``NO_VIEW``.
     """
 
     sites: tuple[str, ...]
@@ -142,11 +142,11 @@ class ViewTable:
 
     @property
     def real(self) -> Tensor:
-        """Which rounds are real, ``[P, B]``."""
+        """Mask of the rounds that are not padding, ``[P, B]``."""
         return self.steps.any(-1)
 
     def sight_of(self, implants: Implants) -> Tensor:
-        """The sight that implants ``[..., P, 1]`` lead to in each round, ``[..., P, B]``."""
+        """Sight in each round ``[..., P, B]`` under implants ``[..., P, 1]``."""
         people = torch.arange(self.people, device=self.index.device)[:, None]
         rounds = torch.arange(self.rounds, device=self.index.device)
         begin = (people * self.rounds + rounds) * self.index.shape[-1]
@@ -154,19 +154,19 @@ class ViewTable:
 
     @cached_property
     def possible(self) -> Tensor:
-        """Which combinations were never given up, ``[P, M]``."""
+        """Mask of the combinations that were never dropped, ``[P, M]``."""
         return ((self.index != NO_VIEW) | ~self.real[..., None]).all(1)
 
     @cached_property
     def _places(self) -> Tensor:
-        """Number of each combination among the possible ones of a person, ``[P, M]``."""
+        """Index of each combination among a person's possible ones, ``[P, M]``."""
         return torch.where(self.possible, self.possible.cumsum(1) - 1, NO_VIEW)
 
     @cached_property
     def possible_numbers(self) -> Tensor:
         """Numbers of the possible combinations of each person, ``[C, P]``.
 
-        Padded with impossible ones, whose likelihood is as good as none.
+        Padded with impossible ones, whose likelihood is almost 0.
         """
         number = int(self.possible.sum(1).max())
         first = self.possible.long().argsort(dim=1, descending=True, stable=True)
@@ -179,32 +179,32 @@ class ViewTable:
         return self.index.gather(-1, numbers).clamp(min=0)
 
     def place_of(self, implants: Implants) -> Tensor:
-        """Which of the possible combinations implants ``[..., P, 1]`` are, ``[..., P, 1]``."""
+        """Index of implants ``[..., P, 1]`` among the possible combinations, ``[..., P, 1]``."""
         people = torch.arange(self.people, device=self.index.device)[:, None]
         begin = people * self.index.shape[-1]
         return self._places.reshape(-1)[begin + self.combination(implants)]
 
     def scores(self, likelihoods: Tensor) -> Tensor:
-        """Log-likelihood ``[..., P, C]`` of possible combinations, of sights ``[..., P, U]``."""
+        """Log-likelihood ``[..., P, C]`` of combinations, given that of sights ``[..., P, U]``."""
         sights = self._sights.flatten(1).expand(*likelihoods.shape[:-1], -1)
         found = likelihoods.gather(-1, sights).unflatten(-1, self._sights.shape[1:])
         return torch.where(self.real[..., None], found, 0.0).sum(-2)
 
     def combination(self, implants: Implants) -> Tensor:
-        """Number of the combination that implants ``[...]`` are, row-major over ``sizes``."""
+        """Number of the combination of implants ``[...]``, row-major over ``sizes``."""
         return combination_number(implants, dict(zip(self.sites, self.sizes, strict=True)))
 
     def along_views(self, moments: Tensor) -> Tensor:
-        """Log-likelihood ``[..., P, V]`` of what was recorded, of moments ``[..., P, N]``."""
+        """Log-likelihood ``[..., P, V]`` of views, given that of moments ``[..., P, N]``."""
         return self._steps_of_views(moments)
 
 
 class RecordedActions(TorchDistribution):
-    """Actions ``[B, T]`` of all rounds of a person, given the log-likelihood of what they may see.
+    """Distribution of a person's actions ``[B, T]`` with precomputed log-likelihoods.
 
     Args:
-        log_likelihoods: of the recorded actions under each possible combination ``[..., P, C]``.
-        place: which of these a person is ``[..., P, 1]``; ``NO_VIEW`` if none.
+        log_likelihoods: those of the actions under each possible combination ``[..., P, C]``.
+        place: index of the person's combination ``[..., P, 1]``; ``NO_VIEW`` if impossible.
         shape: (B, T).
     """
 
@@ -220,11 +220,11 @@ class RecordedActions(TorchDistribution):
         super().__init__(batch, shape, validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Looked up: ``value`` is what the likelihoods were computed for."""
+        """Look up the log-likelihood; ``value`` has to be the recorded actions, and is ignored."""
         del value
         number = self.log_likelihoods.shape[-1]
-        # Where each leading index of the likelihoods begins in the flat table; gathering from a
-        # flat table keeps the gradient as small as the table.
+        # Offset of each leading index in the flat table; gathering from a flat table keeps the
+        # gradient as small as the table.
         begin = torch.arange(
             self.log_likelihoods[..., 0].numel(), device=self.place.device
         ).reshape(*self.log_likelihoods.shape[:-1], 1)

@@ -1,8 +1,8 @@
-"""The views of one person's rounds.
+"""Builder of the table of views of one person's rounds.
 
 Every combination of the discrete implants is a candidate. After some rounds, candidates are dropped
-that explain the person's actions hopelessly worse than the best one, however the person decides:
-the later rounds need not be seen through their eyes, and exact marginalization stays cheap.
+whose likelihood is far below the best one's under every policy. Later rounds need no views of them,
+and exact marginalization stays cheap.
 """
 
 from __future__ import annotations
@@ -52,32 +52,32 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
 
 SCREENED_ROWS, MOST_ROWS = 4096, 32768
-"""Combinations of discrete implants times rounds that are gone through at once: with screening,
-about as many as take as long as the calls themselves, since in later rounds fewer are left."""
+"""Combinations of discrete implants times rounds that are processed at once. With screening,
+the number at which they take as long as the calls' overhead: later rounds have fewer left."""
 CHAINED_ROUNDS = 32
-"""Rounds that are gone through at once where attention is summed out exactly."""
+"""Rounds that are processed at once where attention is summed out exactly."""
 FEW_ROUNDS = 2
-"""So many rounds are gone through as they come."""
+"""Number of rounds up to which they are processed in the given order."""
 GROWTH = 3
-"""With screening, so many times the rounds before are gone through at once, at most."""
+"""With screening, largest ratio of the rounds processed at once to those before them."""
 KINDS_MERGE = 32
-"""Policies that tell moments apart where people are of several kinds, of all of them together."""
+"""Policies that distinguish moments if people are of several kinds; total over kinds."""
 PROPOSING_POLICIES = 64
-"""Draws from the prior by which attention is proposed where nothing is screened."""
+"""Draws from the prior that propose attention without screening."""
 TEMPERATURE = 4.0
 
 
 class ViewTableBuilder:
-    """What a person may have seen in their rounds so far.
+    """Accumulates the views of a person's rounds.
 
     Args:
-        human: whose ``perceive`` and ``believe`` are called (and ``act`` for screening).
-        screening: when to give up combinations; never if ``None``.
-        candidates: numbers of the combinations that are considered at all (see
-            :meth:`ViewTable.combination`); all of them unless given.
-        likely: draws ``[S, 1, 1, ...]`` of what the person may be like, from whom attention is
-            proposed; what rounds say of draws from the prior unless given.
-        values: of attention that stand for all in a round.
+        human: its ``perceive`` and ``believe`` are called (and ``act`` for screening).
+        screening: when to drop combinations; never if ``None``.
+        candidates: numbers of the combinations to consider (see :meth:`ViewTable.combination`);
+            all by default.
+        likely: approximate posterior draws ``[S, 1, 1, ...]`` of the person, from which attention
+            is proposed; by default prior draws weighted by earlier rounds.
+        values: number of sampled values of attention per round.
 
     Raises:
         HumanModelError: see :func:`perceived_sites` and :func:`require_own_attention`.
@@ -86,8 +86,8 @@ class ViewTableBuilder:
         grid: values ``[M]`` of the discrete sites that perception reads, for each combination.
         sizes: number of values of each of these sites.
         alive: numbers of the combinations that are left.
-        score: log-likelihood ``[policies, M]`` of each of them under each policy.
-        policies: these policies, see :func:`draw_policies`; what is likely, if that is known.
+        score: log-likelihood ``[policies, M]`` of each combination under each policy.
+        policies: these policies, see :func:`draw_policies`; ``likely``, if given.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class ViewTableBuilder:
         elif screening is not None:
             found = draw_policies(human, self.grid, screening.policies, screening.seed)
             self.policies = found or {}
-            if found is None:  # nobody is known under whom combinations could be given up
+            if found is None:  # no representative policies for screening
                 self.screening = screening = None
         number = 0 if screening is None else screening.policies
         if self.policies:
@@ -135,7 +135,7 @@ class ViewTableBuilder:
 
     @torch.no_grad()
     def add(self, rounds: Rounds) -> None:
-        """Go through more rounds, as many at once as there is little to go through."""
+        """Add rounds: the fewer combinations are left, the more rounds at once."""
         order, before = self._order(rounds), len(self._rounds)
         if order is None:
             self._go_through(rounds)
@@ -156,10 +156,10 @@ class ViewTableBuilder:
             first += len(some)
 
     def _order(self, rounds: Rounds) -> list[int] | None:
-        """The order in which rounds are gone through: those first that tell most of combinations.
+        """Order in which rounds are processed: the most informative about combinations first.
 
-        ``None`` for as they are, where few are to be given up or attention is proposed by the
-        rounds before.
+        ``None`` for the given order, if there are few combinations or attention is proposed from
+        earlier rounds.
         """
         number = len(rounds)
         as_they_are = self.human.has_round_latents or len(self.alive) < MANY
@@ -169,7 +169,7 @@ class ViewTableBuilder:
         candidates = {name: axis[some].repeat(number) for name, axis in self.grid.items()}
         row = torch.arange(number, device=some.device).repeat_interleave(len(some))
         views, which = views_of_rounds(self.human, candidates, row, rounds)
-        # As many policies as tell moments apart: that is enough to tell rounds apart, too.
+        # The policies that distinguish moments suffice to distinguish rounds.
         found = self._log_likelihoods(views, self._merging(self.screening))[:, which].unflatten(
             -1, (number, -1)
         )
@@ -177,14 +177,14 @@ class ViewTableBuilder:
         return telling_first(found, prior, self.screening.margin)
 
     def _at_once(self) -> int:
-        """How many rounds are gone through before combinations are given up."""
-        if self._proposal is not None:  # by what the rounds before say
+        """Number of rounds that are processed before combinations are dropped."""
+        if self._proposal is not None:  # proposed from earlier rounds
             return 1
         if self.human.chained:
             return CHAINED_ROUNDS
         if self.screening is None:
             return max(1, MOST_ROWS // len(self.alive))
-        # Few at first: the first ones tell most of what can be given up.
+        # Few at first, since the first rounds rule out most combinations.
         return max(1, min(GROWTH * len(self._rounds), SCREENED_ROWS // len(self.alive)))
 
     def _add_together(self, rounds: Rounds) -> None:
@@ -232,7 +232,7 @@ class ViewTableBuilder:
             self._screen(total, self.screening)
 
     def _attended_in(self, one: Rounds, proposal: Proposal) -> tuple[AttentionValues, int]:
-        """Values of attention that stand for all in a round, and a seed of this round."""
+        """Sampled values of attention in a round, and the round's seed."""
         so_far, actions = one.so_far(0)
         recorded = {**one.observation, "actions": one.actions}
         seed = _number_of({name: value[:, one.real[0]] for name, value in recorded.items()})
@@ -246,7 +246,7 @@ class ViewTableBuilder:
         return attended, seed
 
     def _add_chained(self, rounds: Rounds) -> None:
-        """Rounds where attention is summed out exactly."""
+        """Add rounds whose attention is summed out exactly."""
         alive = self.alive
         candidates = {name: axis[alive] for name, axis in self.grid.items()}
         views, chains = chained_views(self.human, candidates, len(alive), rounds)
@@ -271,27 +271,27 @@ class ViewTableBuilder:
             self._take(one, replace(part, chain=chain), every, alive)
 
     def _take(self, one: Rounds, part: RoundViews, seen: Tensor, alive: Tensor) -> None:
-        """Keep a round: which of its views each combination that was alive has."""
+        """Store a round, with the view of each combination that was alive."""
         self._rounds.append(part)
         self._seen.append((alive, seen))
         self._recorded.append((one.actions[0], one.real[0]))
 
     def _screen(self, found: Tensor, screening: Screening) -> None:
-        """Count log-likelihoods ``[policies, M']`` of those alive; give up the hopeless ones."""
+        """Add log-likelihoods ``[policies, M']`` of those alive; drop those far behind."""
         alive = self.alive
         score = self.score[:, alive] + found
         self.score[:, alive] = score
-        # With their prior: what it says, by a factor or an observed site too, may decide.
+        # With the prior, whose factors and observed sites may rule combinations out.
         joint = score + self.log_prior[:, alive]
         self.alive = alive[within(self.human, joint, screening.margin)]
 
     def table(self) -> ViewTable:
-        """The views that are left, as a table of one person; there was at least one round."""
+        """Build the table of the views that are left; needs at least one round."""
         index, rounds, sights, views, moments = [], [], 0, 0, 0
         shifted, attended, chains, counts = [], [], [], []
         steps = max(len(real) for _, real in self._recorded)
         for part, (combination, view) in zip(self._rounds, self._seen, strict=True):
-            # Only what somebody who was never given up has seen is worth keeping.
+            # Keep only views of combinations that were never dropped.
             row = torch.full((prod(self.sizes),), NO_VIEW, device=self.alive.device)
             row[combination] = view
             needed, place = torch.unique(row[self.alive], return_inverse=True)
@@ -328,7 +328,7 @@ class ViewTableBuilder:
         )
 
     def _attention(self, sights: list[Tensor]) -> Attention:
-        """Values of all rounds, given the sights of each ``[U, G']``."""
+        """Attention of all rounds, given the sights of each ``[U, G']``."""
         attended = self._attended
         rounds = [torch.full((len(part),), place) for place, part in enumerate(sights)]
         most = max(part.shape[1] for part in sights)
@@ -354,7 +354,7 @@ class ViewTableBuilder:
             number = PROPOSING_POLICIES
             return torch.full((number,), 1 / number, device=self.alive.device)
         joint = (self.score + self.log_prior)[:, self.alive].logsumexp(-1)
-        # Tempered: few policies would have all the weight, and none of them is the person.
+        # Tempered: else few policies, none of them the person, would have all the weight.
         return torch.softmax(joint / TEMPERATURE, 0)
 
     def _padded_to(self, steps: int, which: int) -> Tensor:
@@ -374,15 +374,15 @@ class ViewTableBuilder:
         return log_priors(self.human, self.grid, others, 1)[:, 0]
 
     def _merged(self, views: ManyViews, screening: Screening) -> tuple[ManyViews, Tensor]:
-        """Moments of a round that count as one made one; which each view is then."""
-        if not len(views.acted):  # of padding alone
+        """Merge equivalent moments of rounds; also returns the new number of each view."""
+        if not len(views.acted):  # padding only
             return views, torch.arange(len(views.moments), device=views.moments.device)
         policies = self._merging(screening)
         keys = [
             torch.round(self._of_moments(policies, views, some) / screening.resolution).long().T
             for some in torch.arange(len(views.acted), device=views.acted.device).split(CHUNK)
         ]
-        # What was done tells moments apart, too: theirs is one entry of ``acted``.
+        # Moments with different actions stay apart: each has one entry of ``acted``.
         key = torch.cat([torch.cat(keys), views.acted[:, None]], -1)
         first, cluster = distinct_in_groups(key, views.rounds)
         moments = views.moments
@@ -400,7 +400,7 @@ class ViewTableBuilder:
         return kept, place
 
     def _merging(self, screening: Screening) -> dict[str, Tensor]:
-        """The policies that tell moments apart: twice as many in all where people are of kinds."""
+        """Policies that distinguish moments; twice as many in all if there are kinds of people."""
         kinds = len(self.score) // screening.policies
         number = kinds * (screening.merge_policies if kinds == 1 else max(1, KINDS_MERGE // kinds))
         return {name: policy[:number] for name, policy in self.policies.items()}
@@ -408,8 +408,8 @@ class ViewTableBuilder:
     def _log_likelihoods(
         self, views: ManyViews, policies: Mapping[str, Tensor] | None = None
     ) -> Tensor:
-        """Of what was recorded under each policy and view, ``[policies, V]``."""
-        if not len(views.acted):  # of padding alone
+        """Log-likelihood of the recorded actions under each policy and view, ``[policies, V]``."""
+        if not len(views.acted):  # padding only
             return self.score.new_zeros(len(self.score), len(views.moments))
         moments = views.moments[None]
         along = Sums.of(moments, moments != NO_VIEW, len(views.acted))
@@ -417,7 +417,7 @@ class ViewTableBuilder:
         return along(self._of_moments(policies, views)[:, None])[:, 0]
 
     def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
-        """Log joint ``[policies, U, G]`` of actions and attention, of their likelihoods."""
+        """Log joint ``[policies, U, G]`` of actions and attention, given log-likelihoods."""
         values = {name: value[None, None] for name, value in attended.values.items()}
         with self._deciding(self.policies):
             implants = self.human.prior()
@@ -429,16 +429,16 @@ class ViewTableBuilder:
     def _of_moments(
         self, policies: Mapping[str, Tensor], views: ManyViews, some: Tensor | slice = slice(None)
     ) -> Tensor:
-        """Log-likelihood ``[policies, N]`` of what was recorded at some moments."""
+        """Log-likelihood ``[policies, N]`` of the record at some moments."""
         moments = (one[None, some] for one in (views.belief, views.values, views.acted))
         with self._deciding(policies) as number:
             _, found = choices(self.human, self.human.prior(), *moments)
-        # Of a model whose actions depend on no implant they are the same under every policy.
+        # If actions depend on no implant, they are the same under every policy.
         return found.expand(number, *found.shape[-2:])[:, 0]
 
     @contextmanager
     def _deciding(self, policies: Mapping[str, Tensor]) -> Iterator[int]:
-        """The program runs for so many people, each with one of the policies."""
+        """Condition the program on the policies, one draw each; yields their number."""
         number = len(next(iter(policies.values()))) if policies else len(self.score)
         with (
             poutine.block(),
@@ -450,7 +450,7 @@ class ViewTableBuilder:
 
 
 def _number_of(values: Mapping[str, Tensor]) -> int:
-    """A seed that tells recordings from others."""
+    """Hash of a recording, to be used as a seed."""
     total = 0
     for value in values.values():
         whole = as_whole_numbers(value).flatten()

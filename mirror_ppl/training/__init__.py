@@ -1,1 +1,1 @@
-"""Training of the networks: the self-model on rounds of the robot, guides on simulated people."""
+"""Network training: the self-model on rounds of the robot, guides on simulated people."""

@@ -1,7 +1,7 @@
-"""Experience of the robot: rounds it drove, and what each action would have led to.
+"""Experience of the robot: rounds that it drove, and the outcomes of every action.
 
-Experience is kept as where rounds began and what was done in them; the world is deterministic from
-there on, so observations, views and rewards are made again whenever a round is learned from.
+Only the initial states and the actions of rounds are stored. The world is deterministic, so
+observations, views and rewards are recomputed whenever a round is used for training.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from mirror_ppl.training.views import ViewPlan
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What one action would lead to at some steps, to the best knowledge of the observer.
+    """Outcomes of one action at some steps, to the best knowledge of the observer.
 
     Attributes:
         reward: ``[B, T']``.
-        over: whether nothing can be won or lost from there on ``[B, T']``.
+        over: True if no further reward is possible after the action ``[B, T']``.
         observation: the next observation ``[B, T', ...]``.
-        visible: what the observer would see of it ``[B, T', K]``.
+        visible: the items of it that the observer would see ``[B, T', K]``.
     """
 
     reward: Tensor
@@ -43,16 +43,16 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class Experience:
-    """Rounds under a view: what happened, and the outcomes of every action at some steps.
+    """Rounds under a view, with the outcomes of every action at some steps.
 
     Attributes:
-        rounds: what happened.
-        outcomes: of every action.
-        over: whether nothing could be won or lost any more, at these steps ``[B, T']``.
-        informed: whether the observer knows there all that counts ``[B, T']``.
-        exact: values of every action for somebody who does, if asked for, ``[B, T', A]``.
-        first: first step at which they were worked out.
-        stride: how far these steps are apart.
+        rounds: observations, actions and rewards.
+        outcomes: one entry for each action.
+        over: True if no further reward is possible, at these steps ``[B, T']``.
+        informed: True if the observer knows all decisive items there ``[B, T']``.
+        exact: action values for an observer who knows them, if requested, ``[B, T', A]``.
+        first: first step with outcomes.
+        stride: distance between these steps.
     """
 
     rounds: Rounds
@@ -65,7 +65,7 @@ class Experience:
 
     @property
     def steps(self) -> slice:
-        """At which steps of the rounds there are outcomes."""
+        """Steps of the rounds that have outcomes."""
         return slice(self.first, None, self.stride)
 
 
@@ -78,19 +78,19 @@ def experience(
     stride: int = 1,
     discount: float | None = None,
 ) -> Experience:
-    """What an observer with a view gets from rounds.
+    """Compute the experience of an observer with a view.
 
-    The world of an observer who takes things for granted is as they believe it to be, and so are
-    the observations, rewards and outcomes from which the networks learn to think like them.
+    If the observer makes assumptions, the world is replaced by the world as they believe it to be,
+    so the networks learn from observations, rewards and outcomes of that believed world.
 
     Args:
         domain: the world.
         start: states ``[B]``.
         actions: ``[B, T]``.
         plan: views of B rounds.
-        first: first step at which the outcomes of every action are worked out.
-        stride: how far these steps are apart.
-        discount: of exact values; without it there are none.
+        first: first step at which the outcomes of every action are computed.
+        stride: distance between these steps.
+        discount: discount of exact values, which are computed only if it is given.
     """
     states = roll_out(domain, start, actions)
     visible, knowledge = follow(domain, plan, domain.observe(states))
@@ -142,7 +142,7 @@ def experience(
 
 
 def follow(domain: Domain, plan: ViewPlan, observation: Observation) -> tuple[Visibility, Any]:
-    """What is visible of rounds ``[B, T + 1, K]``, and what is known of them ``[B, T + 1]``."""
+    """Visibility of rounds ``[B, T + 1, K]``, and the knowledge at each step ``[B, T + 1]``."""
     batch, steps = observation["ego"].shape[:2]
     knowledge = domain.nothing_known(batch, 1, device=observation["ego"].device)
     looks = []
@@ -173,10 +173,10 @@ def drive(
     expert: float = 0.0,
     discount: float = 0.9,
 ) -> Tensor:
-    """Actions ``[B, T]`` of the robot in rounds that it sees through a view.
+    """Drive rounds that the robot sees through a view, and return the actions ``[B, T]``.
 
     Args:
-        self_model: whose greedy policy drives.
+        self_model: its greedy policy drives.
         start: states ``[B]``.
         plan: views of B rounds.
         steps: number of actions T.

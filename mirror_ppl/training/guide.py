@@ -1,13 +1,13 @@
-"""Training of the amortized guide by inference compilation, and by the ELBO if asked.
+"""Training of the amortized guide by inference compilation and, optionally, by the ELBO.
 
-People are drawn from the prior, play rounds in the true domain, and the guide learns to find the
-implants that made them play so, from the first rounds, from more of them, and from all::
+People are drawn from the prior and play rounds in the true domain. The guide learns to infer their
+implants from the first n of these rounds, for several n::
 
     psi_p ~ prior;   rounds_p ~ program(psi_p);   minimize  - E log q(psi_p | first n rounds_p)
 
 (Le, Baydin and Wood, *Inference compilation and universal probabilistic programming*, 2017). At its
-minimum the guide is the posterior of everybody at once, as far as it can express it. Steps of the
-ELBO (:mod:`mirror_ppl.training.guide_elbo`) can be put between.
+minimum the guide is the posterior of every person, as far as its family can express it. ELBO steps
+(:mod:`mirror_ppl.training.guide_elbo`) can be interleaved.
 """
 
 from __future__ import annotations
@@ -52,15 +52,14 @@ class GuideOptions:
 
     Attributes:
         people: number of people drawn from the prior.
-        rounds: numbers of rounds after which evidence is looked at, increasing.
+        rounds: numbers of rounds after which evidence is computed, increasing.
         steps: gradient steps of inference compilation.
-        elbo_steps: gradient steps of the ELBO, evenly among the others.
-        batch: examples in a gradient step, of a person and a number of rounds each.
-        learning_rate: of AdamW at the start; it falls to nothing on a cosine.
-        weight_decay: of AdamW.
-        dropout: share of the network's units that are left out at a step; more where there are
-            many sites, or few people.
-        held_out: share of the people who only tell when to stop.
+        elbo_steps: gradient steps of the ELBO, spread evenly among the others.
+        batch: examples in a gradient step; each is a person and a number of rounds.
+        learning_rate: initial rate of AdamW, annealed to 0 on a cosine.
+        weight_decay: weight decay of AdamW.
+        dropout: dropout rate of the network; should be higher for many sites or few people.
+        held_out: share of the people held out for early stopping.
         together: people who are simulated at once.
     """
 
@@ -88,11 +87,11 @@ class GuideOptions:
 
 @dataclass(frozen=True)
 class Examples:
-    """What there is to learn from, of N people and n numbers of rounds.
+    """Training examples: N people, each at n numbers of rounds.
 
     Attributes:
         place: true implants in unconstrained space, ``[N, D]``.
-        log_evidence: ``[N, n, W]``.
+        log_evidence: features that the network reads, ``[N, n, W]``.
         steps: recorded actions so far, ``[N, n]``.
     """
 
@@ -111,18 +110,18 @@ def train_guide(
     report: Report = silent,
     checkpoint: Path | None = None,
 ) -> tuple[AmortizedGuide, dict[str, float]]:
-    """A guide for a human model, and how good it is on people whom it did not learn from.
+    """Train a guide for a human model, and evaluate it on held-out people.
 
     Args:
         human: the model of people.
         options: settings.
-        seed: of everything random.
-        report: told of people simulated and of gradient steps.
-        checkpoint: file to continue the simulation of people from; written on the way.
+        seed: seed of all random draws.
+        report: called with progress: people simulated, gradient steps.
+        checkpoint: file from which the simulation of people continues; updated during the run.
 
     Returns:
-        The guide; and in nats a person its mean loss on held-out people, that of the prior, and
-        their difference: what the guide learns from rounds.
+        The guide; and its mean loss on held-out people, the prior's loss, and their difference (the
+        information gained from rounds), in nats per person.
 
     Raises:
         CheckpointError: the checkpoint is damaged or of another run.
@@ -145,13 +144,13 @@ def simulate_examples(
     report: Report = silent,
     checkpoint: Path | None = None,
 ) -> Examples:
-    """People from the prior, and what their rounds say, more and more of them."""
+    """Simulate people from the prior, and compute the log-evidence after each number of rounds."""
     run = run_identity(human, None, [seed, options.people, options.rounds, options.together])
     parts = _restored(checkpoint, run)
     done = sum(len(part) for part in parts)
     while done < options.people:
         report("simulate", done, options.people, "people")
-        # Of each group its own seed, so that a run that goes on is the same as one never stopped.
+        # Each group has its own seed, so that a resumed run equals an uninterrupted one.
         generator = torch.Generator().manual_seed(seed * 1_000_003 + done)
         number = min(options.together, options.people - done)
         implants = prior_people(human, number, generator)
@@ -213,7 +212,7 @@ def _optimize(
     numbers = examples.steps.shape[1]
 
     def loss(person: Tensor, number: Tensor) -> Tensor:
-        """Mean negative log density of the truth, by the guide as a program."""
+        """Mean negative log density of the true values under the guide."""
         place = examples.place[person][:, None]
         program = poutine.condition(guide, data={"place": place})
         evidence, steps = examples.log_evidence[person, number], examples.steps[person, number]
@@ -229,7 +228,7 @@ def _optimize(
     best, kept = float("inf"), copy.deepcopy(guide.state_dict())
     for step in range(options.steps):
         guide.train()
-        # So many of them are due by now.
+        # ELBO steps due by now.
         due = (step + 1) * options.elbo_steps // options.steps
         for _ in range(step * options.elbo_steps // options.steps, due):
             by_elbo.step()
@@ -255,7 +254,7 @@ def _optimize(
 
 
 def _prior_loss(human: HumanModel, examples: Examples, learned: int) -> float:
-    """What the loss would be if the guide were the prior."""
+    """Loss of the prior in place of the guide."""
     given = {
         name: site(examples.place[learned:, column]).view(-1, 1, 1)
         for column, (name, site) in enumerate(scalar_sites(human).items())

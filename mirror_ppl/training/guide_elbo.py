@@ -1,12 +1,12 @@
 """Training of the amortized guide by the ELBO, with ``pyro.infer.SVI``.
 
-People are drawn from the prior and play rounds, a group at a time; then the network learns to
-explain their actions, whatever implants made them::
+People are drawn from the prior and play rounds, a group at a time. The network then maximizes the
+ELBO of their actions, without access to their true implants::
 
     psi_p ~ prior;   rounds_p ~ program(psi_p);   minimize  - ELBO(q(. | rounds_p), rounds_p)
 
-Discrete sites are summed out. Continuous sites that the network does not cover, the weights of a
-residual, have a mean-field guide beside it, which begins anew with each group.
+Discrete sites are summed out. Continuous sites that the network does not cover (the weights of a
+residual) have a mean-field guide, which is reinitialized for each group.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ STEPS_OF_A_GROUP = 25
 MEAN_FIELD_RATE = 0.01
 """Learning rate of the mean-field guide."""
 NORM = 100.0
-"""Of a gradient; larger ones are clipped."""
+"""Largest gradient norm; larger gradients are clipped."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Group:
 
     Attributes:
         compiled: their rounds.
-        log_evidence: what the network reads of them, ``[P, 1, W]``.
+        log_evidence: features of the rounds that the network reads, ``[P, 1, W]``.
         steps: numbers of recorded actions, ``[P, 1]``.
         place: true values of the scalar sites in unconstrained space, ``[P, D]``.
     """
@@ -64,7 +64,7 @@ class Group:
 def simulated_groups(
     human: HumanModel, rounds: Sequence[int], generator: torch.Generator
 ) -> Iterator[Group]:
-    """Ever new people from the prior, of each group as many rounds as one of these numbers."""
+    """Yield groups of simulated people; each group's number of rounds is drawn from ``rounds``."""
     while True:
         number = rounds[int(torch.randint(len(rounds), (), generator=generator))]
         implants = prior_people(human, GROUP, generator)
@@ -85,9 +85,9 @@ class ELBOTraining:
     """Gradient steps of the ELBO.
 
     Args:
-        network: what learns.
-        groups: people to learn from.
-        learning_rate: of Adam for the network.
+        network: the guide to train.
+        groups: simulated people.
+        learning_rate: rate of Adam for the network.
     """
 
     def __init__(
@@ -106,13 +106,13 @@ class ELBOTraining:
         self._svi: SVI | None = None
 
     def step(self) -> float:
-        """One gradient step, with the global random state; negative ELBO in nats a person."""
+        """Take one gradient step (global random state); return the negative ELBO, nats a person."""
         if self._steps % STEPS_OF_A_GROUP == 0:
             self._svi = self._of(next(self.groups))
             self._parameters = {"params": {}, "constraints": {}}
         self._steps += 1
         assert self._svi is not None
-        # What is wrong with a model shows at the first step.
+        # Pyro validates the model at the first step only.
         with (
             pyro.get_param_store().scope(self._parameters),
             pyro.validation_enabled(self._steps == 1),

@@ -1,4 +1,4 @@
-"""Amortized guides as files: safetensors, with a card in the file's own metadata."""
+"""Files of amortized guides: safetensors, with a card in the metadata."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def shipped_guide(domain: str, human_model: str = FIRST) -> Path:
     """Path of the guide that ships for a domain and one of the package's human models.
 
     Args:
-        domain: its name.
+        domain: name of the domain.
         human_model: a name in `mirror_ppl.models.variants.VARIANTS`.
 
     Raises:
-        AssetError: none ships.
+        AssetError: no guide ships for them.
     """
     which = "" if human_model == FIRST else f"_{human_model.replace('-', '_')}"
     return asset_path(f"{domain}_guide{which}.safetensors")
@@ -40,7 +40,7 @@ def shipped_guide(domain: str, human_model: str = FIRST) -> Path:
 def save_guide(
     guide: AmortizedGuide, human: HumanModel, path: Path, card: Mapping[str, Any]
 ) -> None:
-    """Write a guide and its card: how it was made, and how good it is.
+    """Write a guide and its card: how it was trained, and its quality.
 
     Raises:
         OutputError: the file cannot be written.
@@ -50,7 +50,7 @@ def save_guide(
 
 
 def _belongs_to(human: HumanModel) -> dict[str, str]:
-    """What a guide of this human model says that it is for."""
+    """Metadata that identify the human model of a guide."""
     return {
         "domain": human.domain.name,
         "domain_version": human.domain.version,
@@ -63,8 +63,8 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
     """Read a guide, ready for use, and its card.
 
     Args:
-        path: a file of :func:`save_guide`.
-        human: the human model that it has to be for.
+        path: a file written by :func:`save_guide`.
+        human: the human model that the guide has to be for.
 
     Raises:
         AssetError: the file is missing or damaged, or is for another human model, self-model,
@@ -94,12 +94,12 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
 
 
 def network_for(engine: str, path: Path | None, human: HumanModel) -> AmortizedGuide | None:
-    """The network that an engine proposes by: a file's, or the one that ships; else ``None``.
+    """Load the network of an engine: from a file, or the one that ships; else ``None``.
 
     Raises:
         AssetError: the file cannot be read or is for another human model; or the engine needs a
             network and none ships.
-        HumanModelError: the engine needs a network, and of this human model there cannot be one.
+        HumanModelError: the engine needs a network, and this human model cannot have one.
     """
     if not ENGINES[engine].takes_network:
         return None
@@ -122,7 +122,7 @@ def network_for(engine: str, path: Path | None, human: HumanModel) -> AmortizedG
 
 
 def _shipped_network(human: HumanModel, names: Sequence[str]) -> AmortizedGuide | None:
-    """The network that ships for exactly this human model with this self-model, if one does."""
+    """The network that ships for exactly this human model and self-model, or ``None``."""
     try:
         path = shipped_guide(human.domain.name, names[0])
     except (AssetError, IndexError):

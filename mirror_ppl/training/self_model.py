@@ -1,14 +1,14 @@
 """Training of the self-model: SVI for the world, Q-learning for the policy (supplement, section D).
 
-Training alternates between phases of driving and of learning. Before a phase each round is given to
-the expert with probability beta, else to the model's own epsilon-greedy policy. Every gradient step
-draws rounds from all experience so far, sees each through a view of its own, and follows
+Training alternates between driving and learning. In a driving phase each round is driven by the
+expert with probability beta, else by the model's own epsilon-greedy policy. Every gradient step
+samples rounds from all experience so far, each under a newly drawn view, and minimizes
 
     - ELBO / (B (T + 1)) * world_weight  +  mean squared Bellman error of both actions.
 
-The Bellman error uses the outcomes of *every* action: the robot's simulator is at hand, so no
-action's value has to wait until somebody takes it. Where the robot knows everything, it can also
-learn from the exact planner, which is its expert, instead of from what it expects itself.
+The Bellman error uses the outcomes of *every* action, from the robot's simulator, not only of the
+action taken. Where the observer knows everything, the targets can also be the values of the exact
+planner (the expert) instead of bootstrapped values.
 """
 
 from __future__ import annotations
@@ -43,28 +43,27 @@ class SelfModelOptions:
         rounds: rounds driven in a phase.
         steps: gradient steps of a phase.
         batch: rounds in a gradient step.
-        learning_rate: of Adam at the start; it falls to a hundredth on a cosine. The supplement
-            has 3e-4; ``docs/decisions.md`` has the measurement of both.
+        learning_rate: initial rate of Adam, annealed to a hundredth on a cosine. The supplement
+            has 3e-4; ``docs/decisions.md`` compares both.
         beta: probability that the expert drives a round, in the first phase (supplement: 0.5).
         beta_decay: factor on beta after each phase (supplement: 0.8).
         epsilon: probability of a random action, in the first phase (supplement: 0.5).
         epsilon_decay: factor on epsilon after each phase (supplement: 0.75).
-        epsilon_floor: least epsilon; people err more often than a finished policy, and the
+        epsilon_floor: least epsilon; people err more often than a trained policy, and the
             robot has to know the states that errors lead to.
         discount: discount of rewards per step.
         target_rate: rate at which the target network follows the Q-network, per step.
         world_weight: weight of the negative ELBO per observation.
-        speech_weight: how often what is said counts in that; pictures have many more numbers.
-        length: steps of a round that is learned from; as many as a round has, if 0.
-        stride: of every so many steps of a round one is learned from for values; which, is drawn.
-        difference_weight: how often errors count by which actions differ, besides the errors
-            themselves. What people choose hangs on differences alone.
-        kinds: share of rounds that are seen in full, with items dropped, and by limited sight; see
-            `mirror_ppl.training.views`.
-        at_means: whether values are learned at the encoder's means in every step, and not at draws
-            of the guide in every other one: sooner exact, where what counts is clear to see.
-        exact: whether somebody who knows all that counts learns the values of the exact planner,
-            where there is one, and not what a step leads to.
+        speech_weight: weight of messages in the ELBO; pictures have many more numbers.
+        length: steps of a training round; the domain's horizon if 0.
+        stride: values are learned at one of every ``stride`` steps; the offset is random.
+        difference_weight: weight of errors in the differences between actions, added to the errors
+            themselves. Choices of people depend on these differences alone.
+        kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
+        at_means: True to learn values at the encoder's means in every step, False to alternate with
+            draws of the guide. Means are exact sooner where decisive items are clearly visible.
+        exact: True to learn the exact planner's values, where there is one, for observers who know
+            all decisive items, instead of bootstrapped values.
     """
 
     phases: int = 40
@@ -90,11 +89,11 @@ class SelfModelOptions:
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
-        """The settings for a domain, with changes.
+        """Settings of a domain, with changes.
 
         Args:
-            domain: its name.
-            changes: settings by name; None leaves what is set for the domain.
+            domain: name of the domain.
+            changes: settings by name; None keeps the domain's own.
         """
         given = {name: value for name, value in changes.items() if value is not None}
         return cls(**{**settings_of(get_domain(domain).record, "training", cls), **given})
@@ -135,13 +134,13 @@ def self_model_loss(
     """Loss of a batch of rounds.
 
     Args:
-        self_model: what is trained.
-        target: the slow copy of its Q-network.
+        self_model: the model to train.
+        target: target network, the slow copy of its Q-network.
         lived: rounds and outcomes.
         options: settings.
-        on_means: learn values at the encoder's means, which is what everything that uses them
-            believes in, and not at draws of the guide, which keep the guide from being vague about
-            what values depend on. Training takes turns.
+        on_means: True to learn values at the encoder's means, which all other code uses as beliefs;
+            False for draws of the guide, which keep it precise about what values depend on.
+            Training alternates.
     """
     rounds = lived.rounds
     bound, z = self_model.elbo(rounds)
@@ -166,7 +165,7 @@ def self_model_loss(
     goal = torch.stack(goals, -1)
     if lived.exact is not None:
         goal = torch.where(lived.informed[..., None], lived.exact, goal)
-    # When all is done, which may be so in every round, it does not matter what one does.
+    # Once a round is over (possibly in every round) actions do not matter.
     error = (self_model.action_values(belief) - goal)[~lived.over]
     unlike = error - error.mean(-1, keepdim=True)
     bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
@@ -192,13 +191,13 @@ def train_self_model(
         generator: source of randomness; torch's global generator is forked and seeded from it
             because Pyro draws from the global one.
         report: called after each phase with the number of phases done and a message.
-        checkpoint: file that is written after each phase and continued from if it exists.
+        checkpoint: file that is written after each phase and resumed from if it exists.
         speech: a name in `mirror_ppl.models.speech.EMBEDDINGS`.
-        sizes: of the networks; the domain's own unless given.
+        sizes: sizes of the networks; by default the domain's own.
         kind: class of the self-model.
 
     Raises:
-        AssetError: that embedding needs what is not there.
+        AssetError: a file or package of that embedding is missing.
         CheckpointError: if the checkpoint belongs to another run (domain, options or seed) or
             cannot be read.
     """
@@ -213,7 +212,7 @@ def train_self_model(
 
 
 class _Trainer:
-    """State of a training run; everything that a checkpoint has to hold."""
+    """State of a training run, as checkpoints hold it."""
 
     def __init__(
         self,
@@ -264,7 +263,7 @@ class _Trainer:
             report(self.phase, message)
 
     def _save(self, path: Path) -> None:
-        # Whole numbers of a world are small.
+        # Integers of a world are small.
         starts = [
             map_state(lambda part: part.int() if part.dtype == torch.long else part, start)
             for start in self.starts
@@ -311,7 +310,7 @@ class _Trainer:
         epsilon = options.epsilon * options.epsilon_decay**self.phase
         expert = options.beta * options.beta_decay**self.phase
         if not offers(domain, "reference_values"):
-            expert = 0.0  # there is no exact planner: the policy is learned from outcomes alone
+            expert = 0.0  # no exact planner: the policy is learned from outcomes alone
         self.starts.append(start)
         self.actions.append(
             drive(
@@ -364,7 +363,7 @@ class _Trainer:
         return f"elbo {elbo:.2f} per observation, bellman error {bellman:.3f}"
 
     def _first(self) -> int:
-        """At which step the first of every ``stride`` steps is from which values are learned."""
+        """Random first step at which values are learned; the others follow every ``stride``."""
         if self.options.stride == 1:
             return 0
         device = self.generator.device

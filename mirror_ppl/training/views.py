@@ -1,17 +1,17 @@
-"""Views: who sees what of a round. Modality and item dropout for training the self-model.
+"""Views of training rounds: modality and item dropout for the self-model.
 
-One encoder has to serve the robot, which sees everything, and people, who see less and differ in
-what they make of it. So each training round is seen in a way of its own, of three kinds:
+One encoder has to serve the robot, which sees everything, and people, who see less and interpret it
+differently. Each training round is therefore seen through a randomly drawn view of three kinds:
 
 - *full*: everything, in both modalities;
 - *dropout*: each item with a probability drawn for the round, in each modality;
-- *sight*: items up to a reach drawn for each direction, in worlds where that takes time noticed at
-  each step with a probability drawn for the round; and now and then something is told.
+- *sight*: items within a reach drawn for each direction; in worlds where noticing takes time, each
+  is noticed at each step with a probability drawn for the round. Some rounds include messages.
 
-An observer with a sight view remembers: what follows from what they have seen and been told counts
-as visible. And they may take things for granted, such as that a car never seen is not there. For
-such a round the world itself is taken to be as believed, so that the encoder learns what such an
-observer would conclude; an item that is merely not visible stays unknown.
+An observer with a sight view has memory: what follows from earlier observations and messages counts
+as visible. They may also make assumptions, such as that a car never seen is not there. For such a
+round the world is replaced by the believed one, so that the encoder learns what such an observer
+would conclude; an item that is merely not visible stays unobserved.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ ASSUMPTION_PROBABILITY = 0.7
 """Share of sight views in which each assumption is made."""
 TOLD_PROBABILITY = 0.4
 ALIKE_PROBABILITY = 0.5
-"""Share of sight views with the same reach in all directions of a group: most people's eyes."""
+"""Share of sight views with the same reach in all directions of a group, as most people have."""
 
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """How each of B rounds is seen; the same plan can be applied to any course of the round.
+    """Views of B rounds; a plan can be applied to any course of a round.
 
     Attributes:
         reach: sight threshold for each direction ``[B, D]``, in the domain's unit of distance.
         keep: for each modality, the probability ``[B]`` that an item within reach is visible.
-        told: for each modality, the probability ``[B]`` that a communicable item is told.
-        remembers: ``[B]``, whether what follows from earlier observations counts as visible.
-        assumes: for each of the domain's assumptions, whether it is made, ``[B]``.
+        told: for each modality, the probability ``[B]`` that a communicable item is communicated.
+        remembers: ``[B]``, True if what follows from earlier observations counts as visible.
+        assumes: for each of the domain's assumptions, True where it is made, ``[B]``.
         noise: for each modality, uniform numbers ``[B, T + 1, K, 2]`` that decide keep and told.
     """
 
@@ -58,7 +58,7 @@ class ViewPlan:
     def sees(
         self, domain: Domain, observation: Observation, first: int = 0, stride: int = 1
     ) -> Visibility:
-        """What is seen unaided ``[B, T', K]`` of observations ``[B, T', ...]`` from a step on."""
+        """Items seen without messages ``[B, T', K]``, of observations ``[B, T', ...]``."""
         direction, distance = domain.distance(observation)
         batch = torch.arange(len(self.reach), device=self.reach.device)[:, None, None]
         seen = {
@@ -76,7 +76,7 @@ class ViewPlan:
     def visibility(
         self, domain: Domain, observation: Observation, first: int = 0, stride: int = 1
     ) -> Visibility:
-        """What is seen or told ``[B, T', K]`` of observations from step ``first``."""
+        """Items seen or communicated ``[B, T', K]``, of observations from step ``first`` on."""
         communicable = domain.communicable(observation)
         visible = self.sees(domain, observation, first, stride)
         for name, seen in visible.items():
@@ -87,17 +87,17 @@ class ViewPlan:
     def look(
         self, domain: Domain, knowledge: Any, observation: Observation, first: int, stride: int = 1
     ) -> tuple[Visibility, Any]:
-        """What is visible, all told, and the knowledge after each of some steps.
+        """Compute visibility and the updated knowledge at some steps.
 
         Args:
             domain: the world.
             knowledge: before each of these steps, ``[B, T']``.
             observation: ``[B, T', ...]``, from step ``first`` on.
             first: number of the first of these steps.
-            stride: how far these steps are apart.
+            stride: distance between these steps.
 
         Returns:
-            Masks ``[B, T', K]`` of items seen, told of or remembered, and knowledge ``[B, T']``.
+            Masks ``[B, T', K]`` of items seen, heard or remembered, and knowledge ``[B, T']``.
         """
         visible = self.visibility(domain, observation, first, stride)
         knowledge = domain.learn(
@@ -113,7 +113,7 @@ class ViewPlan:
         }, knowledge
 
     def taken(self, domain: Domain, knowledge: Any, observation: Observation) -> Visibility:
-        """Items ``[B, T', K]`` that are taken for granted, given knowledge ``[B, T']``."""
+        """Items ``[B, T', K]`` that the assumptions cover, given knowledge ``[B, T']``."""
         items, _ = domain.assume(knowledge, observation)
         taken = {
             name: torch.zeros_like(value[..., 0], dtype=torch.bool)
@@ -137,7 +137,7 @@ def draw_views(
 
     Args:
         domain: the world.
-        batch: rounds.
+        batch: number of rounds.
         steps: actions of a round.
         generator: source of randomness.
         kinds: share of rounds with a view of each of ``KINDS``.

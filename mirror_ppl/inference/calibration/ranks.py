@@ -1,10 +1,10 @@
-"""Ranks of the truth among posterior draws: what they say of the posterior, in numbers and a file.
+"""Ranks of the truth among posterior draws, and statistics of calibration.
 
-Where people are drawn from the prior, what they do from the program, and inference is right, the
-truth is exchangeable with the S posterior draws of it: its rank among them is uniform over 0 .. S.
+If people are drawn from the prior, their actions from the program, and inference is exact, the
+truth is exchangeable with its S posterior draws: its rank among them is uniform over 0 .. S.
 Posteriors that are too narrow give too many extreme ranks, too wide ones too few, and shifted ones
-too many at one end. A posterior that is the prior is right, too, and so are all that leave out part
-of the data: how much is inferred is told by sharpness. Nothing here knows where draws come from.
+too many at one end. The prior, or a posterior that ignores part of the data, is calibrated, too:
+``sharpness`` measures how much is inferred. This module does not depend on the source of draws.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.netcdf import read_netcdf
 
 FAILURE_RATE = 1e-3
-"""How often a right posterior may be rejected, for each site and number of rounds."""
+"""Probability that a calibrated posterior is rejected, for each site and number of rounds."""
 LEVELS = (0.5, 0.8, 0.9)
 """Probabilities of the central intervals whose coverage is counted."""
 ENDS = (0.05, 0.95)
@@ -38,18 +38,18 @@ EXACTLY: Any = {
     "data_vars": "all",
     "coords": "minimal",
 }
-"""How parts are put together: they have to match."""
+"""Options for joining parts, which have to match."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How posteriors compare with the truth, for each site and number of rounds.
+    """Results of a calibration, for each site and number of rounds.
 
     Attributes:
         data: dimensions ``site``, ``rounds`` and ``person``, variables of :func:`judge` and
-            :func:`collect`; attributes say what was calibrated.
-        failure_rate: probability that a right posterior is rejected, for each site and number of
-            rounds.
+            :func:`collect`; attributes describe what was calibrated.
+        failure_rate: probability that a calibrated posterior is rejected, for each site and number
+            of rounds.
 
     Raises:
         ValueError: the failure rate is no probability.
@@ -77,10 +77,10 @@ class Calibration:
         """Share of people whose central interval holds the truth, ``[site, rounds, level]``.
 
         S draws leave S + 1 gaps, equally probable to hold the truth. ``place`` is a random point of
-        the truth's gap, so it is uniform over 0 .. 1 if the posterior is right; and the interval of
-        level q holds the truth if ``|2 place - 1| <= q``, which has probability q exactly. An
-        interval that ends inside of a gap, or inside of the probability of one value of a discrete
-        site, thus holds what is there at random, as often as the part inside is large.
+        the truth's gap, so it is uniform over 0 .. 1 if the posterior is calibrated; and the
+        interval of level q holds the truth if ``|2 place - 1| <= q``, which has probability q
+        exactly. An interval that ends inside of a gap, or inside of the probability of one value of
+        a discrete site, is thus randomized.
         """
         level = xr.DataArray(list(LEVELS), coords={"level": list(LEVELS)}, dims="level")
         inside = abs(2 * self.data["place"] - 1) <= level
@@ -94,7 +94,7 @@ class Calibration:
 
     @property
     def rejected(self) -> list[tuple[str, int]]:
-        """Sites and numbers of rounds whose posteriors are not right."""
+        """Sites and numbers of rounds whose calibration is rejected."""
         table = self.table()
         wrong = table[table["p_value"] < self.failure_rate]
         return list(zip(wrong["site"].tolist(), wrong["rounds"].tolist(), strict=True))
@@ -108,10 +108,10 @@ class Calibration:
               ``p_histogram`` and ``p_ecdf``, or the latter alone where the former is NaN because
               people are too few;
             - ``coverage_50``, ``coverage_50_se`` and so on: :attr:`coverage` with its error;
-            - ``sharpness``: 1 where the posterior says no more than the prior, 0 where it is sure.
-              The mean width of the 90% interval, relative to the prior's; of discrete sites the
-              mean entropy, relative to the prior's;
-            - of discrete sites (else NaN) ``probability``, the posterior's of the truth, and
+            - ``sharpness``: 1 for the prior, 0 for certainty. The mean width of the 90% interval,
+              relative to the prior's; for discrete sites the mean entropy, relative to the
+              prior's;
+            - for discrete sites (else NaN) ``probability``, the posterior's of the truth, and
               ``entropy`` in nats, both means, and ``prior_probability`` and ``prior_entropy``;
             - ``high_pareto_k``: share of people above 0.7; NaN if there are no weights.
         """
@@ -137,7 +137,7 @@ class Calibration:
             row[f"{name}_se"] = float(own["error"].sel(level=level))
         kind = "entropy" if own["discrete"] else "width"
         before = float(own[f"prior_{kind}"])
-        # A site that is known for certain beforehand cannot get any sharper.
+        # Undefined for a site that is certain under the prior.
         row["sharpness"] = float(own[kind].mean()) / before if before > 0 else np.nan
         for name in ("probability", "entropy"):
             row[name] = float(own[name].mean())
@@ -155,13 +155,13 @@ class Calibration:
         write_whole(path, self.content())
 
     def content(self) -> memoryview:
-        """What a file of it holds."""
+        """Content of its netCDF file."""
         data = self.data.assign_attrs(failure_rate=self.failure_rate)
         return data.to_netcdf(engine="h5netcdf")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:
-        """Read a file of :meth:`save`.
+        """Read a file written by :meth:`save`.
 
         Raises:
             PosteriorError: the file is missing or damaged, or holds something else.
@@ -178,8 +178,8 @@ class Calibration:
 def ranks(truth: np.ndarray, draws: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Ranks ``[P]``, from 0 to S, of truths ``[P]`` among draws ``[S, P]``.
 
-    Among the draws that equal it, the truth takes each place with the same probability. So if the
-    truth is one more draw, all S + 1 ranks are equally probable, however many ties there are.
+    Ties are broken uniformly at random. If the truth is exchangeable with the draws, all S + 1
+    ranks are thus equally probable, also with ties.
     """
     below, same = (draws < truth).sum(0), (draws == truth).sum(0)
     return below + rng.integers(same + 1)
@@ -197,19 +197,19 @@ def judge(
     Args:
         truth: by site, ``[P]``.
         draws: by site, ``[S, P]``.
-        discrete: which sites are.
-        rng: source of how ties are broken.
-        pareto_k: of importance weights ``[P]``; NaN counts as infinite.
+        discrete: names of the discrete sites.
+        rng: source of randomness for ties.
+        pareto_k: Pareto k of importance weights ``[P]``; NaN counts as infinite.
 
     Returns:
         Dimensions ``site`` and ``person``: ``truth``; its ``rank``; its ``place``, see
         :attr:`Calibration.coverage`; ``width`` of the 90% interval of continuous sites;
-        ``probability`` of the truth and ``entropy`` in nats of discrete sites, of shares of draws
-        (which makes the entropy of n values too small by up to ``(n - 1) / 2S``). ``pareto_k`` has
-        the dimension ``person`` alone.
+        ``probability`` of the truth and ``entropy`` in nats of discrete sites, from shares of draws
+        (which biases the entropy of n values by up to ``-(n - 1) / 2S``). ``pareto_k`` has the
+        dimension ``person`` only.
 
     Raises:
-        ValueError: there are no draws, or more of one site than of another.
+        ValueError: there are no draws, or their number differs between sites.
     """
     sizes = {len(draws[site]) for site in truth}
     if len(sizes) != 1 or 0 in sizes:
@@ -238,7 +238,7 @@ def judge(
 
 
 def join_rounds(judged: Mapping[int, xr.Dataset]) -> xr.Dataset:
-    """What was judged of the same people after several numbers of rounds, along ``rounds``.
+    """Join results for the same people after several numbers of rounds along ``rounds``.
 
     Raises:
         ValueError: numbers of draws differ.
@@ -252,18 +252,18 @@ def collect(
     discrete: Collection[str],
     attributes: Mapping[str, str],
 ) -> Calibration:
-    """Put together what was judged of all people and numbers of rounds.
+    """Join results for all people, and add statistics of the prior.
 
     Args:
-        parts: results of :func:`join_rounds` of some people each.
+        parts: results of :func:`join_rounds` for some people each.
         prior: draws of the prior by site, ``[D]``.
-        discrete: which sites are.
-        attributes: what the file should say of itself.
+        discrete: names of the discrete sites.
+        attributes: attributes of the file.
 
     Returns:
-        Variables of :func:`judge`, with the dimension ``rounds`` in between (but for ``truth``);
-        and by site ``discrete``, ``prior_width``, ``prior_entropy`` and ``prior_probability``, the
-        mean of the truth's.
+        Variables of :func:`judge`, with the dimension ``rounds`` in between (except ``truth``); and
+        by site ``discrete``, ``prior_width``, ``prior_entropy`` and ``prior_probability``, the mean
+        prior probability of the truth.
 
     Raises:
         ValueError: numbers of draws differ.
@@ -285,7 +285,7 @@ def _joined(parts: Sequence[xr.Dataset], dimension: str | pd.Index) -> xr.Datase
 
 
 def _of_prior(values: np.ndarray, discrete: bool) -> dict[str, float]:
-    """What :func:`collect` tells of the prior, from draws ``[D]``."""
+    """Statistics of the prior for :func:`collect`, from draws ``[D]``."""
     _, counts = np.unique(values, return_counts=True)
     probability = float(((counts / len(values)) ** 2).sum()) if discrete else np.nan
     spread = {name: float(part[0]) for name, part in _spread(values[:, None], discrete).items()}

@@ -1,14 +1,14 @@
 """Simulation-based calibration of posteriors: tests that ranks are uniform and intervals cover.
 
 Implements Talts, Betancourt, Simpson, Vehtari and Gelman (*Validating Bayesian inference algorithms
-with simulation-based calibration*, 2018) for human models, whatever makes the posteriors::
+with simulation-based calibration*, 2018) for human models and any inference method::
 
     psi_p    ~ prior                                   people drawn from the human model itself
-    rounds_p ~ program(psi_p)                          what they do
+    rounds_p ~ program(psi_p)                          their actions
     psi_p^s  ~ infer(rounds_p),   s = 1 .. S           draws from the posterior to be tested
 
-Where inference is right, the rank of psi_p among its S draws is uniform over 0 .. S, whatever the
-model. :mod:`mirror_ppl.inference.calibration.ranks` looks at the ranks; here they are made.
+If inference is exact, the rank of psi_p among its S draws is uniform over 0 .. S for every model.
+This module simulates and infers; :mod:`mirror_ppl.inference.calibration.ranks` evaluates the ranks.
 
 Departures from the paper: ties, of which discrete sites have many, are broken at random; uniformity
 is tested, in two ways (:mod:`mirror_ppl.inference.calibration.uniformity`).
@@ -42,16 +42,16 @@ from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.version import __version__
 
 PRIOR_PEOPLE = 4000
-"""Drawn to know the prior's widths and entropies to a few percent."""
+"""Draws that estimate the prior's widths and entropies to a few percent."""
 PEOPLE_AT_ONCE = 500
-"""Drawn from the prior at once; bounds memory."""
+"""People drawn from the prior at once; bounds memory."""
 
 
 Infer = Callable[[Demonstrations, int], Inferred]
-"""Makes a posterior of each person of recordings; is given a seed for everything random."""
+"""Function that infers each person of recordings, given a seed for all random draws."""
 
 Summary = Callable[[Mapping[str, Tensor]], Tensor]
-"""A number ``[..., P, 1]`` of the values of all sites, ``[..., P, 1, ...]``."""
+"""Function from values of all sites ``[..., P, 1, ...]`` to a number ``[..., P, 1]``."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ class CalibrationOptions:
         rounds: numbers of rounds to infer from, increasing; the shorter recordings are the first
             rounds of the longer ones.
         batch: people who are simulated and inferred at once; bounds memory.
-        summaries: by name, what is to be known of sites with event dimensions. Sites without are
-            always looked at. A summary that returns whole numbers or truth values is discrete.
+        summaries: scalar functions, by name, to calibrate besides the sites without event
+            dimensions. A summary that returns integers or booleans is discrete.
 
     Raises:
-        ValueError: nobody, no rounds, or rounds that do not increase.
+        ValueError: there are no people, no rounds, or rounds that do not increase.
     """
 
     people: int = 500
@@ -84,15 +84,15 @@ class CalibrationOptions:
 
 @torch.no_grad()
 def prior_people(human: HumanModel, people: int, generator: torch.Generator) -> Draws:
-    """Values ``[P, 1, ...]`` of all sites, those of ``act`` included, of people from the prior.
+    """Draw people from the prior: values ``[P, 1, ...]`` of all sites.
 
     Args:
         human: the model of people.
         people: number of people P.
-        generator: source of them.
+        generator: source of randomness.
 
     Raises:
-        ValueError: there are to be no people.
+        ValueError: the number of people is below 1.
     """
     if people < 1:
         raise ValueError(f"people must be at least 1, not {people}")
@@ -105,11 +105,11 @@ def prior_people(human: HumanModel, people: int, generator: torch.Generator) -> 
 
 @dataclass(frozen=True)
 class Batch:
-    """Some of the people, who are simulated and inferred together.
+    """People who are simulated and inferred together.
 
     Attributes:
-        first: number of the first of them.
-        people: how many.
+        first: number of the first person.
+        people: number of people.
     """
 
     first: int
@@ -117,7 +117,7 @@ class Batch:
 
     @property
     def label(self) -> str:
-        """What it is, for people who wait."""
+        """Name of the batch, for progress reports."""
         return f"people {self.first + 1} to {self.first + self.people}"
 
 
@@ -133,15 +133,15 @@ def calibrate(
 
     Args:
         human: the model of people, from which people and rounds are drawn.
-        infer: what is to be tested; if there are several processes, it has to be picklable.
+        infer: the method to test; it has to be picklable if there are several processes.
         options: settings.
         setting: name under which the rounds are recorded.
-        seed: of everything random; people and rounds are the same whatever ``infer`` is.
-        runner: does the work of each `Batch`; this process unless given, and nothing is kept.
+        seed: seed of all random draws; people and rounds do not depend on ``infer``.
+        runner: does the work of each `Batch`; by default this process, without stored results.
 
     Raises:
         UnknownNameError: there is no such setting.
-        ValueError: ``infer`` or a summary returned something else than it should.
+        ValueError: ``infer`` or a summary returned invalid values.
         HumanModelError: a method has a factor, an observed site, a scale or a mask.
     """
     require_known(setting, "setting", human.domain.settings, human.domain.name)
@@ -167,7 +167,7 @@ def calibrate(
 
 
 def _require_plain_program(human: HumanModel) -> None:
-    """Refuse human models that are more than what they sample: people are drawn from that."""
+    """Refuse human models with factors and the like, which simulated people do not follow."""
     kind = type(human).__name__
     for name, node in prior_nodes(human, {}, 1, 1).items():
         if correction(node) is not None:
@@ -189,7 +189,7 @@ def _judged(trial: _Trial, infer: Infer, batch: Batch) -> xr.Dataset:
 
 
 class _Trial:
-    """People of whom everything is known, batch by batch."""
+    """Simulated people with known implants, batch by batch."""
 
     def __init__(
         self, human: HumanModel, options: CalibrationOptions, setting: str, seed: int
@@ -211,7 +211,7 @@ class _Trial:
             self.discrete += [] if summary(drawn).is_floating_point() else [name]
 
     def batch(self, infer: Infer, batch: Batch) -> xr.Dataset:
-        """The people of a batch, judged after each number of rounds."""
+        """Simulate and infer a batch, and compare with the truth after each number of rounds."""
         options, generator = self.options, self._generator(batch.first)
         rng = np.random.default_rng([self.seed, batch.first])
         implants = prior_people(self.human, batch.people, generator)
@@ -239,7 +239,7 @@ def _seed(generator: torch.Generator) -> int:
 
 
 def _prior_sites(human: HumanModel, people: int, seed: int) -> dict[str, Any]:
-    """Nodes of all sites, sampled for P people."""
+    """Trace nodes of all sites, sampled for P people."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return sample_sites(human, people)
@@ -247,7 +247,7 @@ def _prior_sites(human: HumanModel, people: int, seed: int) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Scalars:
-    """What is one number a person: sites without event dimensions, and summaries."""
+    """Scalars per person: sites without event dimensions, and summaries."""
 
     sites: tuple[str, ...]
     summaries: Mapping[str, Summary]
@@ -259,10 +259,10 @@ class _Scalars:
     def of(
         self, draws: Mapping[str, Tensor], shape: tuple[int, ...], source: str
     ) -> dict[str, np.ndarray]:
-        """Numbers by name, of this shape ``[..., P]``, of draws ``[..., P, 1, ...]``.
+        """Scalars by name, of this shape ``[..., P]``, from draws ``[..., P, 1, ...]``.
 
         Raises:
-            ValueError: something is missing, of another shape or not finite.
+            ValueError: a site is missing, of another shape or not finite.
         """
         result = {}
         for name in (*self.sites, *self.summaries):

@@ -1,10 +1,10 @@
-"""Are ranks uniform? A test of their histogram, and one of their cumulative distribution.
+"""Tests of uniform ranks: by their histogram, and by their cumulative distribution.
 
-N ranks of truths among S draws are held against the uniform distribution over 0 .. S. The second
+N ranks of truths among S draws are compared with the uniform distribution over 0 .. S. The second
 test is that of Säilynoja, Bürkner and Vehtari (*Graphical test for discrete uniformity*, 2022): a
-band around the cumulative distribution that the whole of it leaves with a given probability only.
-They simulate that probability, or compute it by a recursion; here the recursion is a chain of
-convolutions, because counts of bins are independent Poisson numbers, given their sum.
+simultaneous band around the cumulative distribution with a given probability of leaving it. They
+simulate that probability, or compute it by a recursion; here the recursion is a chain of
+convolutions, because counts of bins are independent Poisson variables, given their sum.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import numpy as np
 from scipy.stats import binom, chi2, poisson
 
 LEAST_EXPECTED, MOST_BINS = 20, 20
-"""Of the histogram: ranks expected in each bin at least, and bins at most."""
+"""Least expected ranks per bin of the histogram, and largest number of bins."""
 FEWEST_BINS = 4
-"""Of a histogram of too few ranks to be tested, if it is drawn all the same."""
+"""Bins of a plotted histogram with too few ranks to be tested."""
 MOST_POINTS = 100
-"""At so many ranks at most the cumulative distribution is held against the band."""
+"""Largest number of points at which the cumulative distribution is compared with the band."""
 TOLERANCE = 1e-9
-"""Relative; tails that differ by less are the same but for rounding."""
+"""Relative tolerance for tails that are equal up to rounding."""
 
 
 def rank_edges(number: int, draws: int) -> np.ndarray:
     """Edges of the bins of a histogram of ranks, as even as whole numbers allow.
 
     Args:
-        number: how many ranks N there are.
+        number: number of ranks N.
         draws: S; a rank is one of 0 .. S.
 
     Returns:
@@ -45,7 +45,7 @@ def rank_edges(number: int, draws: int) -> np.ndarray:
 
 
 def histogram_p_value(ranks: np.ndarray, draws: int) -> float:
-    """Probability of a histogram as uneven as that of ranks ``[N]``, by Pearson's chi-square test.
+    """P-value of Pearson's chi-square test that ranks ``[N]`` are uniform.
 
     Returns:
         NaN if there are too few ranks for two bins.
@@ -60,10 +60,10 @@ def histogram_p_value(ranks: np.ndarray, draws: int) -> float:
 
 
 def ecdf_p_value(ranks: np.ndarray, draws: int) -> float:
-    """Probability of a cumulative distribution anywhere as extreme as that of ranks ``[N]``.
+    """P-value of the test that the cumulative distribution of ranks ``[N]`` is uniform.
 
-    Exact (but below 1e-12 or so it is 0): the smallest of the two-sided binomial tails at all
-    points, and the probability that it is as small.
+    The statistic is the smallest of the two-sided binomial tails at all points. The p-value is
+    exact (0 below about 1e-12).
     """
     edges, tails = _tails(len(ranks), draws)
     below = (ranks[:, None] < edges[1:-1]).sum(0)
@@ -76,13 +76,13 @@ def ecdf_band(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The simultaneous band of the cumulative distribution of uniform ranks.
 
-    The band is as narrow as it can be: what stays inside of it has an :func:`ecdf_p_value` above
-    the failure rate, and what leaves it has not.
+    The band is as narrow as possible: ranks stay inside of it if and only if their
+    :func:`ecdf_p_value` is above the failure rate.
 
     Args:
-        number: how many ranks N there are.
+        number: number of ranks N.
         draws: S; a rank is one of 0 .. S.
-        failure_rate: probability of leaving the band, at most.
+        failure_rate: largest probability of leaving the band.
 
     Returns:
         At each point: the share of ranks expected below it, and the lowest and the highest share

@@ -1,26 +1,26 @@
 """Partial pooling: a hierarchical prior, inferred together with the people.
 
-The population is a Pyro program above the human model. Every site of one number a person gets
-hyper-parameters, unless its prior depends on other sites already (how soon each terminal is
-noticed, given the person's mean over terminals) or is knowledge of the world
-(`WorldKnowledge.world_sites`); the others, and weights of the residual, keep their prior::
+The population is a Pyro program above the human model. Every site with one number per person gets
+hyper-parameters, unless its prior already depends on other sites (how soon each terminal is
+noticed, given the person's mean over terminals) or it is knowledge of the world
+(`WorldKnowledge.world_sites`). These, and weights of the residual, keep their prior::
 
-    concentration_d ~ LogNormal(log(n_d), 1)      discrete site d, of n_d values: large where
-    chances_d  ~ Dirichlet(concentration_d p_d)     people differ as much as its prior p_d says
-    mean_c     ~ Normal(m_c, s_c)                 continuous site c, in unconstrained space: where
-    spread_c   ~ LogNormal(log(s_c / 2), 0.5)       its prior has the mean m_c and the width s_c
+    concentration_d ~ LogNormal(log(n_d), 1)      discrete site d with n_d values; large if
+    chances_d  ~ Dirichlet(concentration_d p_d)     the population is close to its prior p_d
+    mean_c     ~ Normal(m_c, s_c)                 continuous site c, in unconstrained space,
+    spread_c   ~ LogNormal(log(s_c / 2), 0.5)       whose prior has mean m_c and deviation s_c
     psi_p      ~ Categorical(chances_d), Normal(mean_c, spread_c)        person p
     actions_p  ~ the human model given psi_p
 
-Given the population, people do not depend on each other, and each was inferred already under the
-human model's own prior. So with S draws of those posteriors, up to a constant::
+Given the population, people are independent, and each was already inferred under the human model's
+own prior. With S draws of those posteriors, up to a constant::
 
     p(actions_p | population) = mean over s of  p(psi_p^s | population) / p(psi_p^s | own prior)
 
 (Hogg, Myers and Bovy, *Inferring the eccentricity distribution*, 2010). The population is inferred
-by Gibbs sampling (:mod:`mirror_ppl.inference.population.sampler`), and people are drawn anew by the
-same weights. Somebody without rounds has draws of the prior, weights that only tell of the
-population, and so its predictive: round zero.
+by Gibbs sampling (:mod:`mirror_ppl.inference.population.sampler`), and each person's draws are
+resampled by the same weights. The draws of a person without rounds come from the prior, and after
+reweighting from the population's predictive: round zero.
 """
 
 from __future__ import annotations
@@ -48,19 +48,19 @@ from mirror_ppl.progress import Report, silent
 
 POOLINGS = ("none", "partial")
 MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
-"""Draws of a person, at most, from which a population is inferred; of all people together; and
-what each has of these at least."""
+"""Draws from which a population is inferred: at most per person, at most in total, and at least
+per person."""
 PRIOR_DRAWS = 4000
 LEAST_CHANCE = 1e-6
-"""Of a value of a discrete site, below which the prior rules it out."""
+"""Prior probability of a value of a discrete site below which it counts as impossible."""
 CONCENTRATION_WIDTH = 1.0
-"""Standard deviation of the logarithm of the concentration of chances."""
+"""Standard deviation of the logarithm of the concentration."""
 SPREAD, SPREAD_WIDTH = 0.5, 0.5
-"""How much people differ before anybody is seen: its median, in widths of the human model's prior,
-and the standard deviation of its logarithm."""
+"""Log-normal prior of the spread of people: median, in standard deviations of the human model's
+prior, and standard deviation of the logarithm."""
 
 CANDIDATES = 64
-"""People of whom one is taken as the newcomer, where the program makes some more probable."""
+"""Candidates from which a newcomer is resampled, if the program has factors and the like."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Population:
         return len(next(iter([*self.chances.values(), *self.mean.values()])))
 
     def spaced(self, number: int) -> Population:
-        """So many of its draws, spread evenly over all; some twice if there are too few."""
+        """Select this many draws, evenly spaced; with repetitions if there are too few."""
         chosen = torch.linspace(0, len(self) - 1, number).round().long()
         return Population(
             *({name: value[chosen] for name, value in part.items()} for part in vars(self).values())
@@ -89,12 +89,12 @@ class Population:
 
 @dataclass(frozen=True)
 class Pooled:
-    """People who are from a population.
+    """Posterior of people under a population.
 
     Attributes:
         draws: ``[S, P, 1, ...]``, one for each draw of the population.
-        effective: number ``[P]`` of each person's own draws that count for a draw of the
-            population, the median over them.
+        effective: effective number ``[P]`` of each person's own draws, the median over draws of the
+            population.
     """
 
     draws: Draws
@@ -127,19 +127,19 @@ class Pooling:
             if node["fn"].has_enumerate_support and not node["fn"].event_dim:
                 values = node["fn"].enumerate_support()
                 chances = node["fn"].log_prob(values).exp().flatten(1).mean(1)
-                possible = chances > LEAST_CHANCE  # what the prior rules out stays ruled out
+                possible = chances > LEAST_CHANCE  # prior-impossible values stay impossible
                 self.supports[name] = values.flatten(1)[possible, 0]
                 self.prior_chances[name] = chances[possible] / chances[possible].sum()
 
     def program(
         self, known: Mapping[str, Tensor], place: Mapping[str, Tensor], log_prior: Tensor
     ) -> None:
-        """The population and what is known of its people.
+        """Pyro program of the population, conditioned on its people.
 
         Args:
-            known: by discrete site, which of its values each draw has, one-hot ``[P, S, n]``.
-            place: by continuous site, its value in unconstrained space, ``[P, S]``.
-            log_prior: of the draws under the human model, ``[P, S]``.
+            known: values of discrete sites in each draw, by site, one-hot ``[P, S, n]``.
+            place: values of continuous sites in unconstrained space, by site, ``[P, S]``.
+            log_prior: log prior of the draws under the human model, ``[P, S]``.
         """
         chances = {}
         for name, prior in self.prior_chances.items():
@@ -175,7 +175,7 @@ class Pooling:
     def read(
         self, draws: Mapping[str, Tensor]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
-        """What :meth:`program` is given, of posterior draws ``[S, P, 1, ...]``."""
+        """Convert posterior draws ``[S, P, 1, ...]`` to the arguments of :meth:`program`."""
         known = {
             name: (draws[name][..., 0].T[..., None] == support).to(self.centre)
             for name, support in self.supports.items()
@@ -200,13 +200,13 @@ class Pooling:
     def fit(
         self, draws: Mapping[str, Tensor], number: int, seed: int, report: Report = silent
     ) -> Population:
-        """The population that people with these posterior draws ``[S, P, 1, ...]`` are from.
+        """Infer the population from people's posterior draws ``[S, P, 1, ...]``.
 
         Args:
-            draws: of each person under the human model's own prior.
-            number: of draws of the population.
-            seed: of everything random.
-            report: told of steps.
+            draws: draws of each person under the human model's own prior.
+            number: number of draws of the population.
+            seed: seed of all random draws.
+            report: called with the number of steps.
         """
         held, people = next(iter(draws.values())).shape[:2]
         used = min(held, MOST_DRAWS, max(LEAST_DRAWS, ALL_DRAWS // people))
@@ -229,12 +229,12 @@ class Pooling:
 
     @torch.no_grad()
     def pooled(self, draws: Mapping[str, Tensor], population: Population, seed: int) -> Pooled:
-        """People who are from a population.
+        """Resample people's draws by the weights of a population.
 
         Args:
-            draws: of each person under the human model's own prior, ``[S, P, 1, ...]``.
-            population: what is known of it.
-            seed: of everything random.
+            draws: draws of each person under the human model's own prior, ``[S, P, 1, ...]``.
+            population: posterior of the population.
+            seed: seed of all random draws.
         """
         known, place, log_prior = self.read(draws)
         effective, chosen = [], []
@@ -256,10 +256,10 @@ class Pooling:
 
     @torch.no_grad()
     def newcomers(self, population: Population, people: int, seed: int) -> Draws:
-        """Draws ``[S, P, 1, ...]`` of people of whom nothing is known but where they are from.
+        """Draw people without rounds from the population, ``[S, P, 1, ...]``.
 
-        Where ``prior`` is more than what it samples, one of several is taken, by how probable it
-        makes each of them.
+        If ``prior`` has factors, observed sites, scales or masks, each person is resampled from
+        several candidates by the density that they add.
         """
         number, tries = len(population), CANDIDATES if adds_to_prior(self.human) else 1
         with torch.random.fork_rng(devices=[]):
@@ -274,7 +274,7 @@ class Pooling:
             drawn = values_of(sample_sites(self.human, people * tries, number, given))
             if tries == 1:
                 return drawn
-            # Of these sites the population takes the place of what the prior says.
+            # For these sites the population replaces the prior.
             said = whole_correction(self.human, drawn, people * tries, given)
             weights = torch.softmax(said.view(number * people, tries), -1)
             chosen = torch.multinomial(weights, 1).view(number, people)

@@ -1,11 +1,11 @@
-"""Draws of a population, given draws of its people: Gibbs sampling of `Pooling.program`.
+"""Gibbs sampling of `Pooling.program`: draws of a population, given draws of its people.
 
-Two blocks take turns. Given the population, each person has one of their own draws,
+Two blocks alternate. Given the population, each person is assigned one of their own draws,
 
     s_p ~ p(psi_p^s | population) / p(psi_p^s | own prior)
 
-and given those, sites do not depend on each other. Of each, how much people differ is drawn with
-the rest integrated out, on a grid; what is left is conjugate::
+and given those, sites are independent. The spread or concentration of each is drawn on a grid, with
+the site's other parameters integrated out; the rest is conjugate::
 
     n people with values x of mean x' of a continuous site, its prior's mean 0 and width 1
         spread ~ p(spread) N(x; 0, spread^2 I + 1 1')     mean ~ N(n x' / (n + spread^2), ...)
@@ -13,8 +13,8 @@ the rest integrated out, on a grid; what is left is conjugate::
         concentration ~ p(concentration) DirichletMultinomial(k; concentration p_d)
         chances ~ Dirichlet(concentration p_d + k)
 
-This is exact but for the grid, whose cells are a fortieth of the prior's standard deviation and
-which ends eight of these below and above its median.
+This is exact except for the grid, whose cells are a fortieth of the prior's standard deviation, and
+which ends eight standard deviations below and above the median.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from torch import Tensor
 from torch.distributions import Dirichlet, Normal
 
 WARMUP = 300
-"""Sweeps that are thrown away."""
+"""Discarded sweeps."""
 THIN = 5
-"""Sweeps for a draw that is kept."""
+"""Sweeps per stored draw."""
 CELLS, RANGE = 640, 8.0
-"""Of the grid of a logarithm, from so many standard deviations of its prior below to above it."""
+"""Cells of the grid of a logarithm, and its half-width in standard deviations of the prior."""
 SMALLEST = 1e-30
-"""Of a chance, whose logarithm is needed."""
+"""Least probability, since its logarithm has to be finite."""
 
 
 @dataclass(frozen=True)
 class HyperPriors:
-    """Priors of how much people differ.
+    """Hyper-priors of concentrations and spreads.
 
     Attributes:
-        chances: by discrete site, of its values ``[n]`` in the human model's prior.
+        chances: prior probabilities of each discrete site's values ``[n]``, by site.
         concentration_width: standard deviation of the logarithm of a concentration, whose median
             is the number of values.
-        spread: median of how much people differ in a continuous site, in widths of its prior.
+        spread: median of a continuous site's spread, in standard deviations of its prior.
         spread_width: standard deviation of its logarithm.
     """
 
@@ -59,9 +59,9 @@ class PeoplesDraws:
     """Draws of each person under the human model's own prior.
 
     Attributes:
-        known: by discrete site, which of its values each draw has, one-hot ``[P, S, n]``.
-        place: continuous sites less the mean of their prior, in its widths, ``[P, S, C]``.
-        log_prior: of all of it under the human model, ``[P, S]``.
+        known: values of discrete sites in each draw, by site, one-hot ``[P, S, n]``.
+        place: continuous sites, standardized by their prior, ``[P, S, C]``.
+        log_prior: log prior of these sites under the human model, ``[P, S]``.
     """
 
     known: dict[str, Tensor]
@@ -77,14 +77,14 @@ def sample_population(
     seed: int,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """Draws of the population: chances ``[N, n]`` by site, means and spreads ``[N, C]``.
+    """Draw the population: probabilities ``[N, n]`` by site, means and spreads ``[N, C]``.
 
     Args:
-        people: what is known of them.
-        priors: of how much they differ.
-        number: of draws N.
-        seed: of everything random.
-        report: told of sweeps.
+        people: draws of the people.
+        priors: hyper-priors.
+        number: number of draws N.
+        seed: seed of all random draws.
+        report: called with the number of sweeps.
     """
     place = people.place.double()
     known = [people.known[name].double() for name in priors.chances]
@@ -122,25 +122,25 @@ def sample_population(
 
 
 def _grid(median: Tensor | float, width: float, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Logarithms ``[CELLS]`` of a log-normal in the middle of cells, and their log-densities."""
+    """Grid ``[CELLS]`` of the logarithm of a log-normal, at cell centres, and log-densities."""
     deviations = torch.linspace(-RANGE, RANGE, CELLS, dtype=like.dtype, device=like.device)
     return torch.as_tensor(median).log() + width * deviations, -0.5 * deviations**2
 
 
 def _from_grid(grid: Tensor, log_density: Tensor) -> Tensor:
-    """A number from each row ``[..., CELLS]``, anywhere in the cell that was drawn."""
+    """Draw a number for each row ``[..., CELLS]``, uniform within the drawn cell."""
     cell = torch.multinomial(torch.softmax(log_density, -1), 1)[..., 0]
     inside = torch.rand(cell.shape, dtype=grid.dtype, device=grid.device) - 0.5
     return (grid[cell] + inside * (grid[1] - grid[0])).exp()
 
 
 class ContinuousSites:
-    """How P people are distributed in C continuous sites, given their values.
+    """Conditional posterior of the population in C continuous sites, given P people's values.
 
     Args:
-        people: P.
-        priors: of how much they differ.
-        like: a tensor of the numbers' kind.
+        people: number of people P.
+        priors: hyper-priors.
+        like: a tensor with the dtype and device to use.
 
     Attributes:
         grid: logarithms of spreads, ``[CELLS]``.
@@ -152,7 +152,7 @@ class ContinuousSites:
         self.squares = (2 * self.grid).exp()
 
     def log_densities(self, values: Tensor) -> Tensor:
-        """Of the grid's spreads ``[C, CELLS]``, given values ``[P, C]``; without the mean."""
+        """Log densities of spreads ``[C, CELLS]`` given values ``[P, C]``; mean integrated out."""
         number, centre = self.people, values.mean(0)
         scatter = (values - centre).square().sum(0)[:, None]
         across = self.squares + number
@@ -164,21 +164,21 @@ class ContinuousSites:
         )
 
     def mean(self, values: Tensor, spread: Tensor) -> Normal:
-        """Means ``[C]``, given values ``[P, C]`` and spreads ``[C]``."""
+        """Conditional of the means ``[C]``, given values ``[P, C]`` and spreads ``[C]``."""
         precision = 1 + self.people / spread**2
         return Normal(self.people * values.mean(0) / spread**2 / precision, precision.rsqrt())
 
     def draw(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Means and spreads ``[C]`` of people with values ``[P, C]``."""
+        """Draw means and spreads ``[C]``, given values ``[P, C]``."""
         spread = _from_grid(self.grid, self.log_densities(values))
         return self.mean(values, spread).sample(), spread
 
 
 class DiscreteSite:
-    """How P people are distributed over a discrete site's n values.
+    """Conditional posterior of the population in a discrete site with n values.
 
     Args:
-        people: P.
+        people: number of people P.
         prior: probabilities of the values ``[n]`` under the human model.
         width: standard deviation of the logarithm of the concentration.
 
@@ -199,15 +199,15 @@ class DiscreteSite:
         )
 
     def log_densities(self, count: Tensor) -> Tensor:
-        """Of the grid's concentrations ``[CELLS]``, given how many have each value ``[n]``."""
+        """Log densities of concentrations ``[CELLS]``, given counts of people by value ``[n]``."""
         return self.constant + (self.alone + count).lgamma().sum(-1)
 
     def chances(self, count: Tensor, concentration: Tensor) -> Dirichlet:
-        """Chances ``[n]`` of values, given how many have each ``[n]``."""
+        """Conditional of the probabilities ``[n]`` of values, given counts ``[n]``."""
         return Dirichlet(concentration * self.prior + count)
 
     def draw(self, value: Tensor) -> Tensor:
-        """Chances ``[n]`` of values where people have these ``[P]``."""
+        """Draw probabilities ``[n]`` of values, given people's values ``[P]``."""
         count = torch.bincount(value, minlength=len(self.prior)).to(self.prior)
         concentration = _from_grid(self.grid, self.log_densities(count))
         return self.chances(count, concentration).sample().clamp(min=SMALLEST)

@@ -1,1 +1,1 @@
-"""What comes out of a fit: draws, predictions, summaries, and their files."""
+"""Results of a fit: draws, predictions, summaries, and their files."""

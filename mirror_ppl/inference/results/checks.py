@@ -1,17 +1,17 @@
-"""Posterior predictive checks: what a person did, beside what the human model says they would do.
+"""Posterior predictive checks of a person's actions.
 
-A posterior is sure of itself whether or not its model is right. What was done is therefore compared
-with what the model says would be done, step by step given all that was recorded before::
+A posterior can be narrow although its model is wrong. Recorded actions are therefore compared with
+actions drawn from the posterior predictive, step by step given all earlier recorded steps::
 
     T_h = 1/N sum_t f_h(a_t; history before t)            of the recorded actions
     T_h^rep                                                of actions drawn from the posterior
                                                            predictive at the same steps
     p_h = P(T_h^rep > T_h) + 1/2 P(T_h^rep = T_h)
 
-(Gelman, Meng and Stern, 1996). As each step is drawn given the recorded ones before it, no round
-has to be simulated, and a check depends on nothing that was done later. Only rounds that were
-learned from count: draws of the posterior are right given these, and p-values are then cautious,
-while a wide posterior would be found surprised by every other round.
+(Gelman, Meng and Stern, 1996). Each step is drawn given the recorded ones before it, so no round
+has to be simulated, and a check does not depend on later actions. Only training rounds are used:
+since the posterior is given these, p-values are conservative, whereas under a wide posterior every
+held-out round would seem surprising.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from mirror_ppl.domains.base import Domain, map_state, total_reward
 from mirror_ppl.inference.results.summary import predictive
 
 REPLICATES = 2000
-"""Replicated recordings of a person: p-values of .005 are known to within .0016."""
+"""Replicated recordings of a person: the standard error of a p-value of 0.005 is 0.0016."""
 
 TIE = 1e-6
-"""Share of a sum that rounding may change."""
+"""Relative tolerance for rounding in sums."""
 SHARE = "share of "
-"""What the name of an action's share begins with."""
+"""Prefix of the names of checks of action shares."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Steps:
     """The N recorded steps of one person, in order.
 
     Attributes:
-        actions: what was done ``[N]``.
-        log_probability: of each action there, under each draw ``[S, N, A]``.
+        actions: recorded actions ``[N]``.
+        log_probability: log-probability of each action there, under each draw ``[S, N, A]``.
         before: number of the step before it in the same round, or -1, ``[N]``.
-        rewards: expected of each action there, ``[N, A]``.
+        rewards: expected reward of each action there, ``[N, A]``.
     """
 
     actions: Tensor
@@ -53,20 +53,20 @@ class Steps:
 
     @property
     def follows(self) -> Tensor:
-        """Steps ``[n]`` that have one before them."""
+        """Steps ``[n]`` that are not the first of their round."""
         return (self.before >= 0).nonzero().squeeze(-1)
 
 
 @dataclass(frozen=True)
 class Check:
-    """Something of recorded actions that is compared with what the model says.
+    """A statistic of recorded actions that is compared with its posterior predictive.
 
     Attributes:
-        name: of it.
-        of: its value for each action at each step that it is about, ``[S, n, A]`` or ``[1, n, A]``:
-            at all N steps or, if n is less, at those that follow another one in their round.
-        more: what a person does of whom it is larger than the model says.
-        less: what one does of whom it is smaller.
+        name: name of the statistic.
+        of: its value for each action at each step, ``[S, n, A]`` or ``[1, n, A]``: at all N steps
+            or, if n < N, at those that are not the first of their round.
+        more: description of a person whose statistic is larger than the model predicts.
+        less: description of a person whose statistic is smaller.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Check:
 
 
 def switches(steps: Steps) -> Tensor:
-    """Doing something else than at the step before, ``[1, n, A]``."""
+    """1 for actions that differ from that of the step before, ``[1, n, A]``."""
     some = steps.follows
     last = steps.actions[steps.before[some]]
     actions = torch.arange(steps.rewards.shape[-1], device=last.device)
@@ -84,17 +84,17 @@ def switches(steps: Steps) -> Tensor:
 
 
 def delayed(steps: Steps) -> Tensor:
-    """How probable the model had an action at the step before, ``[1, n, A]``."""
+    """Predictive probability of an action at the step before, ``[1, n, A]``."""
     return predictive(steps.log_probability).exp()[steps.before[steps.follows]][None]
 
 
 def reward(steps: Steps) -> Tensor:
-    """What an action earns at once ``[1, N, A]``; collisions, wrong buttons and the like cost."""
+    """Immediate reward of an action ``[1, N, A]``; collisions, wrong buttons etc. cost."""
     return steps.rewards[None]
 
 
 def surprise(steps: Steps) -> Tensor:
-    """``-log p(a)``, ``[S, N, A]``; where the model holds, on average the actions' entropy."""
+    """``-log p(a)``, ``[S, N, A]``; on average the actions' entropy if the model is right."""
     return -steps.log_probability
 
 
@@ -127,7 +127,7 @@ CHECKS: Mapping[str, Check] = {
         ),
     )
 }
-"""What is compared besides how often each action is chosen; a new check is one more entry."""
+"""Registry of checks besides the shares of actions; a new check is one more entry."""
 
 
 def steps_of(domain: Domain, rounds: Demonstrations, log_probability: Tensor) -> Steps:
@@ -135,8 +135,8 @@ def steps_of(domain: Domain, rounds: Demonstrations, log_probability: Tensor) ->
 
     Args:
         domain: the world.
-        rounds: of one person.
-        log_probability: of actions ``[S, 1, B, T, A]``.
+        rounds: rounds of one person.
+        log_probability: log-probabilities of actions ``[S, 1, B, T, A]``.
     """
     real = rounds.mask[0]
     number = torch.full(real.shape, -1, device=real.device)
@@ -156,10 +156,10 @@ def steps_of(domain: Domain, rounds: Demonstrations, log_probability: Tensor) ->
 
 
 def p_values(steps: Steps, actions: Sequence[str], generator: torch.Generator) -> dict[str, float]:
-    """Posterior predictive p-value of each check, of replicated actions of all draws alike.
+    """Posterior predictive p-value of each check, with equally many replicates per draw.
 
-    Near 0 there is more of it than the model says, near 1 less. Actions stand for how often each
-    was chosen. Without any recorded step there are none.
+    Near 0 the statistic is larger than the model predicts, near 1 smaller. Each action's share is a
+    check, too. Empty without recorded steps.
     """
     if not len(steps.actions):
         return {}
@@ -180,7 +180,7 @@ def p_values(steps: Steps, actions: Sequence[str], generator: torch.Generator) -
             values.gather(-1, drawn[:, some]).double().sum(1),
             values.gather(-1, own).double().sum(1),
         )
-    # Of two actions the second is what the first is not.
+    # With two actions, the share of one determines the other.
     for action, name in enumerate(actions if len(actions) > 2 else actions[:1]):  # noqa: PLR2004
         found[SHARE + name] = _more(
             (drawn == action).double().sum(1), (steps.actions == action).double().sum()
@@ -189,9 +189,9 @@ def p_values(steps: Steps, actions: Sequence[str], generator: torch.Generator) -
 
 
 def _more(replicated: Tensor, recorded: Tensor) -> float:
-    """How probably a replicate is above what was recorded, ties counted by half."""
+    """Probability that a replicate exceeds the recorded value, with ties counted by half."""
     near = (replicated - recorded).abs() <= TIE * (1 + recorded.abs())
-    # What the model holds impossible is infinitely surprising.
+    # Actions of probability 0 have infinite surprise.
     same = torch.where(recorded.isfinite(), near, replicated == recorded)
     above = (replicated > recorded) & ~same
     return float((above.double() + same.double() / 2).mean())

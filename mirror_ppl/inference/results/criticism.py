@@ -1,8 +1,8 @@
-"""Whether a human model explains a person at all, in a word and with reasons.
+"""Criticism of the human model: a verdict on each person, with reasons.
 
-Besides :mod:`mirror_ppl.inference.results.checks` the model is held against two simpler ones, by
-how well they predict held-out actions: how often the person did each before, whatever the state;
-and the robot itself, without implants.
+Besides :mod:`mirror_ppl.inference.results.checks`, the model's predictions of held-out actions are
+compared with two baselines: the person's earlier action shares, independent of the state; and the
+robot itself, without implants.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from mirror_ppl.models.self_model import SelfModel
 OK, SUSPECT, UNEXPLAINED, UNCHECKED = "ok", "suspect", "unexplained", "unchecked"
 """The verdicts."""
 FINE = OK, UNCHECKED
-"""Those that are no warning."""
+"""Verdicts that are no warning."""
 LEVEL = 0.05
-"""Share of people whom the model explains that may be suspect."""
+"""Largest probability that a person whom the model explains is suspect."""
 STANDARD_ERRORS = 2.0
-"""By how many of them predictions have to be worse to count without other reasons."""
+"""Standard errors by which predictions have to be worse to count without other reasons."""
 DRAWS, QUICK = 100, ImportanceOptions(proposals=64, enough=50.0)
-"""How it is inferred how strictly the robot would choose in their place."""
+"""Draws and settings for inference in the baseline without implants."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the model explains a person.
+    """Verdict on whether the model explains a person.
 
     Attributes:
         word: ``ok``, ``suspect``, ``unexplained`` or ``unchecked``.
-        reasons: for it, the strongest first.
+        reasons: reasons for it, the strongest first.
     """
 
     word: str
@@ -61,33 +61,32 @@ class Verdict:
 
 
 def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -> Verdict:
-    """The verdict on a person.
+    """Compute the verdict on a person.
 
-    ``suspect``: a p-value so near to 0 or 1 that of all people whom the model explains at most
-    :data:`LEVEL` have one, whatever the number of checks (Bonferroni). ``unexplained``: a suspect
-    whose held-out actions the model predicts worse than the shares of actions in earlier rounds
-    do, or anybody for whom that difference exceeds :data:`STANDARD_ERRORS`. ``unchecked``: without
-    training rounds there is nothing to check.
+    ``suspect``: a p-value so near to 0 or 1 that at most a share :data:`LEVEL` of people whom the
+    model explains have one (Bonferroni over checks). ``unexplained``: suspect, and the model
+    predicts held-out actions worse than the action shares of earlier rounds do; or this difference
+    exceeds :data:`STANDARD_ERRORS` standard errors. ``unchecked``: there are no training rounds.
 
     Args:
         found: p-values, see :func:`p_values`.
-        lead: by how many nats the model predicts each held-out round better than those shares
+        lead: log predictive density of each held-out round minus that of those shares, nats,
             ``[B']``; ``None`` without such rounds.
-        actions: in all of these rounds.
+        actions: number of actions in all of these rounds.
     """
     if not found:
         return Verdict(UNCHECKED)
     tails = {name: 2 * min(value, 1 - value) for name, value in found.items()}
     limit, least = LEVEL / len(tails), 2 / REPLICATES
     reasons = []
-    for name in sorted(tails, key=lambda one: tails[one]):  # stable: of equals the first
+    for name in sorted(tails, key=lambda one: tails[one]):  # stable: ties keep their order
         if tails[name] < limit:
             size = f"p < {least:.3f}" if tails[name] < least else f"p = {tails[name]:.3f}"
             reasons.append(f"{_says(name, found[name] < 1 / 2)} ({size})")
     word = SUSPECT if reasons else OK
     if lead is not None and len(lead) and lead.sum() < 0:
         total, number = float(lead.sum()), len(lead)
-        # Rounds are the sample: what is done in one depends on each other.
+        # Rounds are the sample: actions within a round depend on each other.
         error = float(lead.std()) * number**0.5 if number > 1 else math.inf
         if reasons or not math.isfinite(total) or total < -STANDARD_ERRORS * error:
             word = UNEXPLAINED
@@ -106,9 +105,9 @@ def _says(name: str, more: bool) -> str:
 
 
 def action_shares(train: Demonstrations, actions: int) -> Tensor:
-    """How often people did each thing, whatever the state: their shares of actions ``[P, A]``.
+    """Share of each action of each person, independent of the state, ``[P, A]``.
 
-    Half an action of each kind is added (Jeffreys's prior), so that none has probability 0.
+    Half a count is added to each action (Jeffreys's prior), so that none has probability 0.
     """
     done = torch.nn.functional.one_hot(train.actions.clamp(min=0), actions)
     counts = (done * train.mask[..., None]).sum((1, 2)) + 1 / 2
@@ -116,16 +115,16 @@ def action_shares(train: Demonstrations, actions: int) -> Tensor:
 
 
 def base_rate(train: Demonstrations, test: Demonstrations, actions: int) -> Tensor:
-    """Nats of each held-out action ``[N']`` of one person by the shares of actions before."""
+    """Negative log-likelihood of held-out actions ``[N']`` of one person under earlier shares."""
     return -action_shares(train, actions)[0].log()[test.actions[test.mask]]
 
 
 def no_implants(
     self_model: SelfModel, train: Demonstrations, test: Demonstrations, seed: int
 ) -> Tensor:
-    """Nats of each held-out action ``[N']`` of one person if they were the robot itself.
+    """Negative log-likelihood of held-out actions ``[N']`` of one person without implants.
 
-    It sees everything and takes nothing for granted; how strictly it chooses is inferred.
+    This baseline is the robot, which sees everything; its consistency and lapse are inferred.
     """
     human = load_human_model("no-implants", self_model)
     if bool(train.mask.any()):
@@ -148,13 +147,13 @@ def criticize(
     log_probabilities: tuple[Tensor, Tensor | None],
     seed: int,
 ) -> dict[str, Any]:
-    """Whether the model explains one person, as ``summary.json`` has it.
+    """Check whether the model explains one person; the result is stored in ``summary.json``.
 
     Args:
         human: the model of people.
-        rounds: of one person: those that were learned from, and the held-out ones, if any.
-        log_probabilities: of actions there, ``[S, 1, B, T, A]``.
-        seed: of everything random.
+        rounds: training rounds of one person, and held-out rounds, if any.
+        log_probabilities: log-probabilities of actions there, ``[S, 1, B, T, A]``.
+        seed: seed of all random draws.
 
     Returns:
         ``verdict``, ``reasons``, ``p_values`` by name, ``nll_base_rate`` and ``nll_no_implants``
@@ -184,7 +183,7 @@ def criticize(
 
 
 def models_of(human: OneOfKinds, kind: Tensor) -> dict[str, float]:
-    """Posterior probability of each model of a family, of draws ``[S]`` of one person's kind.
+    """Posterior probability of each model of a family, from draws ``[S]`` of a person's kind.
 
     See :class:`mirror_ppl.models.family.OneOfKinds`.
     """

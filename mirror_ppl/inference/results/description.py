@@ -1,6 +1,6 @@
-"""What follows from people's draws: predictions, and what their rounds do not identify.
+"""Predictions and identifiability of people, computed from their posterior draws.
 
-Each person by themselves, so that parts of the people can be described by several processes.
+Each person is described separately, so that people can be distributed over processes.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ PRIOR_DRAWS = 100
 
 @dataclass(frozen=True)
 class Described:
-    """What follows from the draws of P people.
+    """Description of P people.
 
     Attributes:
-        prior: draws of the prior of each ``[S', P, 1, ...]``.
-        predictions: of their actions.
-        identifiability: what their rounds do not identify, where that is known.
-        seconds: of processors that it took, by stage.
+        prior: prior draws for each person ``[S', P, 1, ...]``.
+        predictions: predictions of their actions.
+        identifiability: posterior entropies and expected information gains, where defined.
+        seconds: processor time by stage.
     """
 
     prior: Draws
@@ -44,15 +44,15 @@ class Described:
 
 @dataclass(frozen=True)
 class Description:
-    """How people are described.
+    """Settings of :func:`describe`.
 
     Attributes:
         human: the model of people.
-        seed: of everything random.
-        explore: rounds that the model plays in each scenario.
-        population: that the people are from, if they were pooled.
-        every_draw: keep held-out predictions under every draw, not their mean alone, and all sites
-            of the prior, not only those that are one number a person.
+        seed: seed of all random draws.
+        explore: rounds that are simulated in each scenario.
+        population: posterior of the population, if people were pooled.
+        every_draw: True to keep held-out predictions under every draw, not only their mean, and all
+            sites of the prior, not only those with one number per person.
     """
 
     human: HumanModel
@@ -64,13 +64,13 @@ class Description:
 
 @dataclass(frozen=True)
 class Part:
-    """Some people, with draws ``[S, P, 1, ...]`` of what they are like.
+    """Some people, with their posterior draws.
 
     Attributes:
         first: number of the first of them among all.
-        train: the rounds that were learned from.
-        test: the held-out rounds, if there are any.
-        draws: of the posterior.
+        train: training rounds.
+        test: held-out rounds, if there are any.
+        draws: posterior draws ``[S, P, 1, ...]``.
     """
 
     first: int
@@ -90,12 +90,12 @@ def describe(
     """Describe P people.
 
     Args:
-        how: to describe them.
-        train: the rounds that were learned from.
-        test: the held-out rounds, if there are any.
-        draws: of the posterior ``[S, P, 1, ...]``.
-        workers: who does it.
-        identity: of everything that the result depends on.
+        how: settings.
+        train: training rounds.
+        test: held-out rounds, if there are any.
+        draws: posterior draws ``[S, P, 1, ...]``.
+        workers: processes to use.
+        identity: identifies everything that the result depends on.
     """
 
     def given(people: People) -> Part:

@@ -2,15 +2,15 @@
 
 Groups: ``posterior`` and ``prior`` (implants of each person; sight in the domain's unit of
 distance), ``posterior_predictive``, ``prior_predictive``, ``observed_data`` and ``log_likelihood``
-(actions of the rounds that were learned from), ``predictions`` (probabilities of the actions of
-held-out rounds), ``constant_data`` and ``predictions_constant_data`` (what there was to see, and
-the truth where it is known). Attributes say which domain, setting, model and version.
+(actions of the training rounds), ``predictions`` (probabilities of the actions of held-out
+rounds), ``constant_data`` and ``predictions_constant_data`` (observations, and the truth where it
+is known). Attributes hold the domain, setting, model and version.
 
-Predictive draws are of each action given what happened before it, as recorded: averages of them
-compare with what people did, the spread within a round does not.
+Predictive draws are of each action given the recorded history before it: their averages are
+comparable with recorded actions, their spread within a round is not.
 
-Draws are independent and not a chain, so effective sample sizes and r-hat mean nothing for them;
-but for those of the guide ``nuts`` and of pooled people, which follow a chain.
+Draws are independent and not a chain, so effective sample sizes and r-hat are meaningless for them,
+except for those of the engine ``nuts`` and of pooled people, which follow a chain.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ def to_inference_data(
     predicted: Predictions,
     attributes: Mapping[str, str | int | float],
 ) -> az.InferenceData:
-    """Collect everything about a fit.
+    """Collect the results of a fit.
 
     Args:
-        train: rounds that were learned from.
+        train: training rounds.
         test: held-out rounds, if there are any.
         posterior: draws ``[S, P, 1, ...]``.
         prior: draws ``[S', P, 1, ...]``.
-        predicted: actions.
-        attributes: what the file should say of itself.
+        predicted: predictions of actions.
+        attributes: attributes of the file.
     """
     domain = get_domain(train.domain)
 
@@ -94,12 +94,12 @@ def to_inference_data(
 def add_identifiability(
     data: az.InferenceData, found: Identifiability, attributes: Mapping[str, str | int | float]
 ) -> None:
-    """Add the group ``identifiability`` to those of a fit; everything in it is in nats.
+    """Add the group ``identifiability`` to those of a fit; its variables are in nats.
 
     Args:
-        data: of the fit.
-        found: what is open about its people.
-        attributes: what the file says of itself.
+        data: groups of the fit.
+        found: posterior entropies and expected information gains of its people.
+        attributes: attributes of the file.
     """
     domain = get_domain(str(attributes["domain"]))
     scenarios = list(domain.scenarios)[: found.information.shape[1]]
@@ -131,12 +131,12 @@ def add_check(
     people: Sequence[Mapping[str, Any]],
     attributes: Mapping[str, str | int | float],
 ) -> None:
-    """Add the group ``model_check`` to those of a fit: whether the model explains each person.
+    """Add the group ``model_check`` to those of a fit: verdicts and p-values of each person.
 
     Args:
-        data: of the fit.
+        data: groups of the fit.
         people: their parts of the summary, with ``check`` and ``test``.
-        attributes: what the file says of itself.
+        attributes: attributes of the file.
     """
     checks = [person["check"] for person in people]
     names = list(dict.fromkeys(name for check in checks for name in check["p_values"]))
@@ -172,7 +172,7 @@ def save_inference_data(data: az.InferenceData, path: Path) -> None:
 
 
 def netcdf_content(inference_data: az.InferenceData) -> memoryview:
-    """What a netCDF file of it holds; numbers are compressed and have checksums."""
+    """Content of its netCDF file; numbers are compressed and have checksums."""
     data = inference_data.to_datatree()
     packing = {"zlib": True, "complevel": 1, "shuffle": True, "fletcher32": True}
     encoding = {

@@ -1,4 +1,4 @@
-"""The main job: from recordings to every person's posterior, predictions and a summary."""
+"""Fitting: from recordings to every person's posterior, predictions and a summary."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ TRAIN_ROUNDS, TEST_ROUNDS = 20, range(30, 36)
 
 @dataclass(frozen=True)
 class Fit:
-    """Everything that came out of fitting P people.
+    """Results of fitting P people.
 
     Attributes:
         human: the human model.
-        train: the rounds that were learned from.
-        posterior: draws, and how they came about.
+        train: training rounds.
+        posterior: draws and diagnostics.
         data: the posterior and predictions as ArviZ ``InferenceData``.
-        summary: what ``summary.json`` holds.
-        seconds: of processors that it took, by stage.
+        summary: content of ``summary.json``.
+        seconds: processor time by stage.
     """
 
     human: HumanModel
@@ -62,23 +62,22 @@ class Fit:
 def split_rounds(
     demonstrations: Demonstrations, train_rounds: int | None = None
 ) -> tuple[Demonstrations, Demonstrations | None]:
-    """Rounds to learn from and held-out rounds.
+    """Split recordings into training and held-out rounds.
 
-    Recordings of 36 rounds or more are split as the supplement has it: 20 to train, rounds 31 to
-    36 to test. Of shorter ones three quarters train and the rest is held out.
+    Recordings of 36 rounds or more are split as in the supplement: 20 to train, rounds 31 to 36 to
+    test. Shorter ones are split three quarters to one quarter.
 
     Args:
         demonstrations: all rounds.
-        train_rounds: number of rounds to learn from instead, from the first one on; 0 for none,
-            which leaves the prior. Where that reaches into the test rounds, those that follow it
-            are held out.
+        train_rounds: number of training rounds, from the first one on; 0 gives the prior. If they
+            reach into the test rounds, all later rounds are held out.
 
     Returns:
         Training rounds, and the held-out ones or ``None`` if none are left.
 
     Raises:
-        InputError: these are no demonstrations, or no number of rounds.
-        DemonstrationsError: there are fewer rounds than asked for.
+        InputError: these are no demonstrations, or the number is invalid.
+        DemonstrationsError: there are fewer rounds than requested.
     """
     require_kind(demonstrations, Demonstrations, "demonstrations")
     rounds = int(demonstrations.round_counts.max())
@@ -109,29 +108,29 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     every_draw: bool = False,
     checked: bool = False,
 ) -> Fit:
-    """Infer the implants of everybody in recordings, and predict their held-out actions.
+    """Infer the implants of all people in recordings, and predict their held-out actions.
 
     Args:
         human: the model of people.
         demonstrations: rounds of P people.
-        options: how to infer.
-        seed: seed of everything random.
+        options: settings of inference.
+        seed: seed of all random draws.
         train_rounds: see :func:`split_rounds`.
-        report: told of progress.
-        checkpoint: file to continue from; written on the way, removed by nobody. What is done for
-            some people after others is kept in a folder of that name with ``.parts``.
-        network: of the engines that take one.
-        population: that the people are from, if it is known from others.
-        workers: who does the work; report and folder are the others' here.
-        explore: rounds that the model plays in each scenario, to find the most informative one.
+        report: called with progress.
+        checkpoint: file to resume from; written during the run and never removed. Results of parts
+            of the people are stored in a folder of that name with ``.parts``.
+        network: network for the engines that take one.
+        population: a population estimated from other people, to be the prior of these.
+        workers: processes to use; its ``report`` and ``folder`` are replaced.
+        explore: rounds that are simulated in each scenario, to find the most informative one.
         every_draw: keep predictions of held-out actions under every draw, and all of the prior.
-        checked: that :func:`check_contract` was called already.
+        checked: True if :func:`check_contract` was called already.
 
     Raises:
-        InputError: an argument of another kind, or rounds of another domain.
-        DemonstrationsError: too few rounds, or rounds that cannot be in the domain's world (see
-            :func:`mirror_ppl.data.contradictions.check_world`).
-        HumanModelError: the human model breaks its contract, or cannot be fitted by this guide.
+        InputError: an argument of another type, or rounds of another domain.
+        DemonstrationsError: too few rounds, or rounds that are impossible in the domain's world
+            (see :func:`mirror_ppl.data.contradictions.check_world`).
+        HumanModelError: the human model breaks its contract, or cannot be fitted by this engine.
         CheckpointError: the checkpoint is damaged or of another run.
     """
     check_rounds(human, demonstrations)
@@ -156,7 +155,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     if checkpoint is not None and test is not None:
         identity += f"{_recorded(test)} {explore} {every_draw}"
     described = describe(how, train, test, posterior.draws, workers, identity)
-    # Results live where everybody can read them.
+    # Results are on the CPU.
     learned = train
     train, test = train.to("cpu"), None if test is None else test.to("cpu")
     drawn = {name: value.cpu() for name, value in posterior.draws.items()}
@@ -211,7 +210,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
 def _attributes(
     human: HumanModel, train: Demonstrations, options: InferenceOptions, pooling: str, seed: int
 ) -> dict[str, str | int | float]:
-    """What ``posterior.nc`` and ``summary.json`` say of themselves."""
+    """Attributes of ``posterior.nc`` and ``summary.json``."""
     domain = get_domain(train.domain)
     own = {
         "domain": domain.name,
@@ -229,7 +228,7 @@ def _attributes(
 
 
 def _recorded(train: Demonstrations) -> str:
-    """The recordings, as a hash."""
+    """Hash of the recordings."""
     digest = hashlib.sha256()
     for name, value in sorted(train.variables().items()):
         digest.update(name.encode())

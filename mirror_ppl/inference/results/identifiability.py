@@ -1,18 +1,18 @@
-"""What a fit leaves open: does blindness hide behind policy, and which rounds would tell?
+"""Identifiability of perceptual implants: posterior entropy and expected information gain.
 
-Somebody who acts oddly may not see, or may decide oddly. With posterior draws ``psi_s`` of how a
-person decides and the exact ``p(m | psi_s, actions)`` of what they see under each of them,
+Unusual actions may be due to perception or to policy. With posterior draws ``psi_s`` of the policy
+implants and the exact posterior ``p(m | psi_s, actions)`` of the perceptual implants given each,
 
-    open about m          H[ mean_s p(m | psi_s, actions) ]
-    hangs on the policy   open - mean_s H[ p(m | psi_s, actions) ]
+    entropy             H[ mean_s p(m | psi_s, actions) ]
+    shared with policy  entropy - mean_s H[ p(m | psi_s, actions) ]
 
-in nats: the second is the mutual information of the two in the posterior, what one would learn of
-their sight if one knew how they decide. A round that is still to be recorded, in a scenario, tells
+in nats. The second is the posterior mutual information of perceptual and policy implants: the
+reduction of entropy if the policy were known. The expected information gain of a further round is
 
     H[ p(m | actions) ] - E H[ p(m | actions, actions of that round) ]
 
-of what they see whatever their policy, the expectation over rounds that the model itself plays
-(Lindley, *On a measure of the information provided by an experiment*, 1956).
+for each scenario, with the policy marginalized and the expectation over rounds that the model
+simulates (Lindley, *On a measure of the information provided by an experiment*, 1956).
 """
 
 from __future__ import annotations
@@ -42,33 +42,33 @@ from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.progress import Report, silent
 
 NEGLIGIBLE = 0.005
-"""Nats below which nothing is open; they are told as 0.00."""
+"""Nats below which entropies and information gains count as 0; printed as 0.00."""
 POLICIES = 48
-"""Posterior draws of how a person decides."""
+"""Posterior draws of the policy implants."""
 COMBINATIONS = 128
-"""Combinations of what they may see between which rounds are to tell, at most."""
+"""Largest number of combinations of perceptual implants in information gains."""
 FEW = 64
-"""Combinations among the draws up to which no others are looked at, if there are ..."""
+"""If draws have at most this many distinct combinations, only these are considered,"""
 ENOUGH = 3
-"""... so many times as many draws."""
+"""provided that there are this many times as many draws."""
 
 VALUES = 64
-"""Values of attention in a round, where it differs from round to round."""
+"""Sampled values of attention per round."""
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What is open about P people, in nats.
+    """Identifiability of P people's perceptual implants, in nats.
 
     Attributes:
-        sites: the discrete implants that perception reads; D of them.
-        entropy: open about each ``[P, D]``.
-        shared: of it, what hangs on how they decide ``[P, D]``.
-        all_entropy, all_shared: the same of all of them together ``[P]``.
-        information: expected from one more round in each of the domain's N scenarios, about all
-            of them together, ``[P, N]``; empty if no round was played.
-            What is expected is never negative; what is found of it, of a few rounds, may be.
-        information_error: its standard error, of the rounds that were played; NaN if it was one.
+        sites: the D discrete implants that perception reads.
+        entropy: posterior entropy of each ``[P, D]``.
+        shared: part of it that is shared with the policy implants ``[P, D]``.
+        all_entropy, all_shared: entropy and shared part of all sites jointly ``[P]``.
+        information: expected information gain of one more round in each of the domain's N
+            scenarios, about all sites jointly, ``[P, N]``; empty if no round was simulated. An
+            estimate from few rounds may be negative.
+        information_error: its standard error over simulated rounds; NaN for a single round.
     """
 
     sites: tuple[str, ...]
@@ -81,7 +81,7 @@ class Identifiability:
 
     @classmethod
     def joined(cls, parts: Sequence[Mapping[str, Any]]) -> Identifiability:
-        """Of the people of all parts, of each of which these are the attributes."""
+        """Concatenate the attributes of parts of the people."""
         tensors = [name for name in parts[0] if name != "sites"]
         return cls(
             tuple(parts[0]["sites"]),
@@ -90,12 +90,12 @@ class Identifiability:
 
     @property
     def nothing(self) -> bool:
-        """Whether of nobody anything is open, or could be told, that is worth telling."""
+        """True if all joint entropies and information gains are negligible."""
         told = torch.cat([self.all_entropy.flatten(), self.information.flatten()])
         return bool((told < NEGLIGIBLE).all())
 
     def of(self, person: int, scenarios: Sequence[str]) -> dict[str, Any]:
-        """What is open about one person, as ``summary.json`` has it."""
+        """Identifiability of one person, as stored in ``summary.json``."""
         entropy, shared = (part[person].tolist() for part in (self.entropy, self.shared))
         information, error = (
             part[person].tolist() for part in (self.information, self.information_error)
@@ -125,21 +125,21 @@ def identify(
     rounds: int = 8,
     first: int = 0,
 ) -> Identifiability | None:
-    """What is open about people after a fit.
+    """Compute the identifiability of people's perceptual implants after a fit.
 
     Args:
         human: the model of people.
-        train: the rounds that were learned from.
-        draws: posterior draws ``[S, P, 1, ...]``, one after the other not alike.
-        seed: of the rounds that are played.
-        population: that people are from, if it was the prior.
-        report: told of people done.
-        rounds: that are played in each scenario; 0 for none.
+        train: training rounds.
+        draws: posterior draws ``[S, P, 1, ...]``, not autocorrelated.
+        seed: seed of the simulated rounds.
+        population: posterior of the population, if people were pooled.
+        report: called with the number of people done.
+        rounds: simulated rounds in each scenario; 0 for none.
         first: number of the first of these people among all.
 
     Returns:
-        ``None`` of models in which there is nothing discrete to see, or in which actions depend on
-        what is seen otherwise than through beliefs, or whose program is their own.
+        The identifiability; ``None`` for models without discrete perceptual implants, in which
+        percepts affect actions other than through beliefs, or with a program of their own.
     """
     if has_own_program(human):
         return None
@@ -157,7 +157,7 @@ def identify(
         candidates, one = drawn.unique(), train.select_people([person])
         if len(candidates) <= FEW and ENOUGH * len(candidates) <= held:
             table = build_view_table(human, one, [candidates], likely=own, values=VALUES)
-        else:  # draws are too few to tell how many there are
+        else:  # too few draws to estimate the support
             table = build_view_table(human, one, screening=Screening(), likely=own, values=VALUES)
             candidates = table.possible[0].nonzero().squeeze(-1)
         if not acts_on_beliefs(human, table.sites):
@@ -166,7 +166,7 @@ def identify(
         joint = log_joints(human, table, policy, candidates)[:, 0]
         grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
         if population is not None and pooling is not None:
-            # On average: which population it is says nothing of how this person decides.
+            # The mean over the population, which is independent of this person's policy draws.
             chances = {
                 site: value.mean(0, keepdim=True).expand(len(chosen), *value.shape[1:])
                 for site, value in population.chances.items()
@@ -175,7 +175,7 @@ def identify(
         weights = torch.log_softmax(joint, -1)  # [S, C]
         told = (weights.new_zeros(0),) * 2
         if rounds:
-            # Of each person their own worlds, so that averages over people are of many.
+            # Each person has their own worlds, so that averages over people use many.
             generator = torch.Generator(weights.device).manual_seed(
                 seed * 1_000_003 + first + person
             )
@@ -198,23 +198,23 @@ def identify(
 def _instead_of_prior(
     grid: Mapping[str, Tensor], chances: Mapping[str, Tensor], pooling: Pooling
 ) -> Tensor:
-    """Log ratio ``[S, C]`` of the prior of combinations in populations to the model's own.
+    """Log ratio ``[S, C]`` of the population's prior of combinations to the model's own.
 
-    Sites that a population says nothing of keep their prior.
+    Sites that are not part of the population keep their prior.
     """
     total = torch.zeros(())
     for site, support in pooling.supports.items():
         if site in grid:
             same = grid[site][:, None] == support
             ratio = (chances[site] / pooling.prior_chances[site]).log()
-            # A value that the prior rules out has no chance.
+            # Values that are impossible under the prior have probability 0.
             ratio = torch.where(same.any(-1), ratio[:, same.long().argmax(-1)], -torch.inf)
             total = total + ratio
     return total
 
 
 def _open(weights: Tensor, grid: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Entropies and what is shared with policy, of each site ``[D]`` and of all together."""
+    """Entropies and their parts shared with policy, of each site ``[D]`` and of all jointly."""
     open_, shared = [], []
     for value in grid.values():
         values = value.unique()
@@ -226,7 +226,7 @@ def _open(weights: Tensor, grid: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, 
 
 
 def _entropy_and_shared(probability: Tensor) -> tuple[Tensor, Tensor]:
-    """Of conditionals ``[S, n]``."""
+    """Entropy of the mean of conditionals ``[S, n]``, and its part shared with policy."""
     total = _entropy(probability.mean(0))
     return total, (total - _entropy(probability).mean()).clamp(min=0)
 
@@ -236,10 +236,10 @@ def _entropy(probability: Tensor) -> Tensor:
 
 
 def _represented(weights: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Combinations that stand for all, and log weights ``[S, C']`` of them with each policy.
+    """Representative combinations, and their log weights ``[S, C']`` with each policy.
 
-    All of them if they are few; else as many as are drawn, each with the weight of its draws. The
-    weights of all pairs add up to 1.
+    All of them if they are few; else a sample, weighted by frequency. The weights of all pairs sum
+    to 1.
     """
     number = weights.shape[-1]
     if number <= COMBINATIONS:
@@ -262,10 +262,10 @@ def _information(
     rounds: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Expected of a round in each scenario ``[N]``, in nats, and its standard error."""
+    """Expected information gain of a round in each scenario ``[N]``, nats; standard error."""
     domain = human.domain
     number = len(domain.scenarios)
-    # Who plays: every pair of policy and sight by its probability, the same in each scenario.
+    # Players are pairs of policy and combination, by probability, the same in each scenario.
     players = torch.multinomial(
         pairs.exp().flatten(), rounds, replacement=True, generator=generator
     ).repeat(number)

@@ -1,9 +1,9 @@
-"""The population in a posterior file: hyper-parameters, and somebody new from it ("round zero").
+"""The population in a posterior file: hyper-parameters, and a new person from it ("round zero").
 
-Two groups beside the standard ones. ``population``: of each discrete site the probabilities of its
-values, ``<site>_chances``; of each continuous one mean and spread in unconstrained space (of its
-logarithm, or of its logit), ``<site>_mean`` and ``<site>_spread``. ``newcomer``: draws of the
-implants of a person of whom nothing is known but where they are from.
+There are two groups besides the standard ones. ``population``: for each discrete site the
+probabilities of its values, ``<site>_chances``; for each continuous one mean and spread in
+unconstrained space (of its logarithm or logit), ``<site>_mean`` and ``<site>_spread``.
+``newcomer``: draws of the implants of a person from the population without recorded rounds.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ def add_population(
     """Add the groups ``population`` and ``newcomer`` to those of a fit.
 
     Args:
-        data: of the fit.
-        pooling: of the human model.
+        data: groups of the fit.
+        pooling: partial pooling of the human model.
         population: S draws.
-        attributes: what the file says of itself.
-        seed: of the newcomer.
+        attributes: attributes of the file.
+        seed: seed of the newcomer's draws.
 
     Returns:
         Draws ``[S, ...]`` of the newcomer, in the domain's units.
@@ -73,12 +73,12 @@ def add_population(
 
 
 def load_population(path: Path, pooling: Pooling, setting: str | None = None) -> Population:
-    """The population of a posterior file, to be the prior of other people.
+    """Read the population of a posterior file, to be the prior of other people.
 
     Args:
-        path: what ``python -m mirror_ppl.fit --pooling partial`` wrote.
-        pooling: of the human model.
-        setting: that the other people are in; any unless given.
+        path: a file written by ``python -m mirror_ppl.fit --pooling partial``.
+        pooling: partial pooling of the human model.
+        setting: required setting of the population; any by default.
 
     Raises:
         PosteriorError: the file is missing or damaged, holds no population, or is of another human

@@ -1,4 +1,4 @@
-"""Posterior files read back: draws of the implants, as the human model samples them."""
+"""Reading of posterior files: draws of the implants, as the human model samples them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from mirror_ppl.netcdf import read_netcdf
 
 @dataclass(frozen=True)
 class PosteriorFile:
-    """What a posterior file holds of P people.
+    """Content of a posterior file of P people.
 
     Attributes:
-        path: where it was read from.
-        attributes: what the file says of itself: domain, setting, human model and so on.
-        people: names.
+        path: path of the file.
+        attributes: attributes of the file: domain, setting, human model and so on.
+        people: ids of the people.
         values: draws ``[S, P, ...]`` by name, in the units of the file.
     """
 
@@ -43,13 +43,13 @@ class PosteriorFile:
         """Values ``[S, P, 1, ...]`` of all sites of a human model.
 
         Args:
-            human: the model that the posterior is of.
-            number: how many draws, spread evenly over those of the file; all unless given.
+            human: the human model of the posterior.
+            number: number of draws, evenly spaced over those of the file; all by default.
 
         Raises:
             PosteriorError: the posterior is of another human model, self-model or version of the
-                domain, holds fewer draws than asked for, or values that cannot be.
-            InputError: the human model or the number is something else.
+                domain, holds fewer draws than requested, or impossible values.
+            InputError: the human model or the number has another type.
         """
         require_kind(human, HumanModel, "human")
         check_origin(self.path, self.attributes, human)
@@ -93,7 +93,7 @@ class PosteriorFile:
 
 
 def read_results(path: Path, *groups: str) -> dict[str, xr.Dataset]:
-    """Groups of a file that a fit wrote.
+    """Read groups of a file that a fit wrote.
 
     Raises:
         PosteriorError: the file is missing or damaged, or lacks the first of the groups.
@@ -109,7 +109,7 @@ def read_results(path: Path, *groups: str) -> dict[str, xr.Dataset]:
 
 
 def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -> None:
-    """Make sure that a file is of this human model.
+    """Check that a file is of this human model.
 
     Raises:
         PosteriorError: it is of another domain or version of it, human model or self-model.
@@ -135,11 +135,11 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
 
     Args:
         path: a file that ``python -m mirror_ppl.fit`` or `save_inference_data` wrote.
-        domain: name of the domain it has to be of; any unless given.
+        domain: required domain; any by default.
 
     Raises:
         PosteriorError: the file is missing or damaged, holds no draws, or is of another domain.
-        UnknownNameError: it is of a domain that there is not.
+        UnknownNameError: its domain does not exist.
     """
     path = as_path(path)
     group = read_results(path, "posterior")["posterior"]

@@ -1,4 +1,4 @@
-"""Probabilities of recorded people's actions, each given what was done before it."""
+"""Posterior predictive probabilities of recorded people's actions."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from mirror_ppl.models.recorded import check_rounds
 
 PEOPLE_AT_ONCE = 16
 """People whose views are in memory together. With a multiple of 16, predictions equal those of all
-people at once bit for bit, where rounds have an even number of steps in all: processors take the
+people at once bit for bit, if rounds have an even number of steps in all: processors take the
 numbers of an array in blocks of 16 or 32, and may round the rest at its end differently in the last
 digit."""
 PREDICTED_VALUES = 128
-"""Values of attention that predictions average over, where it differs from round to round."""
+"""Sampled values of attention per round in predictions."""
 
 
 def predict_rounds(
     human: HumanModel, rounds: Demonstrations, draws: Mapping[str, Tensor]
 ) -> Tensor:
-    """Log-probabilities ``[S, P, B, T, A]`` of actions, each given what was done before it.
+    """Log-probabilities ``[S, P, B, T, A]`` of actions, each given the earlier ones of its round.
 
     Args:
         human: the model of people.
-        rounds: of P people.
-        draws: of their implants ``[S, P, 1, ...]``.
+        rounds: rounds of P people.
+        draws: draws of their implants ``[S, P, 1, ...]``.
 
     Raises:
-        InputError: the rounds are of another domain, or the draws are none of these people.
-        DemonstrationsError: the rounds cannot be in the domain's world.
+        InputError: the rounds are of another domain, or the draws are not of these people.
+        DemonstrationsError: the rounds are impossible in the domain's world.
         HumanModelError: the draws are not those of the model's sites.
     """
     check_rounds(human, rounds)
@@ -50,7 +50,7 @@ def predict_rounds(
     parts = []
     for some in groups(rounds.num_people):
         own, recorded = of_people(draws, some), rounds.part(some)
-        # Only what some draw sees is looked at: exact views, without screening or merging.
+        # Only combinations among the draws: exact views, without screening or merging.
         candidates = [
             combination_number({site: own[site][:, person, 0] for site in sizes}, sizes)
             .unique()
@@ -66,16 +66,16 @@ def predict_rounds(
 
 
 def chosen_log_probability(log_probabilities: Tensor, rounds: Demonstrations) -> Tensor:
-    """Log-probability ``[S, P, B, T]`` of what was done; 0 in padding."""
+    """Log-probability ``[S, P, B, T]`` of recorded actions; 0 in padding."""
     actions = rounds.actions.clamp(min=0).expand(log_probabilities.shape[:-1])
     chosen = log_probabilities.gather(-1, actions[..., None]).squeeze(-1)
     return torch.where(rounds.mask, chosen, 0.0)
 
 
 def groups(people: int) -> list[range]:
-    """Numbers of the people of each group; one person who would be left over joins the last.
+    """Numbers of the people of each group; a single remaining person joins the last group.
 
-    Arrays of a single person are taken in other blocks.
+    Arrays of a single person are processed in other blocks.
     """
     begins = list(range(0, people, PEOPLE_AT_ONCE))
     if len(begins) > 1 and people - begins[-1] == 1:
@@ -84,5 +84,5 @@ def groups(people: int) -> list[range]:
 
 
 def of_people(draws: Mapping[str, Tensor], some: range) -> dict[str, Tensor]:
-    """Draws ``[S, P', 1, ...]`` of some people."""
+    """Select draws ``[S, P', 1, ...]`` of some people."""
     return {name: value[:, some.start : some.stop] for name, value in draws.items()}

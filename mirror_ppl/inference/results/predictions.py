@@ -1,8 +1,8 @@
-"""Predictions of everybody's actions, and whether the model explains them; a few people at a time.
+"""Predictions and model checks of all people, in groups of a few.
 
 The views of one person's rounds under a hundred draws take up to 13 MB, and log-probabilities of
-actions under all draws another one. Both are needed for a moment only: predictions go through the
-people in groups, and of each group nothing is kept but its results.
+actions under all draws another one. To bound memory, people are processed in groups, and only the
+results of each group are kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.progress import Report, silent
 
 PREDICTIVE_STREAM, CRITICISM_STREAM = 2**31, 2**32
-"""Added to seeds of predictive draws, which inference and played rounds must not share."""
+"""Offsets of seeds, so that predictive draws share none with inference and simulated rounds."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Predictions:
         posterior: actions in the training rounds, one for each posterior draw, ``[S, P, B, T]``,
             int8.
         prior: actions there, one for each prior draw, ``[S', P, B, T]``, int8.
-        log_likelihood: of the training rounds under each posterior draw, ``[S, P, B]``.
+        log_likelihood: log-likelihood of training rounds under each posterior draw, ``[S, P, B]``.
         held_out: probabilities of actions in the held-out rounds under each posterior draw,
             ``[S, P, B', T', A]``; ``None`` without such rounds.
-        scores: of each person's held-out rounds, see :func:`score`; ``None`` without such rounds.
-        checks: whether the model explains each person, see :func:`criticize`.
+        scores: scores of each person's held-out rounds, see :func:`score`; ``None`` without these.
+        checks: model criticism of each person, see :func:`criticize`.
     """
 
     posterior: Tensor
@@ -80,17 +80,17 @@ def predict_people(
     report: Report = silent,
     first: int = 0,
 ) -> Predictions:
-    """Predict what P people do, each action given what was done before it.
+    """Predict the actions of P people, each given the earlier ones of its round.
 
-    The predictive draws of each person have a generator of their own, so that they do not depend on
-    who else was recorded.
+    Each person has their own generator, so that predictive draws do not depend on which other
+    people were recorded.
 
     Args:
         human: the model of people.
-        rounds: those that were learned from, and the held-out ones, if there are any.
-        draws: of implants, from the posterior ``[S, P, 1, ...]`` and the prior ``[S', P, 1, ...]``.
-        seed: of predictive draws.
-        report: told of people done.
+        rounds: training rounds, and held-out rounds, if there are any.
+        draws: implants from the posterior ``[S, P, 1, ...]`` and the prior ``[S', P, 1, ...]``.
+        seed: seed of predictive draws.
+        report: called with the number of people done.
         first: number of the first of these people among all.
     """
     (train, test), parts = rounds, []
@@ -130,7 +130,7 @@ def predict_people(
 
 
 def _drawn(log_probabilities: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
-    """Actions ``[S, P, B, T]``, int8, by log-probabilities ``[S, P, B, T, A]``."""
+    """Sample actions ``[S, P, B, T]``, int8, from log-probabilities ``[S, P, B, T, A]``."""
     actions = []
     for person, generator in enumerate(generators):
         own = log_probabilities[:, person].exp()

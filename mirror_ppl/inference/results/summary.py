@@ -1,4 +1,4 @@
-"""What a fit says of each person, in numbers that a person reads."""
+"""Summaries of a fit for each person, as in ``summary.json``."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def summarize(
     scores: Sequence[dict[str, Any] | None] | None,
     value_names: Mapping[str, Sequence[str]] | None = None,
 ) -> list[dict[str, Any]]:
-    """One entry a person: ``id``, ``rounds``, ``implants`` and ``test``.
+    """Summarize each person: ``id``, ``rounds``, ``implants`` and ``test``.
 
     Args:
-        draws: posterior draws ``[S, P, ...]``; implants that are one number a person are told of.
-        train: rounds that were learned from.
-        scores: of each person's held-out rounds, see :func:`score`, if there are such rounds.
+        draws: posterior draws ``[S, P, ...]``; only implants with one number per person are used.
+        train: training rounds.
+        scores: scores of each person's held-out rounds, see :func:`score`, if there are any.
         value_names: see `HumanModel.value_names`.
 
     Returns:
         ``implants``: by name ``median``, ``q05``, ``q95`` and ``truth`` (``None`` where unknown);
-        quantiles are values that were drawn. Of implants whose values have names ``most_probable``
-        and its ``probability`` instead of quantiles. ``test``: ``nll`` in nats an action,
+        quantiles are values that were drawn. Implants with named values have ``most_probable`` and
+        its ``probability`` instead of quantiles. ``test``: ``nll`` in nats per action,
         ``accuracy`` and ``floor``, the person's own entropy (``None`` where unknown); ``None``
         without held-out rounds.
     """
@@ -54,7 +54,7 @@ def summarize(
 def summarize_newcomer(
     draws: Mapping[str, Tensor], value_names: Mapping[str, Sequence[str]] | None = None
 ) -> dict[str, dict[str, Any]]:
-    """The same of each implant of somebody new that is one number, of draws ``[S, ...]``."""
+    """Summarize each scalar implant of a new person, from draws ``[S, ...]``."""
     return {
         site: _told(site, value, value_names or {})
         for site, value in draws.items()
@@ -71,8 +71,8 @@ def score(log_probabilities: Tensor, rounds: Demonstrations) -> list[dict[str, A
     """Negative log-likelihood, accuracy and floor of each person's actions.
 
     Args:
-        log_probabilities: of actions ``[S, P, B, T, A]``.
-        rounds: of P people.
+        log_probabilities: log-probabilities of actions ``[S, P, B, T, A]``.
+        rounds: rounds of P people.
 
     Returns:
         One entry a person; ``None`` for those without rounds.
@@ -102,7 +102,7 @@ def score(log_probabilities: Tensor, rounds: Demonstrations) -> list[dict[str, A
 
 
 def _told(site: str, values: Tensor, value_names: Mapping[str, Sequence[str]]) -> dict[str, Any]:
-    """What is told of a site, of draws ``[S]``."""
+    """Summary of a site, from draws ``[S]``."""
     if site not in value_names:
         return _quantiles(values)
     often = torch.bincount(values.long(), minlength=len(value_names[site])) / len(values)
