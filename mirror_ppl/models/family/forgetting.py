@@ -38,8 +38,8 @@ class Forgetting(SeveralBeliefs):
         super().__init__(self_model)
         if len(self.domain.reach_bins) <= 1:
             raise HumanModelError(
-                f"forgetting: in {self.domain.name} what was found stays in view, and there is "
-                "nothing to forget"
+                f"forgetting: in {self.domain.name} items stay in view once they are found, so "
+                "there is nothing to forget"
             )
 
     @property

@@ -39,8 +39,8 @@ class Noticing(SeveralBeliefs):
         super().__init__(self_model)
         if len(self.domain.reach_bins) <= 1:
             raise HumanModelError(
-                f"noticing: in {self.domain.name} it does not count how far away things are, and "
-                'the model "mirror" says itself when they are noticed'
+                f"noticing: in {self.domain.name} distance does not matter, and the model "
+                '"mirror" already includes when items are noticed'
             )
 
     @property
