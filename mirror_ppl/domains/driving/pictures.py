@@ -11,7 +11,7 @@ PICTURES = {
     "samples.png": SightPicture(
         samples.has_sight,
         samples.samples_picture,
-        "the same in samples, beside what they really see",
+        "posterior samples of that road, beside what they really see",
     ),
     "notices.png": NOTICES_PICTURE,
 }

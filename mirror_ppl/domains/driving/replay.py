@@ -336,7 +336,7 @@ def _explain(figure: Picture, axes: list[Axes], truth_known: bool) -> None:
     labels = [
         "the person, driving to the right",
         "other cars; arrow: motion relative to the person",
-        "what they are told of",
+        "communicated to the person",
         "where the simulated person thinks a car is",
     ]
     number = len(handles) if truth_known else len(handles) - 1
