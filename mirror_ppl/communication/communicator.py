@@ -220,7 +220,7 @@ class Decision:
             return "the round is over"
         world, now = self.world, self.observation
         if not offers(world, "reference_values"):
-            return f"none: what is best is not known exactly in {world.name}"
+            return f"none: the best action is not known exactly in {world.name}"
         values = world.reference_values(world.state_behind(now), ADVICE_DISCOUNT)
         notion = next(iter(world.relevance(now).values()))
         flags = Channels(world).join(notion)

@@ -100,7 +100,7 @@ class ExpectedUtility:
             raise ValueError(f"enumerate_above must be from 0 to 1, not {self.enumerate_above}")
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
-        """See :class:`Objective`."""
+        """Return the function that values candidates; see :class:`Objective`."""
         person, past = context.person, context.past
         horizon = min(self.horizon, steps_left)
         device = past.actions.device
@@ -297,7 +297,7 @@ class Divergence:
             raise ValueError(f"weight must be positive, not {self.weight}")
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
-        """See :class:`Objective`; steps left and seed are not used.
+        """Return the function that values candidates; steps left and seed are not used.
 
         Raises:
             HumanModelError: the beliefs of the human model have no density like the robot's.

@@ -218,17 +218,17 @@ class SimulatorWorld:
         self.domain = domain
 
     def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
-        """See :class:`World`; the generator is not used."""
+        """Return the rollouts; the generator is not used, see :class:`World`."""
         now = {name: value[None, None] for name, value in past.now.items()}
         state = self.domain.state_behind(now)
         return RolloutTree(self, state, now, len(self.domain.actions), horizon)
 
     def observe(self, state: Any) -> Observation:
-        """See :class:`Dynamics`."""
+        """Return the full observation, see :class:`Dynamics`."""
         return self.domain.observe(state)
 
     def step(self, state: Any, action: Tensor, step: int) -> tuple[Tensor, Any]:
-        """See :class:`Dynamics`."""
+        """Return rewards and next states, see :class:`Dynamics`."""
         following = self.domain.transition(state, action)
         return total_reward(self.domain.rewards(state, action, following)), following
 
@@ -255,7 +255,7 @@ class SelfModelWorld:
         self.draws = whole_number(draws, "draws", 1)
 
     def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
-        """See :class:`World`."""
+        """Return the rollouts, see :class:`World`."""
         model = self.self_model
         device = past.actions.device
         shape = (self.draws, 1, model.latent)

@@ -51,7 +51,7 @@ class Exhaustive:
     items: int | None = None
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`; the seed is not used."""
+        """Return candidates with their values; the seed is not used, see :class:`Search`."""
         candidates = every_message(allowed, self.items)[:, None]
         return Found(candidates, in_chunks(value, candidates))
 
@@ -81,7 +81,7 @@ class Patient:
             raise ValueError(f"steps must be at least 1, not {self.steps}")
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`; the seed is not used."""
+        """Return candidates with their values; the seed is not used, see :class:`Search`."""
         if self.steps > 1 and count_messages(allowed, self.items) <= FEW_MESSAGES:
             messages = every_message(allowed, self.items)
             plans = [_at_once(messages, self.steps), *self._plans(messages[1:])]
@@ -142,7 +142,7 @@ class CrossEntropy:
             raise ValueError(f"steps must be at least 1, not {self.steps}")
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`."""
+        """Return candidates with their values, see :class:`Search`."""
         places = allowed.nonzero().squeeze(-1)
         number = len(places)
 
@@ -182,7 +182,7 @@ class Automatic:
     items: int | None = None
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`."""
+        """Return candidates with their values, see :class:`Search`."""
         if count_messages(allowed, self.items) <= self.most:
             return Patient(self.steps, items=self.items)(value, allowed, seed)
         return CrossEntropy(self.steps)(value, allowed, seed)

@@ -42,7 +42,7 @@ CAPABILITIES = (
     Capability("over", "rounds last to the horizon", "rounds that end"),
     Capability("learn", "what was last seen", "memory: what people know without looking"),
     Capability("assume", "nothing", "what people take for granted"),
-    Capability("communicable", "everything", "what can be told"),
+    Capability("communicable", "everything", "items that can be communicated"),
     Capability("relevance", "everything", "shares of relevant messages"),
     Capability("describe", "names and numbers", "messages in words"),
     Capability("deed", "the action's name", "actions in words"),

@@ -32,7 +32,7 @@ class OneRadius(HumanModel):
         super().__init__(self_model)
         if len(self.domain.reach_bins) <= 1:
             raise HumanModelError(
-                f"one-radius: in {self.domain.name} it does not count how far away things are"
+                f"one-radius: in {self.domain.name} distance does not matter, so there is no radius"
             )
 
     def prior(self) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from mirror_ppl.row_hashing import as_whole_numbers, random_keys
 
 @dataclass(frozen=True)
 class View:
-    """What enters a person's belief: masks ``[..., K]`` and imagined items for each modality.
+    """The inputs of a belief: masks ``[..., K]`` and imagined items for each modality.
 
     Attributes:
         visible: items that are seen, communicated or remembered.

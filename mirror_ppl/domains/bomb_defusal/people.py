@@ -13,7 +13,7 @@ were shown it, they press the button that is right for the believed type; until 
 ``p(f_t | not f_{t-1}) = notices[terminal]``, and ``a_t`` is the right button for ``k_t`` if
 ``f_t``, else to wait. They do not learn the type from penalties: a wrong guess stays wrong.
 
-Choices that the supplement leaves open, with their reasons, are in ``docs/people.md``.
+Choices that the supplement does not specify, and their reasons, are in ``docs/people.md``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Mind:
         guess: the guessed type, used if they do not ``[...]``.
         found: whether they have found the lit terminal ``[...]``, at ``stage`` ``[...]``.
         step: number of the next step ``[...]``.
-        mind_noise: uniform numbers ``[..., 1 + T]``: for the guess, and for the search at each step.
+        mind_noise: uniform numbers ``[..., 1 + T]``: for the guess, and the search at each step.
     """
 
     informed: Tensor

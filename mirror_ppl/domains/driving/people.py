@@ -17,7 +17,7 @@ There are two kinds. `TaskDrivers` value actions exactly, by the task's own rewa
 for the participants of the study. `PlanningDrivers` are the supplement's simulated agents: they
 plan by the cross-entropy method on a reward learned from recordings.
 
-Choices that the supplement leaves open, with their reasons, are in ``docs/people.md``.
+Choices that the supplement does not specify, and their reasons, are in ``docs/people.md``.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ chooses anew, as at the entrance. The next subgoal is chosen among those that ar
 
 ``p(a_t | g_t, k_t) = (1 - lapse) * uniform over steps on a shortest way to g_t + lapse / 4``
 
-Choices that the supplement leaves open, with their reasons, are in ``docs/people.md``.
+Choices that the supplement does not specify, and their reasons, are in ``docs/people.md``.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def sight_probability(data: az.InferenceData, person: str) -> np.ndarray:
         person: id of the person.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     return _seen(draws(of_person(data, "posterior", person)[SITE])).mean(0)
 
