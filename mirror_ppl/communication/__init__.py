@@ -1,8 +1,8 @@
-"""What to tell a person, when, through which channel, and why.
+"""Plans what to communicate to a person, when, through which channel, and explains why.
 
 Three layers: the person (`person`, posterior draws of a human model tracked through a round), value
-(`objectives`, what candidate messages are worth) and search (`search`, which candidates there are).
-`Communicator` puts them together.
+(`objectives`, utilities of candidate messages) and search (`search`, which candidates to value).
+`Communicator` combines them.
 """
 
 from mirror_ppl.communication.communicator import Communicator, Decision, Gain

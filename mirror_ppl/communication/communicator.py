@@ -1,7 +1,7 @@
-"""The communicator: what to tell this person now, and why.
+"""The communicator: plans the message for a person at each step, and explains it.
 
-It is a function of the round so far and keeps nothing between calls, so any simulator or robot can
-drive it step by step::
+It is a function of the round so far without state between calls, so any simulator or robot can call
+it step by step::
 
     communicator = Communicator(person, ExpectedUtility(SelfModelWorld(human.self_model)))
     decision = communicator.plan(round_so_far)
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 INTERVAL = 1.645
-"""Standard errors on either side of a mean that hold it with a probability of 90%."""
+"""Half-width of a 90% interval in standard errors."""
 LITTLE = 0.05
-"""Changes of a probability below this explain nothing."""
+"""Changes of a probability below this are not reported as explanations."""
 ADVICE_DISCOUNT = 0.95
-"""Of what advice brings, per step."""
+"""Discount per step in advice."""
 TIE = 1e-6
 """Gains up to this, in units of reward, count as none."""
 
 
 @dataclass(frozen=True)
 class Gain:
-    """By how much a message is better than silence, in units of reward, its cost taken off.
+    """Gain of a message over silence, in units of reward, net of its cost.
 
     Attributes:
         mean: over posterior draws.
@@ -72,15 +72,15 @@ class Decision:
     """A message, and why it was chosen.
 
     Attributes:
-        message: what to communicate now.
-        flags: the same as flags ``[N]``.
-        gain: of the plan over saying nothing at all; also where the plan begins with silence.
+        message: the message for now.
+        flags: the message as flags ``[N]``.
+        gain: gain of the plan over permanent silence; also where the plan begins with silence.
         domain: the world of the round.
-        observation: what there was to observe, ``[E]`` and ``[K, F]``.
-        found: the candidates that were compared; ``None`` where there was nothing to choose.
-        chosen: which of them this is.
-        world: the world as the robot knows it, by which it advises.
-        over: whether the round is.
+        observation: the full observation, ``[E]`` and ``[K, F]``.
+        found: the candidates that were compared; ``None`` if there was no choice.
+        chosen: index of the plan among them.
+        world: the world as the robot knows it, for advice.
+        over: whether the round is over.
     """
 
     message: Message
@@ -98,12 +98,12 @@ class Decision:
 
     @property
     def told(self) -> Visibility:
-        """The message as masks ``[K]`` by modality."""
+        """Message as masks ``[K]`` by modality."""
         return Channels(self.domain).split(self.flags)
 
     @property
     def plan(self) -> tuple[Message, ...]:
-        """The message for now, and what would be said in the steps after it as things stand."""
+        """Message for now, and the planned messages of the steps after it."""
         channels = Channels(self.domain)
         if self.found is None:
             return (self.message,)
@@ -116,12 +116,12 @@ class Decision:
 
     @cached_property
     def alternatives(self) -> pd.DataFrame:
-        """Every candidate with its gain over silence, the best first.
+        """All candidates with their gain over silence, the best first.
 
-        Columns: ``message`` (for now), ``later`` (what would be said in the steps after), ``cost``
-        (of both), ``gain`` (with that taken off), its ``standard_error``, ``low``, ``high`` (90%
-        interval), ``probability`` (share of draws in which it is better than silence), ``chosen``,
-        and ``p(action)``, the predicted probability of each action now.
+        Columns: ``message`` (for now), ``later`` (messages of the steps after), ``cost`` (of both),
+        ``gain`` (net of cost), its ``standard_error``, ``low``, ``high`` (90% interval),
+        ``probability`` (share of draws in which it is better than silence), ``chosen``, and
+        ``p(action)``, the predicted probability of each action now.
         """
         import pandas as pd
 
@@ -159,9 +159,9 @@ class Decision:
 
     @cached_property
     def matters(self) -> dict[tuple[str, str], float]:
-        """What each communicated item adds: the gain that is lost when it alone is left out now.
+        """Contribution of each communicated item: the gain lost if only this item is left out now.
 
-        An item without which the plan was not among the candidates is not there.
+        Items without which the plan was not among the candidates are missing.
         """
         if self.found is None:
             return {}
@@ -179,48 +179,48 @@ class Decision:
 
     @property
     def turning_point(self) -> tuple[int, int, float, float] | None:
-        """Where the message changes most: step ahead, action, probability without and with it."""
+        """First large effect of the message: step, action, probability without and with it."""
         if self.found is None or self.chosen == 0 or self.found.valued.actions is None:
             return None
         silent, told = self.found.valued.actions[0], self.found.valued.actions[self.chosen]
         silent, told = (each / each.sum(-1, keepdim=True) for each in (silent, told))
-        # Of the actions that the message makes less probable: the first that it changes much.
+        # Among actions that the message makes less probable, the first with a large change.
         less = silent - told
         place = int((less >= less.max() / 2).flatten().long().argmax())
         step, action = divmod(place, silent.shape[-1])
         return step, action, float(silent[step, action]), float(told[step, action])
 
     def why(self) -> str:
-        """The decision in a sentence that a person understands."""
+        """Explain the decision in one sentence of plain English."""
         if not self.message:
             return f"silence: {self._why_not()}"
         ranked = sorted(self.message, key=lambda pair: -self.matters.get(pair, 0.0))
         text = self._about(ranked)
         turn = self.turning_point
         if turn is None:
-            return f"{text}: brings what they believe closer to what is so"
+            return f"{text}: brings their belief closer to the truth"
         step, action, without, told = turn
         worth = f"(gain {self.gain.mean:+.2f})"
         if without - told < LITTLE:
-            return f"{text}: changes a little of what they do in the steps ahead {worth}"
-        # In which lane they will be later is not known.
+            return f"{text}: slightly changes what they do in the steps ahead {worth}"
+        # Their lane at later steps is not known.
         deed = self.domain.deed(self.observation, None if step else ranked[0][1], action)
         when = "" if step == 0 else f" in {step} step{'s' * (step > 1)}"
-        chances = f"with probability {without:.2f}; told, {told:.2f}"
+        chances = f"with probability {without:.2f}; with the message, {told:.2f}"
         return f"{text}: they would {deed}{when} {chances} {worth}"
 
     @property
     def advice(self) -> str:
-        """What the robot would have them do now, and what that hangs on.
+        """Action that the robot recommends now, and the items it depends on.
 
-        By all that there is to observe, and by what the robot learned of the world, as in which
-        rules hold. The supplement's robot advises a button in bomb defusal.
+        It uses the full observation and what the robot learned about the world, such as the rules.
+        The supplement's robot advises a button in bomb defusal.
         """
         if self.over:
             return "the round is over"
         world, now = self.world, self.observation
         if not offers(world, "reference_values"):
-            return f"none: what is best is not known exactly in {world.name}"
+            return f"none: the best action is not known exactly in {world.name}"
         values = world.reference_values(world.state_behind(now), ADVICE_DISCOUNT)
         notion = next(iter(world.relevance(now).values()))
         flags = Channels(world).join(notion)
@@ -234,7 +234,7 @@ class Decision:
         if self.over:
             return "the round is over"
         if self.found is None:
-            return "there is nothing new that can be told now"
+            return "there is nothing new to communicate now"
         for step, message in enumerate(self.plan):
             if message:
                 return f"{self._about(message)}: can wait {step} step{'s' * (step > 1)}"
@@ -242,8 +242,8 @@ class Decision:
             self.found.valued, int(self.found.valued.utility.mean(-1).argmax())
         )
         if gain.mean > TIE:
-            return f"what could be told is not surely worth its cost (the best gains {gain})"
-        return "nothing that could be told is worth its cost"
+            return f"no message is reliably worth its cost (the best gains {gain})"
+        return "no message is worth its cost"
 
     def _about(self, items: Iterable[tuple[str, str]]) -> str:
         about = [self.domain.describe(self.observation, *pair) for pair in items]
@@ -256,14 +256,14 @@ class Communicator:
 
     Attributes:
         person: posterior draws of the human model.
-        objective: what messages are for.
+        objective: what messages maximize.
         search: how candidates are found.
-        min_standard_errors: how many standard errors of its gain a message has to gain; 0 takes
-            whatever is best on average.
+        min_standard_errors: number of standard errors by which a gain has to exceed 0; 0 chooses
+            the largest mean gain.
         seed: of everything random; the same seed and round give the same decision.
 
     Raises:
-        InputError: one of them is something else, or the objective is of another domain.
+        InputError: an argument is of another kind, or the objective is of another domain.
     """
 
     person: Person
@@ -276,7 +276,7 @@ class Communicator:
         require_kind(self.person, Person, "person")
         require_methods(self.objective, ["at"], "objective", "an objective")
         require_methods(self.search, ["__call__"], "search", "a search")
-        # What is rolled forward, where an objective says so and that says of which domain it is.
+        # The world of the objective, if it has one with a domain.
         world = getattr(getattr(self.objective, "world", None), "domain", None)
         own = self.person.human.domain.name
         if world is not None and world.name != own:
@@ -290,14 +290,14 @@ class Communicator:
 
     @torch.no_grad()
     def plan(self, past: RoundSoFar) -> Decision:
-        """What to communicate now.
+        """Plan the message for now.
 
         Silence is chosen where no message gains enough, and when the round is over: after its last
-        step, or after all is done.
+        step, or after the task is done.
 
         Raises:
-            InputError: the round cannot be, at any of its steps; it has more steps than rounds of
-                the domain have, or goes on after all was done.
+            InputError: the round is impossible at one of its steps, has more steps than rounds of
+                the domain, or goes on after the task was done.
         """
         domain = self.person.human.domain
         if isinstance(past, Demonstrations):
@@ -329,16 +329,16 @@ class Communicator:
         return Decision(message, flags, gain, domain, now, found, chosen, self._world)
 
     def after(self, past: RoundSoFar) -> Communicator:
-        """The communicator for the next round of the same person.
+        """Return the communicator for the next round of the same person.
 
-        It has learned which channels reach them (:mod:`mirror_ppl.communication.hearing`): whoever
-        does not react to messages is soon left in peace.
+        It has learned which channels reach them (:mod:`mirror_ppl.communication.hearing`), so a
+        person who does not react to messages soon gets none.
 
         Args:
-            past: the round in which they were assisted, with its last action and observation.
+            past: the assisted round, with its last action and observation.
 
         Raises:
-            InputError: as of :meth:`plan`.
+            InputError: as for :meth:`plan`.
         """
         past = require_kind(past, RoundSoFar, "the round").to(self.person.device)
         past.check(self.person.human.domain)
@@ -348,7 +348,7 @@ class Communicator:
         )
 
     def _silence(self, now: Observation, allowed: Tensor, over: bool = False) -> Decision:
-        """Where there is nothing to choose."""
+        """Return the decision for silence where there is no choice."""
         none = torch.zeros_like(allowed)
         domain = self.person.human.domain
         message = Channels(domain).message(none)
@@ -357,14 +357,14 @@ class Communicator:
 
     @cached_property
     def _world(self) -> Domain:
-        """The world as the robot knows it after what it learned."""
+        """World as the robot knows it after learning."""
         return planning_domain(self.person.human, self.person.draws)
 
 
 def choose(valued: Valued, standard_errors: float) -> int:
-    """The candidate whose gain over silence is largest less so many ``standard_errors`` of it.
+    """Return the candidate with the largest lower bound, gain - ``standard_errors`` * SE.
 
-    Silence, candidate 0, where none gains anything; of equally good ones the first.
+    Returns silence, candidate 0, if no lower bound is positive; the first one among ties.
     """
     least = _least(valued.utility - valued.utility[:1], standard_errors)
     best = int(least.argmax())
@@ -372,14 +372,14 @@ def choose(valued: Valued, standard_errors: float) -> int:
 
 
 def slimmed(value: Value, found: Found, chosen: int, standard_errors: float) -> tuple[Found, int]:
-    """A plan in which every item that is communicated now is itself surely worth it.
+    """Drop items of a plan's present message whose own gain has no positive lower bound.
 
-    A plan can gain much by what it says later, and a message by one of its items. So the plan is
-    compared with itself less each item that it communicates now, and the item of which least is
-    left after so many ``standard_errors`` is dropped if that is nothing, until none is.
+    A plan can owe its gain to later messages, and a message to one of its items. So the plan is
+    compared with itself without each item that it communicates now. The item with the lowest lower
+    bound, gain - ``standard_errors`` * SE, is dropped if that is not positive, until all are.
 
     Returns:
-        The candidates with those that were valued besides, and which of them is chosen.
+        All candidates, with those added here, and the index of the chosen one.
     """
     while True:
         plan = found.candidates[chosen]
@@ -397,7 +397,7 @@ def slimmed(value: Value, found: Found, chosen: int, standard_errors: float) -> 
 
 
 def _least(gain: Tensor, standard_errors: float) -> Tensor:
-    """What is left of gains ``[C, S]`` after so many standard errors, ``[C]``."""
+    """Return lower bounds ``[C]`` of mean gains ``[C, S]``: mean - ``standard_errors`` * SE."""
     mean = gain.mean(-1)
     if gain.shape[-1] == 1:
         return mean
@@ -405,7 +405,7 @@ def _least(gain: Tensor, standard_errors: float) -> Tensor:
 
 
 def gain_over_silence(valued: Valued, index: int) -> Gain:
-    """The gain of a candidate."""
+    """Return the gain of a candidate over silence."""
     gain = valued.utility[index] - valued.utility[0]
     spread = float(gain.std()) if len(gain) > 1 else 0.0
     return Gain(float(gain.mean()), spread / len(gain) ** 0.5, float((gain > TIE).float().mean()))

@@ -1,4 +1,4 @@
-"""A communicator for a person in a foreign loop: that of a simulator, or of a robot."""
+"""A communicator to call from the loop of a simulator or robot."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Companion:
         while ...:
             decision = companion.decide()       # send decision.message
             companion.observe(observation, action)
-        companion.begin(observation)            # the next round; what was learned of them stays
+        companion.begin(observation)            # the next round; learned channels are kept
 
     Observations are dicts of numpy arrays, tensors or lists: ``ego`` ``[E]``, each modality
-    ``[K, F]``, everything that the robot knows of the world.
+    ``[K, F]``, the full observation of the robot.
 
     Args:
         communicator: for the first round.
@@ -39,10 +39,10 @@ class Companion:
         self._decision: Decision | None = None
 
     def begin(self, observation: Mapping[str, Any]) -> None:
-        """A round begins. From the one before is learned which channels reach the person.
+        """Begin a round; the round before updates which channels reach the person.
 
         Raises:
-            InputError: such an observation cannot be; nothing has changed then.
+            InputError: the observation is impossible; nothing has changed then.
         """
         past = RoundSoFar.begin(self.communicator.person.human.domain, observation)
         if self.past is not None and self.past.time:
@@ -50,7 +50,7 @@ class Companion:
         self.past, self._decision = past, None
 
     def decide(self) -> Decision:
-        """What to tell them now; the same until the next `observe`.
+        """Return the decision for now, which is fixed until the next `observe`.
 
         Raises:
             InputError: no round has begun.
@@ -65,16 +65,16 @@ class Companion:
         action: int,
         message: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
-        """The person has acted.
+        """Record the person's action and the observation after it.
 
         Args:
-            observation: what there is to observe after it.
-            action: index of what they did.
-            message: names of the items that were communicated before it, by modality; what was
-                decided unless given, and nothing if nothing was.
+            observation: the observation after the action.
+            action: index of the action.
+            message: names of the items that were communicated before it, by modality; unless given,
+                those of the decision, or none if there was no decision.
 
         Raises:
-            InputError: no round has begun or it is over, or one of these cannot be; nothing has
+            InputError: no round has begun or it is over, or an argument is impossible; nothing has
                 changed then.
             UnknownNameError: there is no such modality or item.
         """

@@ -1,13 +1,13 @@
-"""Which channels reach somebody: found out while they are assisted, where recordings leave it open.
+"""Infers during assistance which channels reach a person, if recordings do not identify it.
 
-Of people who were recorded without messages nothing is known of that but a prior, which their
-posterior does not depend on. So each draw gets, beside what it has, whether messages of each
-modality reach the person (:class:`mirror_ppl.models.family.HardOfHearing`), from::
+Recordings without messages do not identify which channels reach a person, so the posterior equals
+the prior. Each posterior draw therefore also gets, for each modality, whether messages reach the
+person (:class:`mirror_ppl.models.family.HardOfHearing`), drawn from::
 
     p(hears | psi, rounds so far)  ~  p(hears) prod_t p(a_t | psi, hears, a_{1:t-1}, told_{1:t})
 
-over the rounds in which they were assisted (:meth:`HearingPerson.after`) and the present one so
-far. What these rounds say of the other implants is left to the next fit.
+over the assisted rounds (:meth:`HearingPerson.after`) and the present round so far. The other
+implants are updated only by the next fit.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from mirror_ppl.models.human import HumanModel
 
 
 class HearingPerson(Person):
-    """A person of whom it is open which channels reach them.
+    """A person with an inferred subset of channels that reach them.
 
     Args:
         human: the model of people.
-        draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or what becomes one.
-        hears: probability that messages of a modality reach them, before anything was told; of a
-            model that infers it, one draw among all that are given.
+        draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or convertible to tensors.
+        hears: prior probability that messages of a modality reach them; in a model that infers it,
+            it counts as one additional draw.
 
     Raises:
-        HumanModelError, InputError: as of `Person`.
+        HumanModelError, InputError: as for `Person`.
     """
 
     def __init__(self, human: HumanModel, draws: Mapping[str, Tensor], hears: float) -> None:
@@ -49,7 +49,7 @@ class HearingPerson(Person):
             if given is not None:
                 chance = (float(given.sum()) + hears) / (own.number + 1)
             chances.append(torch.where(pattern == 1, chance, 1 - chance))
-        # [S, H], of each draw and pattern; from the second round on they differ by draw.
+        # [S, H], by draw and pattern; from the second round on they differ between draws.
         self.log_hears = torch.stack(chances).log().sum(0).expand(own.number, -1)
         generator = torch.Generator().manual_seed(0)
         self.ladder = (torch.randperm(own.number, generator=generator) + 0.5) / own.number
@@ -57,14 +57,14 @@ class HearingPerson(Person):
         super().__init__(_open(human), own.draws | self._drawn(self.log_hears))
 
     def in_round(self, past: RoundSoFar) -> Person:
-        """The person in a round under way, with what reaches them as their actions tell it."""
+        """Return the person in this round, with channels drawn given their actions so far."""
         found = copy(self)
         found._take(self._drawn(self._after(past)))
         return super(HearingPerson, found).in_round(past)
 
     @torch.no_grad()
     def after(self, past: RoundSoFar) -> HearingPerson:
-        """The same person after a round in which they were assisted."""
+        """Return the person after an assisted round, with updated channel probabilities."""
         found = copy(self)
         found.log_hears = self._after(past)
         found._take(self._drawn(found.log_hears))
@@ -72,7 +72,7 @@ class HearingPerson(Person):
 
     @property
     def hears(self) -> dict[str, float]:
-        """Probability that messages of each modality reach them, over all draws."""
+        """Probability that messages of each modality reach them, averaged over draws."""
         chances = self.log_hears.softmax(-1).mean(0)
         return {
             name.removeprefix(HEARS): float(chances @ pattern.to(chances))
@@ -80,14 +80,14 @@ class HearingPerson(Person):
         }
 
     def _after(self, past: RoundSoFar) -> Tensor:
-        """Log-probability ``[S, H]`` of each pattern, up to a constant, after what was done."""
+        """Return log-probabilities ``[S, H]`` of patterns, up to a constant, given a round."""
         said = any(bool(mask[: past.time].any()) for mask in past.told.values())
         if not said or not past.time:
             return self.log_hears
         return (self.log_hears + self._log_likelihoods(past)).log_softmax(-1)
 
     def _log_likelihoods(self, past: RoundSoFar) -> Tensor:
-        """Of what was done so far in a round under each pattern, ``[S, H]``."""
+        """Return log-likelihoods of actions so far in a round under each pattern, ``[S, H]``."""
         if not self.human.has_round_latents:
             return self._log_chances(self.patterns, past)
         attention, log_chances = self._attending(past)
@@ -98,7 +98,7 @@ class HearingPerson(Person):
         return (found + log_chances[:, None]).logsumexp(-1)
 
     def _drawn(self, log_chances: Tensor) -> dict[str, Tensor]:
-        """A pattern for each draw, as often of each as it is probable, ``[S, 1, 1]`` by site."""
+        """Draw a pattern for each draw by stratified sampling, ``[S, 1, 1]`` by site."""
         steps = log_chances.softmax(-1).cumsum(-1)
         chosen = (self.ladder[:, None] > steps).sum(-1).clamp(max=steps.shape[-1] - 1)
         return {name: pattern[chosen][:, None, None] for name, pattern in self.patterns.items()}
@@ -114,7 +114,7 @@ class HearingPerson(Person):
 
 
 def hearing(person: Person, hears: float) -> Person:
-    """Somebody of whom it is open which channels reach them; as they are if all do for certain.
+    """Return a :class:`HearingPerson`, or the person if no channel has to be inferred.
 
     Args:
         person: the person.
@@ -127,7 +127,7 @@ def hearing(person: Person, hears: float) -> Person:
 
 
 def _open(human: HumanModel) -> HumanModel:
-    """The same model, but for the sites of what reaches people, which it has besides."""
+    """Return the model with the sites of :class:`HardOfHearing` added."""
     if isinstance(human, HardOfHearing):
         return human
     own, kind = copy(human), type(human)

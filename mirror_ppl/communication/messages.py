@@ -1,8 +1,8 @@
-"""Messages: which items are shown and said in one step, and what that costs.
+"""Messages: the items communicated in one step, and their cost.
 
 A message is a set of items of the domain's modalities. Planners handle many at once as *flags*:
-boolean ``[..., N]``, one for each item of each modality in the order of the domain. What the
-letters mean stands in `mirror_ppl.domains.base`; beside them N is the number of all items.
+boolean ``[..., N]``, one for each item of each modality in the order of the domain. Shape letters
+are those of `mirror_ppl.domains.base`; in addition, N is the number of all items.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from mirror_ppl.domains.base import Domain, Visibility, require_known
 
 @dataclass(frozen=True)
 class Message:
-    """What is communicated in one step.
+    """The items communicated in one step.
 
     Attributes:
-        items: names of the communicated items by modality; every modality is there.
+        items: names of the communicated items by modality; every modality is a key.
     """
 
     items: Mapping[str, tuple[str, ...]]
 
     def __iter__(self) -> Iterator[tuple[str, str]]:
-        """Pairs of modality and item."""
+        """Iterate over pairs of modality and item."""
         return ((name, item) for name, items in self.items.items() for item in items)
 
     def __len__(self) -> int:
         return sum(map(len, self.items.values()))
 
     def __bool__(self) -> bool:
-        """Whether anything is communicated."""
+        """True if anything is communicated."""
         return len(self) > 0
 
     def __str__(self) -> str:
@@ -48,7 +48,7 @@ class Message:
 
 
 class Channels:
-    """The layout of flags, written once: which flag is which item of which modality.
+    """The layout of flags: which flag is which item of which modality.
 
     Args:
         domain: whose modalities they are.
@@ -60,32 +60,32 @@ class Channels:
         self.pairs = [(m.name, item) for m in domain.modalities for item in m.items]
 
     def __len__(self) -> int:
-        """Number of all items N."""
+        """Return the number of all items N."""
         return len(self.pairs)
 
     def split(self, flags: Tensor) -> Visibility:
-        """Masks ``[..., K]`` by modality of flags ``[..., N]``."""
+        """Split flags ``[..., N]`` into masks ``[..., K]`` by modality."""
         parts = flags.split(self.sizes, -1)
         return {m.name: part for m, part in zip(self.modalities, parts, strict=True)}
 
     def join(self, masks: Visibility) -> Tensor:
-        """Flags ``[..., N]`` of masks ``[..., K]`` by modality."""
+        """Join masks ``[..., K]`` by modality into flags ``[..., N]``."""
         return torch.cat([masks[modality.name] for modality in self.modalities], -1)
 
     def marginal(self, number: int) -> Tensor:
-        """What each item ``[N]`` costs as the so-manieth of its modality in one step."""
+        """Return each item's marginal cost ``[N]`` as the n-th of its modality in a step."""
         count = torch.tensor([number, number - 1])
         added = [m.cost(count)[0] - m.cost(count)[1] for m in self.modalities]
         return torch.stack(added).repeat_interleave(torch.tensor(self.sizes))
 
     def cost(self, flags: Tensor) -> Tensor:
-        """Cost ``[...]`` in units of reward of messages ``[..., N]`` (supplement, Table I)."""
+        """Return costs ``[...]`` in units of reward of flags ``[..., N]`` (supplement, Table I)."""
         masks = self.split(flags)
         costs = [modality.cost(masks[modality.name].sum(-1)) for modality in self.modalities]
         return torch.stack(costs).sum(0)
 
     def message(self, flags: Tensor) -> Message:
-        """The message of flags ``[N]``."""
+        """Return the message of flags ``[N]``."""
         chosen = [pair for pair, flag in zip(self.pairs, flags.tolist(), strict=True) if flag]
         return Message(
             {
@@ -95,7 +95,7 @@ class Channels:
         )
 
     def flags(self, items: Mapping[str, tuple[str, ...] | list[str]]) -> Tensor:
-        """Flags ``[N]`` of named items by modality, as in :attr:`Message.items`.
+        """Return flags ``[N]`` of named items by modality, as in :attr:`Message.items`.
 
         Raises:
             UnknownNameError: there is no such modality or item.
@@ -110,14 +110,14 @@ class Channels:
 
 
 def count_messages(allowed: Tensor, most: int | None = None) -> int:
-    """How many messages :func:`every_message` makes."""
+    """Return the number of messages that :func:`every_message` returns."""
     number = int(allowed.sum())
     most = number if most is None else min(number, most)
     return sum(math.comb(number, size) for size in range(1 + most))
 
 
 def every_message(allowed: Tensor, most: int | None = None) -> Tensor:
-    """All messages ``[C, N]`` of so many of the allowed items ``[N]`` at most, silence first."""
+    """Return all messages ``[C, N]`` of at most ``most`` allowed items ``[N]``, silence first."""
     places = allowed.nonzero().squeeze(-1)
     if most is not None and most < len(places):
         sizes = range(1 + most)

@@ -1,8 +1,8 @@
-"""What messages are worth: objectives that map candidates to utilities, one for each draw.
+"""Objectives: map candidate messages to utilities, one for each posterior draw.
 
 A candidate is a sequence of messages ``[L, N]``: the first is for now, the others for the steps
-that follow, and after L steps nothing is said. C candidates are valued at once, under the same
-random numbers.
+that follow, with silence after L steps. C candidates are valued at once, with common random
+numbers.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, mixed, unifo
 
 @dataclass(frozen=True)
 class Valued:
-    """What candidates are worth.
+    """Values of candidates.
 
     Attributes:
         utility: of each candidate under each posterior draw, in units of reward, ``[C, S]``.
         actions: predicted probabilities of actions at each step ahead, ``[C, H, A]``; ``None``
-            where the objective does not look at actions.
+            where the objective does not predict actions.
     """
 
     utility: Tensor
@@ -46,18 +46,18 @@ Value = Callable[[Tensor], Valued]
 
 
 class Objective(Protocol):
-    """What a communicator wants.
+    """An objective of a communicator.
 
-    One that values the message of the present step alone has an attribute ``one_step`` that is
-    true, so that no plans of several steps are compared.
+    An objective that values the message of the present step alone has a true attribute
+    ``one_step``, so that no plans of several steps are compared.
     """
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
-        """What candidates are worth at this point of a round.
+        """Return the function that values candidates at this point of a round.
 
         Args:
             context: the person at this point.
-            steps_left: how many actions are left, at least 1.
+            steps_left: number of actions left, at least 1.
             seed: of the random numbers that all candidates share.
         """
         ...
@@ -67,23 +67,22 @@ class Objective(Protocol):
 class ExpectedUtility:
     """``U(c) = E[ sum_{h<H} discount^h ( r_{t+h} - cost(c_{t+h}) ) ]``.
 
-    The expectation is over posterior draws, draws of the world, and the person's actions. Of the
-    latter it is a tree in which courses less probable than ``enumerate_above`` are kept by chance,
-    with a weight that makes up for it: at 0 the expectation over actions is exact, at 1 each draw
-    follows a single course of actions. In between, what is probable is exact and the improbable
-    cheap, and the expectation is right at every value.
+    The expectation is over posterior draws, draws of the world, and the person's actions. Action
+    sequences form a tree; those more probable than ``enumerate_above`` are enumerated, the others
+    are sampled and reweighted. At 0 the expectation over actions is exact, at 1 each draw follows a
+    single action sequence; the estimate is unbiased at every value.
 
-    Where what could be gained after the horizon counts, it is added up as what could be gained now
-    and the advantages on the way, ``r_t + discount * V(s_{t+1}) - V(s_t)``. The sum is the same,
-    but only small numbers depend on which courses are kept by chance.
+    A terminal value is computed as the value now plus the advantages of later actions,
+    ``r_t + discount * V(s_{t+1}) - V(s_t)``. The sum is the same, with less variance from sampled
+    sequences.
 
     Attributes:
-        world: what is rolled forward.
-        horizon: steps H that are looked ahead.
+        world: the world in which actions are rolled out.
+        horizon: number of steps H planned ahead.
         discount: per step.
-        enumerate_above: probability of a course of actions below which it is kept by chance.
-        terminal_value: whether what could be gained at best after the last of these steps counts
-            too, where the round goes on.
+        enumerate_above: probability of an action sequence above which it is enumerated.
+        terminal_value: whether to add the optimal value after the last of these steps, where the
+            round goes on.
     """
 
     world: World
@@ -101,7 +100,7 @@ class ExpectedUtility:
             raise ValueError(f"enumerate_above must be from 0 to 1, not {self.enumerate_above}")
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
-        """See :class:`Objective`."""
+        """Return the function that values candidates; see :class:`Objective`."""
         person, past = context.person, context.past
         horizon = min(self.horizon, steps_left)
         device = past.actions.device
@@ -135,7 +134,7 @@ class ExpectedUtility:
                 if step < horizon - 1 or (self.terminal_value and ends):
                     tree.branch(chances, rollouts, step, self.enumerate_above, seed)
             if self.terminal_value and ends:
-                # What could be gained is lost where the round ends.
+                # There is no terminal value where the round ends.
                 left = rollouts.values(horizon)[tree.draw_of_world(), tree.path]
                 utility -= tree.of_each((self.discount**horizon) * tree.weight * left)
             steps = min(candidates.shape[1], horizon)
@@ -146,17 +145,17 @@ class ExpectedUtility:
 
 
 class _Tree:
-    """Courses of actions of each candidate and draw, sorted by draw; E courses in all.
+    """Action sequences of each candidate and draw, sorted by draw; E sequences in all.
 
     Candidates that have led a draw to the same beliefs on the same paths, and go on with the same
-    messages, have the same courses from there on: they are a *group*, and count once.
+    messages, have the same sequences from there on: they form a *group* and are computed once.
 
     Attributes:
-        draw, path, weight, group: of each course ``[E]``.
-        belief: what the person believes and knows on it ``[E]``, an index into ``state``.
-        state: after the last step that was looked at.
-        candidate: one of each group, ``[G]``.
-        group_of: of each candidate and draw, ``[C, S]``.
+        draw, path, weight, group: of each sequence ``[E]``.
+        belief: index into ``state`` of the belief and knowledge after each ``[E]``.
+        state: beliefs and knowledge after the last step.
+        candidate: one candidate of each group, ``[G]``.
+        group_of: group of each candidate and draw, ``[C, S]``.
     """
 
     def __init__(self, context: PlanningContext, candidates: Tensor, worlds: int) -> None:
@@ -176,16 +175,16 @@ class _Tree:
         self.last = torch.full_like(self.draw, context.last_action)
 
     def draw_of_world(self) -> Tensor:
-        """Which draw of the world each course is in, ``[E]``."""
+        """Return the draw of the world of each sequence, ``[E]``."""
         return self.draw % self.worlds
 
     def of_each(self, values: Tensor) -> Tensor:
-        """Sums of values ``[E, ...]`` of courses, of each candidate and draw ``[C, S, ...]``."""
+        """Sum values ``[E, ...]`` of sequences by candidate and draw, ``[C, S, ...]``."""
         total = values.new_zeros(len(self.candidate), *values.shape[1:])
         return total.index_add_(0, self.group, values)[self.group_of]
 
     def act(self, observation: Observation, step: int, channels: Channels) -> Tensor:
-        """Look at the world and choose: weights ``[E, A]`` of each course and its next action."""
+        """Perceive and act: return weights ``[E, A]`` of each sequence and its next action."""
         paths = len(observation["ego"]) // self.worlds
         row = self.draw_of_world() * paths + self.path
         percept = self.person.percept[self.draw]
@@ -201,7 +200,7 @@ class _Tree:
         if told is None or message is None:
             flags = torch.zeros(len(first), len(channels), dtype=torch.bool, device=key.device)
         else:
-            # What is no longer there to be told cannot be told later, whatever the plan says.
+            # Items that are no longer communicable are dropped from the plan.
             communicable = channels.join(self.person.human.domain.communicable(observation))
             flags = told[message[first]] & communicable[row[first]]
         transition = self.person.transition(
@@ -214,7 +213,7 @@ class _Tree:
             self._merge(self.candidates[:, step + 1 :])
         beliefs = self.state.mean
         values = self.person.human.action_values(beliefs)
-        # Courses of a draw share its policy implants: one row a draw, padded to the longest.
+        # Sequences of a draw share its policy implants: one row a draw, padded to the longest.
         counts = torch.bincount(self.draw, minlength=self.person.number)
         begin = counts.cumsum(0) - counts
         place = torch.arange(len(self.draw), device=key.device) - begin[self.draw]
@@ -224,7 +223,7 @@ class _Tree:
         return self.weight[:, None] * log_chances.exp()
 
     def _merge(self, rest: Tensor) -> None:
-        """Join groups that have the same courses and the same ``rest`` ``[C, l, N]``."""
+        """Merge groups that have the same sequences and the same ``rest`` ``[C, l, N]``."""
         own = mixed(self.path, self.belief, as_whole_numbers(self.weight), self.draw)
         courses = own.new_zeros(len(self.candidate)).index_add_(0, self.group, own)
         _, following = distinct_rows(rest.flatten(1).long())
@@ -238,27 +237,27 @@ class _Tree:
         self.group = which[self.group]
 
     def _keep(self, course: Tensor) -> None:
-        """Only these courses go on, some of them perhaps more than once."""
+        """Keep only these sequences, possibly some more than once."""
         self.draw, self.group = self.draw[course], self.group[course]
         self.belief = self.belief[course]
 
     def branch(
         self, chances: Tensor, rollouts: RolloutTree, step: int, threshold: float, seed: int
     ) -> None:
-        """Go on to the courses of one action more.
+        """Extend the sequences by one action.
 
         Args:
-            chances: their weights ``[E, A]``.
-            rollouts: what they lead to.
-            step: how many actions the courses have.
-            threshold: see :class:`ExpectedUtility`.
-            seed: of what is left to chance, which is the same for all candidates.
+            chances: weights of the extended sequences ``[E, A]``.
+            rollouts: states that they lead to.
+            step: number of actions of the present sequences.
+            threshold: ``enumerate_above``, see :class:`ExpectedUtility`.
+            seed: of the sampling, which is the same for all candidates.
         """
         weight = chances
         if threshold > 0:
             small = chances < threshold
-            # Systematic: the improbable siblings share one number, so that exactly as many are
-            # kept as their weights ask for, give or take a fraction.
+            # Systematic sampling: improbable siblings share one number, so that the number kept
+            # differs from its expectation by less than one.
             total = torch.where(small, chances, 0.0).cumsum(-1) / threshold
             place = torch.full_like(self.draw, step)
             noise = uniform_of(seed, place, self.draw, rollouts.names(step)[self.path])
@@ -277,13 +276,13 @@ class _Tree:
 class Divergence:
     """``U(c) = - weight * KL( q(z^R_t) || q(zH_t | c) ) - cost(c_t)``: MIRROR-KL.
 
-    Brings the person's belief close to the robot's, without a look at rewards. Only the message of
-    the present step counts.
+    Brings the person's belief close to the robot's, ignoring rewards. Only the message of the
+    present step counts.
 
     Attributes:
-        weight: units of reward that a nat of divergence is worth.
-        measure: ``kl``, or ``squared``, the squared distance of the means that the authors'
-            released code has in its place.
+        weight: units of reward per nat of divergence.
+        measure: ``kl``, or ``squared``, the squared distance of means in the authors' released
+            code.
     """
 
     one_step: ClassVar[bool] = True
@@ -298,7 +297,7 @@ class Divergence:
             raise ValueError(f"weight must be positive, not {self.weight}")
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
-        """See :class:`Objective`; steps left and seed do not matter.
+        """Return the function that values candidates; steps left and seed are not used.
 
         Raises:
             HumanModelError: the beliefs of the human model have no density like the robot's.
@@ -329,7 +328,7 @@ class Divergence:
 
 @torch.no_grad()
 def beliefs_have_density(human: HumanModel) -> bool:
-    """Whether beliefs of a human model have densities to compare with the robot's."""
+    """True if beliefs of a human model have densities to compare with the robot's."""
     domain = human.domain
     device = next(human.parameters()).device
     observation = domain.observe(domain.initial(1, torch.Generator(device).manual_seed(0)))
@@ -352,7 +351,7 @@ def require_density(human: HumanModel) -> None:
     """Refuse human models whose beliefs have no density to compare with the robot's.
 
     Raises:
-        HumanModelError: this is one.
+        HumanModelError: the model's beliefs have none.
     """
     if not beliefs_have_density(human):
         raise HumanModelError(

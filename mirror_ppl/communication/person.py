@@ -1,8 +1,8 @@
-"""What the person may believe: posterior draws of a human model, tracked through a round.
+"""The person in planning: posterior draws of a human model, tracked through a round.
 
 Beliefs depend on perceptual implants alone, and draws of these repeat; so beliefs are tracked once
-for each distinct *percept*, the values of the discrete sites (:class:`BeliefState`). U stands for
-distinct percepts.
+for each distinct *percept*, the values of the discrete sites (:class:`BeliefState`). U is the
+number of distinct percepts.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from mirror_ppl.models.prior import checked_draws
 from mirror_ppl.row_hashing import distinct_rows
 
 COUNTED = 3
-"""Up to how many items of a message have to be cheaper than others that tell the same."""
+"""An item is dropped if an equivalent item costs no more, even as this number in a message."""
 ATTENTION_VALUES = 512
-"""Values that stand for all that somebody may attend to in a round, of which each draw gets one."""
+"""Number of proposed values of attention in a round, of which each draw gets one."""
 
 
 class Person:
@@ -41,17 +41,17 @@ class Person:
 
     Args:
         human: the model of people.
-        draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or what becomes one.
+        draws: values ``[S, 1, 1, ...]`` of all its sites, tensors or convertible to tensors.
 
     Attributes:
-        percepts: values ``[U]`` of the discrete sites, each combination in the draws once;
-            in a round those of attention, too.
-        percept: which of them each draw has, ``[S]``.
+        percepts: values ``[U]`` of the discrete sites, each combination in the draws once; in a
+            round including attention.
+        percept: index of each draw's combination, ``[S]``.
 
     Raises:
-        HumanModelError: there are no draws, or they are not those of the model's sites.
-        InputError: the draws are of several people, of another shape or kind, or have values that
-            the human model rules out.
+        HumanModelError: there are no draws, or their sites are not the model's.
+        InputError: the draws are of several people, of another shape or kind, or have values
+            outside the support of the sites.
     """
 
     def __init__(self, human: HumanModel, draws: Mapping[str, Tensor]) -> None:
@@ -76,7 +76,7 @@ class Person:
     def _distinct_percepts(
         self, values: Mapping[str, Tensor], number: int
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Each combination of values ``[number]`` once, and which of them each is."""
+        """Return distinct combinations of values ``[number]``, and the index of each value."""
         none = [torch.zeros(number, dtype=torch.long, device=self.device)]
         rows = torch.stack([value.long() for value in values.values()] or none, -1)
         first, which = distinct_rows(rows)
@@ -84,11 +84,11 @@ class Person:
 
     @torch.no_grad()
     def in_round(self, past: RoundSoFar) -> Person:
-        """The person in a round under way, with what they attend to as their actions tell it.
+        """Return the person in this round, with attention drawn given their actions so far.
 
-        Each draw gets one value of attention from ``p(m | psi, what was done so far)``, of all
-        there are or of some that stand for them (:mod:`mirror_ppl.likelihood.attention`). Nothing
-        changes if no attention differs from round to round.
+        Each draw gets one value of attention from ``p(m | psi, actions so far)``, among all values
+        or a weighted sample of them (:mod:`mirror_ppl.likelihood.attention`). A model without
+        round latents is returned unchanged.
         """
         if not self.human.has_round_latents:
             return self
@@ -106,12 +106,12 @@ class Person:
         return person
 
     def after(self, past: RoundSoFar) -> Person:
-        """The person after a round in which they were assisted; nothing is learned from it here."""
+        """Return the person after an assisted round; here nothing is learned from it."""
         del past
         return self
 
     def _attending(self, past: RoundSoFar) -> tuple[dict[str, Tensor], Tensor]:
-        """Values of attention ``[G]`` that stand for all in a round, and log priors ``[S, G]``."""
+        """Return proposed values of attention ``[G]`` in a round, and log priors ``[S, G]``."""
         so_far = {name: value[: past.time] for name, value in past.observation.items()}
         facts = {
             name: fact.view(1, 1) for name, fact in self.human.covariates(past.observation).items()
@@ -132,16 +132,16 @@ class Person:
 
     @cached_property
     def _attention(self) -> Proposal:
-        """Proposes values of attention that stand for all that this person may attend to."""
+        """Proposal distribution of this person's attention."""
         return Proposal(self.human, self.draws, self.draws, ATTENTION_VALUES)
 
     @cached_property
     def _attention_of_any_round(self) -> AttentionValues:
-        """These values where nothing is known of the round; always the same."""
+        """Proposed values that do not depend on the round; computed once."""
         return self._attention.values(None, 0)
 
     def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
-        """Log-probability ``[S, G]`` of what was done so far under values of attention ``[G]``."""
+        """Return log-probabilities ``[S, G]`` of actions so far, given attention ``[G]``."""
         number = len(next(iter(attention.values())))
         total = torch.zeros(self.number, number, device=self.device)
         everybody = copy(self)
@@ -182,16 +182,16 @@ class Person:
         told: Visibility,
         row: Tensor | None = None,
     ) -> Transition:
-        """What leads percepts ``[n]`` to their next step; see :class:`Transition`."""
+        """Return the transition of percepts ``[n]`` to their next step."""
         implants = {name: value[percept] for name, value in self.percepts.items()}
         return Transition(implants, action, observation, told, row)
 
     def last_action(self, past: RoundSoFar, time: int) -> int:
-        """What was done before a step of a round; the number of actions if nothing was."""
+        """Return the action before a step of a round; the number of actions before the first."""
         return int(past.actions[time - 1]) if time else len(self.human.domain.actions)
 
     def act(self, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities ``[S, M, A]`` of actions at M beliefs of each draw.
+        """Return log-probabilities ``[S, M, A]`` of actions at M beliefs of each draw.
 
         Args:
             belief: ``[S, M, Z]``, or ``[1, M, Z]`` where draws share them.
@@ -203,7 +203,7 @@ class Person:
 
 
 def transitions(person: Person, past: RoundSoFar) -> list[Transition]:
-    """What leads every percept through a round so far, up to before its present step."""
+    """Return the transitions of every percept through a round, before its present step."""
     every = torch.arange(person.percept_count, device=person.device)
     return [
         person.transition(
@@ -218,13 +218,13 @@ def transitions(person: Person, past: RoundSoFar) -> list[Transition]:
 
 @dataclass(frozen=True)
 class PlanningContext:
-    """A person in the middle of a round, about to look at the present step.
+    """A person in the middle of a round, before they perceive the present step.
 
     Attributes:
         person: posterior draws of the human model.
         past: the round so far.
-        before: what may be believed before that look, each belief once.
-        own: which of these beliefs each percept has, ``[U]``.
+        before: distinct beliefs before the present step.
+        own: index of each percept's belief, ``[U]``.
     """
 
     person: Person
@@ -234,7 +234,7 @@ class PlanningContext:
 
     @classmethod
     def of(cls, person: Person, past: RoundSoFar) -> PlanningContext:
-        """The person at this point of a round."""
+        """Return the context of a person at this point of a round."""
         person = person.in_round(past)
         state = BeliefState.initial(person.human, person.percept_count)
         if past.time:
@@ -243,11 +243,11 @@ class PlanningContext:
 
     @property
     def last_action(self) -> int:
-        """What was done last; the number of actions at the start of a round."""
+        """Last action; the number of actions at the start of a round."""
         return self.person.last_action(self.past, self.past.time)
 
     def told(self, messages: Tensor) -> tuple[BeliefState, Tensor]:
-        """Beliefs after messages ``[M, N]`` for now, and which each percept has ``[M, U]``."""
+        """Return beliefs after messages ``[M, N]`` for now, and each percept's index ``[M, U]``."""
         percepts, number = self.person.percept_count, len(messages)
         percept = torch.arange(percepts, device=messages.device).repeat(number)
         transition = self.person.transition(
@@ -261,10 +261,10 @@ class PlanningContext:
 
     @torch.no_grad()
     def telling(self, allowed: Tensor) -> Tensor:
-        """Which of the allowed items ``[N]`` tell anything now, in at least one posterior draw.
+        """Return which allowed items ``[N]`` change a belief now in at least one posterior draw.
 
-        What everybody sees or knows already leads to the same beliefs if it is told besides, so no
-        message with it is worth its cost. Items tell something each by itself or not at all.
+        An item that is seen or known in all draws changes no belief, so no message with it is worth
+        its cost. Items are tested one by one: an item without effect alone has none with others.
         """
         places = allowed.nonzero().squeeze(-1)
         messages = allowed.new_zeros(len(places) + 1, len(allowed))
@@ -276,10 +276,12 @@ class PlanningContext:
         return result
 
     def _dearer(self, places: Tensor, index: Tensor) -> Tensor:
-        """Items ``[n]`` that tell just what others do at less cost, even as the third of those.
+        """Return items ``[n]`` for which others lead to equal beliefs at less cost.
+
+        The others have to cost less even as number `COUNTED` of their modality.
 
         Args:
-            places: of the items, ``[n]``.
+            places: flag indices of the items, ``[n]``.
             index: beliefs after each, ``[n, U]``.
         """
         channels = Channels(self.person.human.domain)

@@ -1,4 +1,4 @@
-"""The planners by name: what each is for, and what makes it."""
+"""The planners by name, with their settings and constructors."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ class PlannerOptions:
     """Settings of the planners.
 
     Attributes:
-        horizon: steps looked ahead.
+        horizon: number of steps planned ahead.
         discount: per step.
         enumerate_above: see :class:`ExpectedUtility`.
         patience: length of the plans that are compared, see :class:`Automatic`.
         items: most items of a message, see :class:`Automatic`.
         min_standard_errors: standard errors that a gain must exceed, see :class:`Communicator`.
         terminal_value: see :class:`ExpectedUtility`.
-        hears: probability that messages of a modality reach the person, before anything was told
-            (:mod:`mirror_ppl.communication.hearing`); 1 takes it for granted.
-        kl_weight: units of reward that mirror-kl gives for a nat.
+        hears: prior probability that messages of a modality reach the person
+            (:mod:`mirror_ppl.communication.hearing`); 1 assumes that they do.
+        kl_weight: units of reward per nat in mirror-kl.
         kl_measure: what mirror-kl measures, see :class:`Divergence`.
     """
 
@@ -54,7 +54,7 @@ class PlannerOptions:
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
-        """The settings for a domain, with changes; None leaves what is set for the domain."""
+        """Return the settings for a domain, with changes; None keeps the domain's setting."""
         given = {name: value for name, value in changes.items() if value is not None}
         return cls(**{**settings_of(get_domain(domain).record, "planning", cls), **given})
 
@@ -83,18 +83,18 @@ PLANNERS: Mapping[str, Callable[[Person, PlannerOptions], Objective]] = {
     "mirror-self-model": _mirror_self_model,
     "mirror-kl": _mirror_kl,
 }
-"""What makes the objective of each; a new one is a function and its name here.
+"""Constructors of objectives by name; a new objective is a function and its name here.
 
-``mirror`` looks for reward in the domain's simulator, ``mirror-self-model`` in what the robot has
-learned of the world; ``mirror-kl`` brings the person's belief near to the robot's.
+``mirror`` maximizes reward in the domain's simulator, ``mirror-self-model`` in the robot's learned
+world model; ``mirror-kl`` minimizes the divergence of the person's belief from the robot's.
 """
 
 
 def planner_of(name: str, person: Person, options: PlannerOptions, seed: int) -> Communicator:
-    """The planner of that name for one person.
+    """Make the planner of that name for one person.
 
     Raises:
-        UnknownNameError: there is none.
+        UnknownNameError: no planner has that name.
     """
     if name not in PLANNERS:
         raise UnknownNameError.of("planner", name, PLANNERS)

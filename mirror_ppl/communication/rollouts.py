@@ -1,12 +1,12 @@
-"""RolloutTree of the world under courses of actions, whoever takes them.
+"""Rollouts of the world under sequences of actions, shared by all candidate messages.
 
-What a person is told changes what they do and nothing else, so the world is rolled out once for
-all candidate messages: one future for each sequence of actions that somebody might take. A *path*
-is such a sequence; paths are worked out when they are first asked for. The *name* of a path is a
-number: that of path ``p`` followed by action ``a`` is ``p * A + a``, and of the empty path 0.
+A message affects the world only through the person's actions, so the world is rolled out once for
+all candidate messages: one future for each possible sequence of actions. A *path* is such a
+sequence; paths are computed when first requested. The *name* of a path is a number: that of path
+``p`` followed by action ``a`` is ``p * A + a``, and that of the empty path is 0.
 
-There are two worlds. `SelfModelWorld` is what the robot has learned; `SimulatorWorld` is the
-domain itself, where it is at hand. W stands for draws of the world.
+There are two worlds. `SelfModelWorld` is the robot's learned world model; `SimulatorWorld` is the
+domain itself. W stands for draws of the world.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
 
 NAMES = 2**62
-"""How many paths can have names."""
+"""Maximum number of paths, so that names fit into integers."""
 
 
 class Dynamics(Protocol):
-    """How states ``[W, n]``, any dataclass of tensors, go on."""
+    """Dynamics of states ``[W, n]``, any dataclass of tensors."""
 
     def observe(self, state: Any) -> Observation:
-        """What there is to observe, ``[W, n, ...]``."""
+        """Return the full observation, ``[W, n, ...]``."""
         ...
 
     def step(self, state: Any, action: Tensor, step: int) -> tuple[Tensor, Any]:
-        """Rewards ``[W, n]`` of actions ``[W, n]`` at a step, and the states that follow."""
+        """Return rewards ``[W, n]`` of actions ``[W, n]`` at a step, and the next states."""
         ...
 
     def value(self, state: Any) -> Tensor:
-        """What can still be gained from there, at best, ``[W, n]``."""
+        """Return the optimal value of the states, ``[W, n]``."""
         ...
 
 
 @dataclass
 class _Paths:
-    """Paths of as many actions, in the order in which they were asked for.
+    """Paths of one length, in the order in which they were requested.
 
     Attributes:
-        state: where they lead to ``[W, n]``.
+        state: the states that they lead to ``[W, n]``.
         name: of each, ``[n]``.
-        observation: there, ``[W, n, ...]``.
-        reward: of each action from there ``[W, m A]``, of the first m of them.
+        observation: in these states, ``[W, n, ...]``.
+        reward: of each action in the first m of these states, ``[W, m A]``.
         following: the states that follow ``[W, m A]``.
-        child: the path at the next step, or -1 if it was not asked for, ``[m A]``.
-        value: what can still be gained in ``state``, as far as it was asked for.
-        left: the same in ``following``.
+        child: index of the path at the next step, or -1 if not requested, ``[m A]``.
+        value: optimal values of the first requested ones of ``state``.
+        left: optimal values of the first requested ones of ``following``.
     """
 
     state: Any
@@ -70,17 +70,17 @@ class _Paths:
 
 
 class RolloutTree:
-    """What there will be to observe and to gain.
+    """Future observations and rewards along paths of actions.
 
     Args:
-        dynamics: how states go on.
-        state: now, ``[W, 1]``.
-        now: what there is to observe now, ``[W, 1, ...]``.
-        actions: how many actions there are, A.
-        horizon: how many steps may be asked for.
+        dynamics: of the states.
+        state: the present state, ``[W, 1]``.
+        now: the present observation, ``[W, 1, ...]``.
+        actions: number of actions A.
+        horizon: maximum number of steps.
 
     Raises:
-        ValueError: there are more paths than can have names.
+        ValueError: there are too many paths.
     """
 
     def __init__(
@@ -96,29 +96,29 @@ class RolloutTree:
         self._steps = [_Paths(state, root, now)]
 
     def observation(self, step: int) -> Observation:
-        """Of each path of so many actions, ``[W, n, ...]``."""
+        """Return observations after each path of ``step`` actions, ``[W, n, ...]``."""
         return self._steps[step].observation
 
     def names(self, step: int) -> Tensor:
-        """Of each path of so many actions, ``[n]``."""
+        """Return names of the paths of ``step`` actions, ``[n]``."""
         return self._steps[step].name
 
     def rewards(self, step: int) -> Tensor:
-        """Of each action after each path of so many actions, ``[W, n, A]``."""
+        """Return rewards of each action after each path of ``step`` actions, ``[W, n, A]``."""
         reward = self._opened(step).reward
         assert reward is not None
         return reward.unflatten(1, (-1, self.actions))
 
     def values(self, step: int) -> Tensor:
-        """What can still be gained after each path of so many actions, at best, ``[W, n]``."""
+        """Return the optimal value after each path of ``step`` actions, ``[W, n]``."""
         here = self._steps[step]
         here.value = self._valued(here.value, here.state)
         return here.value
 
     def advantages(self, step: int, discount: float = 1.0) -> Tensor:
-        """How much better each action is than what could be gained at best, ``[W, n, A]``.
+        """Return the advantage of each action after each path of ``step`` actions, ``[W, n, A]``.
 
-        ``r(s, a) + discount * V(s') - V(s)``, which is 0 for the best action and below for others.
+        ``r(s, a) + discount * V(s') - V(s)`` is 0 for the best action and negative for others.
         """
         here = self._opened(step)
         assert here.reward is not None
@@ -127,7 +127,7 @@ class RolloutTree:
         return after - self.values(step)[..., None]
 
     def _valued(self, known: Tensor | None, state: Any) -> Tensor:
-        """Values of all states ``[W, n]``, of which the first are known."""
+        """Return values of all states ``[W, n]``, the first of which are known."""
         if known is None:
             return self.dynamics.value(state)
         first = known.shape[1]
@@ -135,12 +135,12 @@ class RolloutTree:
         return torch.cat([known, self.dynamics.value(new)], 1)
 
     def follow(self, step: int, path: Tensor, action: Tensor) -> Tensor:
-        """Which paths of one action more these are, ``[E]``; those that are new are worked out.
+        """Return paths extended by one action, ``[E]``; new ones are computed.
 
         Args:
-            step: how many actions the paths have.
+            step: number of actions of the paths.
             path: ``[E]``.
-            action: that follows each, ``[E]``.
+            action: the next action of each, ``[E]``.
         """
         here = self._opened(step)
         assert here.child is not None
@@ -167,7 +167,7 @@ class RolloutTree:
         return here.child[branch]
 
     def _opened(self, step: int) -> _Paths:
-        """The paths of so many actions, with what each action leads to."""
+        """Return the paths of ``step`` actions, with the outcome of each action computed."""
         here = self._steps[step]
         known = 0 if here.child is None else len(here.child) // self.actions
         number = len(here.name) - known
@@ -190,17 +190,17 @@ class RolloutTree:
 
 
 def _joined(first: Any, second: Any) -> Any:
-    """States ``[W, n]`` and ``[W, m]`` as ``[W, n + m]``."""
+    """Concatenate states ``[W, n]`` and ``[W, m]`` to ``[W, n + m]``."""
     return map_state(lambda *parts: torch.cat(parts, 1), first, second)
 
 
 class World(Protocol):
-    """Something that can be rolled forward."""
+    """A world that can be rolled forward."""
 
     draws: int
 
     def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
-        """RolloutTree of H steps from a round so far, in W draws."""
+        """Return the rollouts of H steps from a round so far, in W draws."""
         ...
 
 
@@ -208,7 +208,7 @@ class SimulatorWorld:
     """The domain's own simulator, from the state behind the last observation.
 
     Args:
-        domain: the world; its transitions are deterministic, so one draw is all there is.
+        domain: the world; its transitions are deterministic, so there is one draw.
     """
 
     draws = 1
@@ -218,35 +218,35 @@ class SimulatorWorld:
         self.domain = domain
 
     def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
-        """See :class:`World`; the generator is not used."""
+        """Return the rollouts; the generator is not used, see :class:`World`."""
         now = {name: value[None, None] for name, value in past.now.items()}
         state = self.domain.state_behind(now)
         return RolloutTree(self, state, now, len(self.domain.actions), horizon)
 
     def observe(self, state: Any) -> Observation:
-        """See :class:`Dynamics`."""
+        """Return the full observation, see :class:`Dynamics`."""
         return self.domain.observe(state)
 
     def step(self, state: Any, action: Tensor, step: int) -> tuple[Tensor, Any]:
-        """See :class:`Dynamics`."""
+        """Return rewards and next states, see :class:`Dynamics`."""
         following = self.domain.transition(state, action)
         return total_reward(self.domain.rewards(state, action, following)), following
 
     def value(self, state: Any) -> Tensor:
-        """The exact value of the best action, see :class:`Dynamics`; without discount."""
+        """Return the exact value of the best action, undiscounted; see :class:`Dynamics`."""
         return self.domain.reference_values(state, 1.0).amax(-1)
 
 
 class SelfModelWorld:
-    """The robot's own latent states, rolled forward by what it has learned.
+    """The robot's learned world model: its latent states rolled forward.
 
     ``z_t`` comes from the encoder, which sees everything; then ``p(z_{t+1} | z_t, a_t)``,
     ``p(x_t | z_t)`` and ``p(r_t | z_t, a_t)``. Observations are the decoders' means, moved to the
-    nearest that can be; rewards are means too.
+    nearest possible observation; rewards are means too.
 
     Args:
         self_model: the robot's networks.
-        draws: number of draws W of states; one means that every state is the mean.
+        draws: number of draws W of states; with one, every state is the mean.
     """
 
     def __init__(self, self_model: SelfModel, draws: int = 1) -> None:
@@ -255,7 +255,7 @@ class SelfModelWorld:
         self.draws = whole_number(draws, "draws", 1)
 
     def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
-        """See :class:`World`."""
+        """Return the rollouts, see :class:`World`."""
         model = self.self_model
         device = past.actions.device
         shape = (self.draws, 1, model.latent)
@@ -281,7 +281,7 @@ class _Latent:
 
 @dataclass(frozen=True)
 class _LearnedDynamics:
-    """How a self-model's states go on; the noise ``[H, W, 1, Z]`` is the same on all paths."""
+    """Dynamics of a self-model's states; all paths share the noise ``[H, W, 1, Z]``."""
 
     self_model: SelfModel
     noise: Tensor
@@ -300,7 +300,7 @@ class _LearnedDynamics:
 
 
 def robot_belief(self_model: SelfModel, past: RoundSoFar) -> Gaussian:
-    """``q(z^R_t | ...)`` of the robot, which sees everything; parameters ``[Z]``."""
+    """Return ``q(z^R_t | ...)`` of the robot, which sees everything; parameters ``[Z]``."""
     encoder, domain = self_model.encoder, self_model.domain
     everything = {
         m.name: torch.ones_like(past.observation[m.name][..., 0], dtype=torch.bool)

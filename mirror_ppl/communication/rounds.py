@@ -1,4 +1,4 @@
-"""What a communicator knows of a round that is under way."""
+"""The round so far: observations, actions and messages up to the present step."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ EGO = "ego"
 class RoundSoFar:
     """A round up to the moment at which the person is about to act for the (t + 1)-th time.
 
-    Arrays may be tensors, numpy arrays or lists of any numeric kind, and are kept as tensors: what
-    there was to observe in torch's default dtype, actions as int64, what was told as bool (1 and 0
-    will do), all on the device of the ego's features.
+    Arrays may be tensors, numpy arrays or lists of any numeric kind, and are kept as tensors:
+    observations in torch's default dtype, actions as int64, messages as bool (1 and 0 are
+    accepted), all on the device of the ego's features.
 
     Attributes:
-        observation: everything there was to observe at each step, as the robot saw it: ego
-            ``[t + 1, E]``, each modality ``[t + 1, K, F]``.
-        actions: what the person did, ``[t]``.
-        told: what they were told at each step, by modality ``[t, K]``.
+        observation: full observation of the robot at each step: ego ``[t + 1, E]``, each modality
+            ``[t + 1, K, F]``.
+        actions: the person's actions, ``[t]``.
+        told: items communicated to them at each step, by modality ``[t, K]``.
 
     Raises:
-        InputError: these are no such arrays, or they do not go together. Whether they can be of a
-            domain is what `check` tells.
+        InputError: these are no such arrays, or their sizes do not match. `check` tests whether
+            they are possible in a domain.
     """
 
     observation: Observation
@@ -76,10 +76,10 @@ class RoundSoFar:
 
     @classmethod
     def begin(cls, domain: Domain, observation: Observation) -> RoundSoFar:
-        """A round of which there is only the first observation, ``[E]`` and ``[K, F]``.
+        """Begin a round with its first observation, ``[E]`` and ``[K, F]``.
 
         Raises:
-            InputError: such an observation cannot be.
+            InputError: the observation is impossible.
         """
         require_methods(domain, ["observe", "faults"], "domain", "a domain")
         shapes = _shapes(domain)
@@ -99,17 +99,17 @@ class RoundSoFar:
     def of(
         cls, recordings: Demonstrations, person: str | None = None, number: int = 0, step: int = 0
     ) -> RoundSoFar:
-        """A recorded round up to one of its steps.
+        """Return a recorded round up to one of its steps.
 
         Args:
             recordings: of rounds.
-            person: id; the only one unless named.
+            person: id; may be left out if there is only one person.
             number: of the round, from 0.
-            step: the one at which the person is about to act, from 0.
+            step: the step at which the person is about to act, from 0.
 
         Raises:
             InputError: there is no such round or step, or several people and none is named.
-            UnknownNameError: there is nobody of that id.
+            UnknownNameError: no person has that id.
         """
         people = require_kind(recordings, Demonstrations, "recordings").people
         if person is None and len(people) > 1:
@@ -131,15 +131,15 @@ class RoundSoFar:
         )
 
     def then(self, told: Visibility, action: int | Tensor, observation: Observation) -> RoundSoFar:
-        """The round one step later.
+        """Return the round one step later.
 
         Args:
-            told: what the person was told before they acted, ``[K]`` by modality.
-            action: what they did.
-            observation: what there is to observe now, ``[E]`` and ``[K, F]``.
+            told: items communicated before the person acted, ``[K]`` by modality.
+            action: index of their action.
+            observation: the observation after it, ``[E]`` and ``[K, F]``.
 
         Raises:
-            InputError: one of them is not of this kind and shape.
+            InputError: an argument is not of this kind and shape.
         """
         device = self.actions.device
         heard = require_keys(told, self.told, "told")
@@ -161,11 +161,11 @@ class RoundSoFar:
         )
 
     def check(self, domain: Domain) -> None:
-        """Make sure that all of the round can be of this domain.
+        """Check that the round is possible in a domain.
 
         Raises:
-            InputError: it is longer than the domain's rounds; or an observation, an action or what
-                was told cannot be.
+            InputError: it is longer than the domain's rounds; or an observation, an action or a
+                message is impossible.
         """
         if self.time > domain.horizon:
             raise InputError(
@@ -203,16 +203,16 @@ class RoundSoFar:
 
     @property
     def time(self) -> int:
-        """How many actions there have been, t."""
+        """Number of actions so far, t."""
         return len(self.actions)
 
     @property
     def now(self) -> Observation:
-        """The last observation, ``[E]`` and ``[K, F]``."""
+        """Last observation, ``[E]`` and ``[K, F]``."""
         return {name: value[-1] for name, value in self.observation.items()}
 
     def to(self, device: torch.device) -> RoundSoFar:
-        """The round on another device."""
+        """Return the round on another device."""
         if self.actions.device == device:
             return self
         observation = {name: value.to(device) for name, value in self.observation.items()}
@@ -224,13 +224,13 @@ def _the(name: str) -> str:
 
 
 def _shapes(domain: Domain) -> dict[str, tuple[int, ...]]:
-    """Values of one observation of everything, by name."""
+    """Return the shapes of one full observation, by name."""
     shapes = {m.name: (len(m.items), len(m.features)) for m in domain.modalities}
     return {EGO: (len(domain.ego_features),), **shapes}
 
 
 def _observation(given: Any) -> Observation:
-    """Observations ``[t + 1, ...]`` as tensors on one device."""
+    """Convert observations ``[t + 1, ...]`` to tensors on one device."""
     if not isinstance(given, Mapping) or EGO not in given:
         what = ", ".join(map(shown, given)) if isinstance(given, Mapping) else shown(given)
         raise InputError(f'the observation must be a dict with "{EGO}" and modalities, not {what}')
@@ -247,5 +247,5 @@ def _observation(given: Any) -> Observation:
 
 
 def _first(value: Tensor, bad: Tensor) -> tuple[int, float]:
-    """The first entry that is bad: where along the first dimension, and what."""
+    """Return the first bad entry: its index along the first dimension, and its value."""
     return int(bad.nonzero()[0, 0]), value[bad][0].item()

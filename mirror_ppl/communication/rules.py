@@ -1,4 +1,4 @@
-"""Communicators without a model of the person: what a planner has to be better than."""
+"""Baseline communicators without a model of the person."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from mirror_ppl.domains.base import Domain
 
 
 def nothing(domain: Domain, past: RoundSoFar) -> Tensor:
-    """Silence, flags ``[N]``."""
+    """Return silence, flags ``[N]``."""
     return torch.zeros(len(Channels(domain)), dtype=torch.bool)
 
 
 def everything(domain: Domain, past: RoundSoFar) -> Tensor:
-    """Everything that may be communicated, at every step, flags ``[N]``."""
+    """Return everything that may be communicated, at every step, flags ``[N]``."""
     return Channels(domain).join(domain.communicable(past.now))
 
 
 def nearest(domain: Domain, past: RoundSoFar, setting: str) -> Tensor:
-    """A sensible rule by hand, flags ``[N]``: the nearest thing that the setting hides.
+    """Return the nearest item that the setting hides, flags ``[N]``: a hand-written rule.
 
-    One thing a step, and each only once; nothing that is farther away than half the range of
-    sight, and nothing that everybody knows. It is said where that can be done and tells more, and
-    else shown.
+    One item a step, each only once; no item farther away than half the range of sight, and none
+    that all people know. It is said if it has a more informative utterance that is allowed, else
+    shown.
     """
     channels = Channels(domain)
     flags = torch.zeros(len(channels), dtype=torch.bool)
@@ -58,7 +58,7 @@ def nearest(domain: Domain, past: RoundSoFar, setting: str) -> Tensor:
 def at_random(
     domain: Domain, past: RoundSoFar, rates: Mapping[str, float], generator: torch.Generator
 ) -> Tensor:
-    """Each item that may be communicated with the probability of its modality, flags ``[N]``."""
+    """Draw each allowed item with the probability of its modality, flags ``[N]``."""
     channels = Channels(domain)
     chance = torch.cat([torch.full((len(m.items),), rates[m.name]) for m in domain.modalities])
     drawn = torch.rand(len(channels), generator=generator) < chance

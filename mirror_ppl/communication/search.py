@@ -1,6 +1,6 @@
-"""Finding the message that is worth most: every candidate, or the cross-entropy method.
+"""Searches for the best message: exhaustively, or by the cross-entropy method.
 
-Search knows nothing of people: it proposes candidates and is told what they are worth.
+Search is independent of the human model: it proposes candidates and receives their values.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.row_hashing import distinct_rows
 
 MOST_CANDIDATES = 4096
-"""How many candidates are valued one by one; beyond that they are searched."""
+"""Maximum number of candidates that are all valued; more are searched."""
 FEW_MESSAGES = 4
-"""Up to how many messages all plans are valued at once."""
+"""Maximum number of messages of which all plans are valued at once."""
 CHUNK = 512
-"""Candidates that are valued at once; bounds memory."""
+"""Number of candidates that are valued at once; bounds memory."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """Candidates ``[C, L, N]`` with their values; silence comes first."""
+    """Candidates ``[C, L, N]``, silence first, with their values."""
 
     candidates: Tensor
     valued: Valued
 
 
 class Search(Protocol):
-    """A way to search."""
+    """A search method."""
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """Candidates made of the allowed items ``[N]``, silence first."""
+        """Return candidates made of the allowed items ``[N]``, silence first."""
         ...
 
 
 @dataclass(frozen=True)
 class Exhaustive:
-    """Every message for now, and silence afterwards.
+    """Values every message for now, with silence afterwards.
 
     Attributes:
         items: most items of a message; any number unless given.
@@ -51,24 +51,24 @@ class Exhaustive:
     items: int | None = None
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`; the seed is not used."""
+        """Return candidates with their values; the seed is not used, see :class:`Search`."""
         candidates = every_message(allowed, self.items)[:, None]
         return Found(candidates, in_chunks(value, candidates))
 
 
 @dataclass(frozen=True)
 class Patient:
-    """Every message for now; and, of the best or of a few, whether they can wait or be split.
+    """Values every message for now, and delayed and split versions of the best.
 
-    A message that is compared with silence for good is said as soon as it helps. Much of what would
-    help now helps as well a step later, or turns out not to be needed, and items told one by one
-    cost less than together. So the best messages are also valued as plans: the same message 1 to
-    ``steps - 1`` steps later, and each of its items now with the rest in the next step. If there
-    are few messages, plans of all of them are valued at once, which is quicker.
+    Compared with permanent silence alone, a message is sent as soon as it helps. It may help as
+    much a step later, or turn out not to be needed, and items sent one by one cost less than
+    together. So the best messages are also valued as plans: the same message 1 to ``steps - 1``
+    steps later, and each of its items now with the rest in the next step. If there are few
+    messages, the plans of all of them are valued at once, which is faster.
 
     Attributes:
         steps: length L of the plans.
-        best: how many messages are looked at in this way.
+        best: number of messages of which plans are valued.
         items: most items of a message; any number unless given.
     """
 
@@ -81,7 +81,7 @@ class Patient:
             raise ValueError(f"steps must be at least 1, not {self.steps}")
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`; the seed is not used."""
+        """Return candidates with their values; the seed is not used, see :class:`Search`."""
         if self.steps > 1 and count_messages(allowed, self.items) <= FEW_MESSAGES:
             messages = every_message(allowed, self.items)
             plans = [_at_once(messages, self.steps), *self._plans(messages[1:])]
@@ -98,7 +98,7 @@ class Patient:
         return joined(Found(now, first.valued), plans, value)[0]
 
     def _plans(self, messages: Tensor) -> list[Tensor]:
-        """What else can become of messages ``[M, N]``: plans ``[C, L, N]``, in parts."""
+        """Return delayed and split versions ``[C, L, N]`` of messages ``[M, N]``, in parts."""
         plans = []
         for message in messages:
             later = message.new_zeros(self.steps - 1, self.steps, len(message))
@@ -116,20 +116,20 @@ class Patient:
 
 
 def _at_once(messages: Tensor, steps: int) -> Tensor:
-    """Plans ``[M, L, N]`` of messages ``[M, N]`` for now."""
+    """Return plans ``[M, L, N]`` that send messages ``[M, N]`` now, followed by silence."""
     return torch.nn.functional.pad(messages[:, None], [0, 0, 0, steps - 1])
 
 
 @dataclass(frozen=True)
 class CrossEntropy:
-    """The cross-entropy method over sequences of messages.
+    """Searches sequences of messages by the cross-entropy method.
 
-    The best sequence found comes with its variations: each of its items left out, and its first
-    message followed by silence.
+    Candidates are the best sequence found and its variations: each of its items left out, and its
+    first message followed by silence.
 
     Attributes:
         steps: length L of the sequences.
-        options: how hard to search. A message has few items, so few are tried at the start.
+        options: of the method. Messages have few items, so the start probability is low.
     """
 
     steps: int = 1
@@ -142,7 +142,7 @@ class CrossEntropy:
             raise ValueError(f"steps must be at least 1, not {self.steps}")
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`."""
+        """Return candidates with their values, see :class:`Search`."""
         places = allowed.nonzero().squeeze(-1)
         number = len(places)
 
@@ -169,12 +169,12 @@ class CrossEntropy:
 
 @dataclass(frozen=True)
 class Automatic:
-    """:class:`Patient` where candidates are few, else :class:`CrossEntropy`.
+    """Uses :class:`Patient` for few candidates, else :class:`CrossEntropy`.
 
     Attributes:
         steps: length L of the plans.
-        most: the largest number of messages that are valued one by one.
-        items: most items of a message where they are; any number unless given.
+        most: maximum number of messages for :class:`Patient`.
+        items: most items of a message of :class:`Patient`; any number unless given.
     """
 
     steps: int = 3
@@ -182,16 +182,16 @@ class Automatic:
     items: int | None = None
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
-        """See :class:`Search`."""
+        """Return candidates with their values, see :class:`Search`."""
         if count_messages(allowed, self.items) <= self.most:
             return Patient(self.steps, items=self.items)(value, allowed, seed)
         return CrossEntropy(self.steps)(value, allowed, seed)
 
 
 def joined(found: Found, more: Tensor, value: Value) -> tuple[Found, Tensor]:
-    """What was found with more candidates ``[C, L, N]`` after it, and where each of these is.
+    """Append candidates ``[C, L, N]``; returns all candidates and the indices of these.
 
-    Those that are there already are not valued again.
+    Candidates that were already valued are not valued again.
     """
     known = len(found.candidates)
     first, which = distinct_rows(torch.cat([found.candidates, more]).flatten(1).long())
@@ -211,7 +211,7 @@ def joined(found: Found, more: Tensor, value: Value) -> tuple[Found, Tensor]:
 
 
 def in_chunks(value: Value, candidates: Tensor) -> Valued:
-    """Values of many candidates ``[C, L, N]``."""
+    """Value many candidates ``[C, L, N]``, a chunk at a time."""
     parts = [value(part) for part in candidates.split(CHUNK)]
     actions = [part.actions for part in parts if part.actions is not None]
     return Valued(

@@ -1,4 +1,4 @@
-"""Worlds as pure batched functions, and their Gymnasium faces."""
+"""Worlds as pure batched functions, and their Gymnasium environments."""
 
 from mirror_ppl.domains.base import Domain, Modality, Observation, Visibility, require_known
 from mirror_ppl.domains.record import Record

@@ -1,7 +1,7 @@
-"""The contract of a domain: what can be seen, said and done, and how the world moves.
+"""The contract of a domain: observations, messages, actions and dynamics.
 
-A domain is a set of pure, batched functions over tensors. Nothing in it holds state between calls
-and randomness enters only through the generator that is passed in, so one seed gives one rollout.
+A domain is a set of pure, batched functions over tensors. It holds no state between calls, and
+randomness enters only through the generator that is passed in, so one seed gives one rollout.
 
 Shape letters, used in every docstring of the package:
 
@@ -11,11 +11,11 @@ B    rounds (episodes) of a person, or a batch of rounds
 T    steps of a round; a round holds T + 1 observations, T actions and T rewards
 K    items of a modality (cars that can be shown, utterances that can be said)
 F    features of an item
-E    features of the ego, which are always known
+E    features of the ego, which are always observed
 Z    latent dimensions
 A    actions
 S    posterior draws
-V    views of a round: the distinct ways to have seen it
+V    distinct views of a round
 ===  ==========================================================================================
 """
 
@@ -37,11 +37,11 @@ Observation = Mapping[str, Tensor]
 
 
 class RepeatedObservation(Mapping[str, Tensor]):
-    """Observations ``[n, ...]``, many of them the same; copied only where they are read.
+    """Observations ``[n, ...]`` with many repeated rows; copied only when read.
 
     Args:
         distinct: observations ``[rows, ...]``.
-        row: which of them each is ``[n]``.
+        row: index of each among them ``[n]``.
     """
 
     def __init__(self, distinct: Observation, row: Tensor) -> None:
@@ -61,14 +61,14 @@ class RepeatedObservation(Mapping[str, Tensor]):
 
 
 def of_each(function: Callable[[Observation], Tensor], observation: Observation) -> Tensor:
-    """A function of each observation, called once where many are the same."""
+    """Apply a function to each observation, to repeated rows only once."""
     if isinstance(observation, RepeatedObservation):
         return function(observation.distinct)[observation.row]
     return function(observation)
 
 
 Visibility = dict[str, Tensor]
-"""Masks by modality, boolean ``[..., K]``: which items are seen (or were communicated)."""
+"""Masks by modality, boolean ``[..., K]``: items that are seen (or communicated)."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ class Modality:
             units of reward (supplement, Table I).
         image: rows, columns and colours of an item that is an image; its features are the pixels
             in that order.
-        utterances: of spoken items, what is said of each by the value of its one feature: U
-            sentences an item, for the values 0 to U - 1.
+        utterances: for spoken items, the sentences about each by the value of its one feature: U
+            sentences per item, for the values 0 to U - 1.
     """
 
     name: str
@@ -110,18 +110,18 @@ class Modality:
             )
 
     def cost(self, number: Tensor) -> Tensor:
-        """Cost in units of reward of communicating ``number`` items in one step."""
+        """Return the cost in units of reward of communicating ``number`` items in one step."""
         return self.cost_coefficient * number.to(torch.get_default_dtype()) ** 2
 
     def understand(self, utterance: str) -> tuple[int, int]:
-        """Which item an utterance is about, and which of the utterances about it was said.
+        """Return the index of an utterance's item, and its index among that item's utterances.
 
         Args:
-            utterance: one of ``utterances``; upper and lower case count alike.
+            utterance: one of ``utterances``, in any case.
 
         Raises:
             UnknownNameError: it is none of them; lists them.
-            TypeError: it is no string.
+            TypeError: it is not a string.
         """
         if not isinstance(utterance, str):
             raise TypeError(f"an utterance is a string, not {utterance!r}")
@@ -134,21 +134,20 @@ class Modality:
 
 
 class Domain(Protocol):
-    """What a world offers to models, people, inference and communication.
+    """The interface of a world for models, people, inference and communication.
 
-    ``state`` and ``knowledge`` are the domain's own frozen dataclasses of tensors; only the domain
-    looks inside. Knowledge is what an observer has learned of the things behind the items from what
-    they saw or were told in a round so far. ``over_at_horizon`` says that nothing is left to win or
-    lose when a round ends; where it does not, the end is only where recording stops.
-    ``partial_views`` are reaches in each direction by name, in which self-models are measured.
-    The robot practises to see only so far with weights ``reach_practice`` of the reaches (all alike
-    if empty), to notice what is within reach at a step with a probability between those of
-    ``notice_practice``, and to be told of an item with one up to ``told_practice``.
-    ``assumptions`` are what an observer may take for granted of what they do not know; where all of
-    them leave nothing open, the world is ``settled``.
-    ``mishap`` is the reward term of what people should be kept from, and what several of them are
-    called. ``counterparts`` has for each visual item the verbal item that tells of the same, where
-    that tells more of it. ``record`` is what other parts of the package do differently here.
+    ``state`` and ``knowledge`` are the domain's own frozen dataclasses of tensors, opaque to other
+    code. Knowledge is what an observer has learned about the hidden state behind the items from
+    what they saw and heard in a round so far. ``over_at_horizon`` is true if nothing can be won or
+    lost after the end of a round; otherwise recording merely stops there. ``partial_views`` are
+    reaches in each direction by name, with which self-models are evaluated. In training, the
+    robot's reach is drawn with weights ``reach_practice`` (uniform if empty), items within reach
+    are noticed with a probability per step drawn between those of ``notice_practice``, and items
+    are communicated with a probability of up to ``told_practice``. ``assumptions`` are what an
+    observer may take for granted about unknown items; the world is ``settled`` if all of them
+    together determine every item. ``mishap`` is the reward term of a harmful event, and the plural
+    of its name. ``counterparts`` has for each visual item the verbal item about the same thing, if
+    that is more informative. ``record`` holds settings of other parts of the package.
     """
 
     name: str
@@ -178,49 +177,49 @@ class Domain(Protocol):
 
     @property
     def as_believed(self) -> Domain:
-        """The world as the robot was taught it, which may be wrong; else the world itself."""
+        """World as the robot was taught it, which may be wrong; else the world itself."""
         ...
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
     ) -> Any:
-        """States ``[batch]`` at the start of a round, scenarios drawn uniformly unless given."""
+        """Draw states ``[batch]`` at the start of a round; scenarios uniformly unless given."""
         ...
 
     def anywhere(self, batch: int, generator: torch.Generator) -> Any:
-        """States ``[batch]`` from which the robot learns, wherever a round may lead to."""
+        """Draw states ``[batch]`` for the robot's training, anywhere a round may lead."""
         ...
 
     def transition(self, state: Any, action: Tensor) -> Any:
-        """State at t + 1 from the state at t and the action at t, both batched alike."""
+        """Return the state at t + 1 from the state and action at t, batched alike."""
         ...
 
     def rewards(self, state: Any, action: Tensor, following: Any) -> dict[str, Tensor]:
-        """Reward terms by name, each ``[...]``; the task reward is their sum."""
+        """Return reward terms by name, each ``[...]``; the task reward is their sum."""
         ...
 
     def over(self, state: Any) -> Tensor:
-        """Where ``[...]`` all is done, and nothing can be won or lost any more."""
+        """Return where ``[...]`` the task is done and no more reward can be won or lost."""
         ...
 
     def observe(self, state: Any) -> Observation:
-        """Everything that could be observed of a state, whoever looks."""
+        """Return the full observation of a state."""
         ...
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
-        """What an unaided person sees in a setting, limited by the setting alone."""
+        """Return the items that an unaided person sees, limited by the setting alone."""
         ...
 
     def communicable(self, observation: Observation) -> Visibility:
-        """Which items may be communicated now."""
+        """Return the items that may be communicated now."""
         ...
 
     def faults(self, observation: Observation) -> dict[str, Tensor]:
-        """What cannot be in this world: which observations ``[...]`` break each rule, by rule."""
+        """Return which observations ``[...]`` break each rule of this world, by rule."""
         ...
 
     def nothing_known(self, *batch: int, device: torch.device | None = None) -> Any:
-        """Knowledge ``[*batch]`` before anything was observed."""
+        """Return knowledge ``[*batch]`` before anything was observed."""
         ...
 
     def learn(
@@ -230,32 +229,32 @@ class Domain(Protocol):
         visible: Visibility,
         sees: Callable[[Observation], Visibility],
     ) -> Any:
-        """Knowledge ``[...]`` after a step, from that of the step before.
+        """Return knowledge ``[...]`` after a step.
 
         Args:
             knowledge: of the step before.
-            observation: everything there is to observe at this step ``[..., K, F]``.
-            visible: which items are seen or told at this step ``[..., K]``.
-            sees: which items of an observation the observer would see by themselves; it tells
-                whether something that they expected is missing.
+            observation: full observation of this step ``[..., K, F]``.
+            visible: items that are seen or communicated at this step ``[..., K]``.
+            sees: maps an observation to the items the observer would see without messages, to
+                detect that an expected item is missing.
         """
         ...
 
     def known(self, knowledge: Any) -> Visibility:
-        """Items ``[..., K]`` whose content follows from what was observed, at this step or before.
+        """Return items ``[..., K]`` whose content follows from observations so far.
 
-        As the supplement has it (section B), what was seen or told is digested and not forgotten.
+        As in the supplement (section B), what was seen or communicated is not forgotten.
         """
         ...
 
     def assume(
         self, knowledge: Any, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """What somebody may take for granted about the things that they do not know.
+        """Return what a person may take for granted about unknown items.
 
         Args:
             knowledge: what they have learned.
-            observation: of this step; only what is always known of it is used.
+            observation: of this step; only its always observed parts are used.
 
         Returns:
             For each of ``assumptions``, the items ``[..., K]`` that it is about; and the
@@ -264,71 +263,71 @@ class Domain(Protocol):
         ...
 
     def supposed(self, state: Any, knowledge: Any, assumes: Mapping[str, Tensor]) -> Any:
-        """The state as somebody believes it to be who makes some of the assumptions.
+        """Return the state as believed by a person who makes some of the assumptions.
 
         Args:
-            state: how it is.
+            state: the true state.
             knowledge: what they have learned.
-            assumes: for each of ``assumptions``, who makes it, boolean ``[...]``.
+            assumes: for each of ``assumptions``, whether they make it, boolean ``[...]``.
         """
         ...
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
-        """Observations in the form in which networks read them, ``[..., symbol_sizes[name]]``."""
+        """Encode observations for networks, ``[..., symbol_sizes[name]]``."""
         ...
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
-        """What perceptual implants act on: direction index and distance of each visual item."""
+        """Return the direction index and distance of each visual item, for perceptual implants."""
         ...
 
     def state_behind(self, observation: Observation) -> Any:
-        """The state ``[...]`` that gives this observation of everything."""
+        """Return the state ``[...]`` with this full observation."""
         ...
 
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
-        """What there is to observe after an action ``[...]``; NaN where it may be one or another.
+        """Return the full observation after an action ``[...]``; NaN where it is random.
 
-        Recordings are held against it, see :mod:`mirror_ppl.data.contradictions`.
+        Recordings are checked against it, see :mod:`mirror_ppl.data.contradictions`.
         """
         ...
 
     def nearest(self, observation: Observation) -> Observation:
-        """The possible observation ``[...]`` nearest to one that decoders came up with."""
+        """Return the possible observation ``[...]`` nearest to a decoded one."""
         ...
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
-        """Which items ``[..., K]`` are about what matters now, by notion of what that is.
+        """Return relevant items ``[..., K]``, by definition of relevance.
 
-        The first notion is the one of the supplement, section F.
+        The first definition is that of the supplement, section F.
         """
         ...
 
     def decisive(self, observation: Observation) -> Visibility:
-        """The items ``[..., K]`` that somebody has to know to choose as who knows everything.
+        """Return items ``[..., K]`` that suffice for the choice made with full knowledge.
 
-        Too many do no harm. Self-models learn exact values where these are known.
+        A superset is fine. Self-models learn exact values where these items are known.
         """
         ...
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:
-        """An item of one observation ``[K, F]`` in words, such as "rear car, closing"."""
+        """Describe an item of one observation ``[K, F]``, such as "rear car, closing"."""
         ...
 
     def deed(self, observation: Observation, item: str | None, action: int) -> str:
-        """An action in words, with regard to an item (now) or none, such as "switch lanes"."""
+        """Describe an action, relative to a present item or none, such as "switch lanes"."""
         ...
 
     def reference_values(self, state: Any, discount: float) -> Tensor:
-        """Exact discounted action values ``[..., A]`` of a fully known state."""
+        """Return exact discounted action values ``[..., A]`` of a fully known state."""
         ...
 
     def render(self, state: Any) -> Any:
-        """A picture of one state, ``uint8 [height, width, 3]``."""
+        """Draw a picture of one state, ``uint8 [height, width, 3]``."""
         ...
 
 
 def total_reward(terms: Mapping[str, Tensor]) -> Tensor:
-    """Sum of reward terms ``[...]``."""
+    """Return the sum of reward terms ``[...]``."""
     return torch.stack(list(terms.values())).sum(0)
 
 
@@ -344,7 +343,7 @@ def map_state(function: Callable[..., Tensor], *states: Any) -> Any:
 
 
 def roll_out(domain: Domain, start: Any, actions: Tensor) -> Any:
-    """States ``[B, T + 1]`` of rounds from ``start`` ``[B]`` under ``actions`` ``[B, T]``."""
+    """Return states ``[B, T + 1]`` of rounds from ``start`` ``[B]`` by ``actions`` ``[B, T]``."""
     states = [start]
     for action in actions.unbind(1):
         states.append(domain.transition(states[-1], action))
@@ -363,7 +362,7 @@ def require_known(name: str, kind: str, known: Sequence[str], where: str = "") -
 
 
 def by_eye(domain: Domain, seen: Tensor) -> Visibility:
-    """What somebody sees who hears nothing: visual items ``[..., K]``, and none of the others."""
+    """Return masks with visual items ``[..., K]`` seen and no items of other modalities."""
     return {
         modality.name: seen
         if modality.name == "visual"

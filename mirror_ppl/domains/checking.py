@@ -1,4 +1,4 @@
-"""Whether a world keeps the contract of worlds, and what it offers; each fault in one line."""
+"""Checks a world against the contract of worlds, and lists what it implements."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from mirror_ppl.errors import DomainError
 from mirror_ppl.user_code import describe
 
 ROUNDS = 6
-"""Rounds that a check goes through."""
+"""Number of rounds that a check plays."""
 TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
 class Capability:
-    """Something that a world may write and need not.
+    """An optional member of a world.
 
     Attributes:
-        method: or attribute, by which it does.
-        otherwise: what there is without.
-        gives: what it is for.
+        method: the method or attribute.
+        otherwise: the default.
+        gives: its use.
     """
 
     method: str
@@ -42,7 +42,7 @@ CAPABILITIES = (
     Capability("over", "rounds last to the horizon", "rounds that end"),
     Capability("learn", "what was last seen", "memory: what people know without looking"),
     Capability("assume", "nothing", "what people take for granted"),
-    Capability("communicable", "everything", "what can be told"),
+    Capability("communicable", "everything", "items that can be communicated"),
     Capability("relevance", "everything", "shares of relevant messages"),
     Capability("describe", "names and numbers", "messages in words"),
     Capability("deed", "the action's name", "actions in words"),
@@ -52,15 +52,15 @@ CAPABILITIES = (
 
 
 def capabilities(world: World) -> list[tuple[Capability, bool]]:
-    """What a world may offer, and whether it does so by itself."""
+    """Return optional members of a world, and whether it implements each."""
     return [(one, offers(world, one.method)) for one in CAPABILITIES]
 
 
 def require_sound(world: World) -> World:
-    """Return a world in which no fault is found.
+    """Return the world if it has no faults.
 
     Raises:
-        DomainError: there are some; says the first.
+        DomainError: it has faults; the message has the first.
     """
     found = faults_of(world)
     if found:
@@ -70,9 +70,9 @@ def require_sound(world: World) -> World:
 
 
 def faults_of(world: World) -> list[str]:
-    """What is wrong with a world, each with what was expected and what was given.
+    """Return the faults of a world, each with what was expected and what was found.
 
-    Rounds of random actions are played; where they cannot be, what comes later is not looked at.
+    Plays rounds of random actions; checks stop at the first stage with faults.
     """
     faults: list[str] = _of_names(world)
     if faults:
@@ -103,7 +103,7 @@ def _call(world: World, name: str, *arguments: Any) -> Any:
 
 def _of_names(world: World) -> list[str]:
     found = []
-    if len(world.actions) < 2:  # noqa: PLR2004 - one to choose from is none
+    if len(world.actions) < 2:  # noqa: PLR2004 - one action is no choice
         found.append(f"actions: expected at least 2, found {len(world.actions)}")
     if not world.ego_features:
         found.append("ego_features: expected at least one, found none")
@@ -127,7 +127,7 @@ def _of_names(world: World) -> list[str]:
 
 
 def _begins(world: World) -> list[str]:
-    """How rounds begin: states of tensors, that a seed determines."""
+    """Check initial states: dataclasses of tensors, determined by the seed."""
     first = _start(world)
     if not is_dataclass(first) or isinstance(first, type):
         return [f"initial: expected a dataclass of tensors, found {type(first).__name__}"]
@@ -143,7 +143,7 @@ def _begins(world: World) -> list[str]:
     scenario = torch.zeros(ROUNDS, dtype=torch.long)
     _call(world, "initial", ROUNDS, torch.Generator().manual_seed(0), scenario)
     if not _same(first, _start(world)):
-        return ["initial: the same generator gives other states; draw with the one that is passed"]
+        return ["initial: equal generators give different states; draw with the one that is passed"]
     return []
 
 
@@ -152,7 +152,7 @@ def _start(world: World) -> Any:
 
 
 def _goes_on(world: World) -> list[str]:
-    """How the world moves: pure, batched, of the same kind, with finite rewards."""
+    """Check transitions and rewards: pure, batched, of the same types, finite."""
     state = _start(world)
     generator = torch.Generator().manual_seed(1)
     for step in range(world.horizon):
@@ -168,7 +168,7 @@ def _goes_on(world: World) -> list[str]:
         if not _same(before, state):
             return ["transition: changes the state that it is given; return a new one"]
         if not _same(following, _call(world, "transition", state, action)):
-            return ["transition: is not pure, the same state and action lead to others each time"]
+            return ["transition: is not pure, the same state and action lead to different states"]
         terms = _call(world, "rewards", state, action, following)
         if not isinstance(terms, Mapping) or set(terms) != set(world.reward_terms):
             named = ", ".join(terms) if isinstance(terms, Mapping) else _kind(terms)
@@ -183,7 +183,7 @@ def _goes_on(world: World) -> list[str]:
 
 
 def _looks(world: World) -> list[str]:
-    """What there is to observe, and all that is made of it, along rounds ``[B, T]``."""
+    """Check observations, and methods that read them, along rounds ``[B, T]``."""
     generator = torch.Generator().manual_seed(2)
     states, actions = [_start(world)], []
     for _ in range(world.horizon):
@@ -209,8 +209,8 @@ def _looks(world: World) -> list[str]:
         if not isinstance(mask, Mapping) or set(mask) != set(items):
             named = ", ".join(mask) if isinstance(mask, Mapping) else _kind(mask)
             return [
-                f"{name}: expected masks of {', '.join(items)} (of what is only said, too: nobody "
-                f"sees it), found {named}"
+                f"{name}: expected masks of {', '.join(items)} (also of modalities that are only "
+                f"said), found {named}"
             ]
         found += [_fault(name, key, mask[key], own, bool) for key, own in items.items()]
     for rule, broken in _call(world, "faults", observation).items():
@@ -251,7 +251,7 @@ def _looks(world: World) -> list[str]:
             found.append(f"state_behind: {name} of the state is not what was observed")
         elif bool(((following[name] - value[:, 1:]).abs() > TOLERANCE).any()):
             found.append(
-                f"state_behind: {name} goes on otherwise than from the true state; something that "
+                f"state_behind: the next {name} is not that of the true state; something that "
                 "matters cannot be observed"
             )
     if offers(world, "reference_values"):
@@ -262,7 +262,7 @@ def _looks(world: World) -> list[str]:
 
 
 def _of_one(world: World, states: Any, observations: Mapping[str, Tensor]) -> list[str]:
-    """What is only ever asked of one state, and memory: that it can be called at all."""
+    """Check that methods for one state, and memory, can be called."""
     state = map_state(lambda part: part[0, 0], states)
     now = {name: value[0, 0] for name, value in observations.items()}
     behind = _call(world, "state_behind", now)
@@ -292,7 +292,7 @@ def _of_one(world: World, states: Any, observations: Mapping[str, Tensor]) -> li
 
 
 def _fault(where: str, name: str, value: Any, shape: tuple[int, ...], kind: type | None) -> str:
-    """What is wrong with a tensor, or nothing."""
+    """Return the fault of a tensor, or an empty text."""
     named = f"{where}: {name}".rstrip(": ")
     if not isinstance(value, Tensor):
         return f"{named} has to be a tensor, found {_kind(value)}"

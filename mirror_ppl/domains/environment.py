@@ -23,7 +23,7 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
     """A round of a domain, seen by an unaided person in one of the domain's settings.
 
     All mechanics are the domain's: this class only draws the round, hides what the setting hides
-    and counts steps. Each domain has a child of it, which says what is observed.
+    and counts steps. Each domain has a subclass with its observation space.
 
     Attributes:
         domain: the world.
@@ -69,14 +69,14 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[EnvObservation, dict[str, Any]]:
-        """Start a round; the same seed gives the same round. There are no ``options``."""
+        """Start a round; the same seed gives the same round. ``options`` are not used."""
         super().reset(seed=seed, options=options)
         scenarios = self.domain.scenarios
         if self.scenario is None:
             index = int(self.np_random.integers(len(scenarios)))
         else:
             index = scenarios.index(self.scenario)
-        # The domain draws from torch's generators; this one hangs on Gymnasium's seed.
+        # The domain draws from torch's generators; this one depends on Gymnasium's seed.
         generator = torch.Generator().manual_seed(int(self.np_random.integers(2**63 - 1)))
         batch = self.domain.initial(1, generator, torch.tensor([index]))
         self._state = map_state(lambda part: part[0], batch)
@@ -109,7 +109,7 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         return self._observation(), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """Picture ``uint8 [height, width, 3]`` of everything there is, seen or not.
+        """Return a picture ``uint8 [height, width, 3]`` of the full state, seen or not.
 
         Returns:
             The picture, or None if the environment was made without a render mode.
@@ -128,7 +128,7 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         return self._step == self.domain.horizon or bool(self.domain.over(self._state))
 
     def _observation(self) -> EnvObservation:
-        """What the person sees, as numpy arrays of their own."""
+        """Return what the person sees, as new numpy arrays."""
         values = self.domain.observe(self._state)
         masks = self.domain.visibility(self.setting, values)
         seen: EnvObservation = {"ego": values["ego"].numpy().astype(np.float32)}

@@ -1,10 +1,9 @@
-"""Any small deterministic Gymnasium environment as a world: all that can happen in it, tabulated.
+"""Worlds from small deterministic Gymnasium environments, by tabulating their states.
 
-People are inferred and messages are planned by leading thousands of courses of a round at once,
-which an environment that steps one course at a time cannot do. So every state that can be reached
-from some seeds is visited once, each action is tried there, and what comes of it is written into
-tables. Then the world is a look-up, and exact values come for free. The tables are kept in a file,
-for the next command.
+Inference and planning simulate thousands of histories at once, while an environment steps one at a
+time. So every state that can be reached from some seeds is visited once, each action is tried
+there, and the outcomes are tabulated. The world is then a look-up, and exact action values follow.
+The tables are cached in a file.
 """
 
 from __future__ import annotations
@@ -35,33 +34,33 @@ from mirror_ppl.progress import Progress
 from mirror_ppl.row_hashing import as_whole_numbers, row_numbers
 
 SWEEPS = 1000
-"""Most sweeps of value iteration."""
+"""Maximum number of sweeps of value iteration."""
 CLOSE = 1e-6
 SOONER, LITTLE = 0.95, 1e-4
-"""A discount by which what is alike without one differs, and how much that counts."""
+"""A discount to break ties between undiscounted values, and the weight of these values."""
 CACHED = ("tables", "_names", "_path", "_values", "_decisive")
-"""What is worked out once."""
+"""Attributes that are computed once."""
 TRIED_TWICE = 200
-"""States that are tried again when they are reached by another way: is all of them observed?"""
+"""Number of states tried again when reached on another way, to detect unobserved state."""
 UNSEEN = "something that matters cannot be observed"
 
 
 @dataclass(frozen=True)
 class Place:
-    """Which state of the table, ``[...]``."""
+    """Index of a state in the table, ``[...]``."""
 
     number: Tensor
 
 
 @dataclass(frozen=True)
 class Tables:
-    """Everything that can happen, of S states.
+    """Observations, transitions and rewards of S states.
 
     Attributes:
-        observation: all that can be observed of each, ``[S, ...]``.
+        observation: full observation of each, ``[S, ...]``.
         following: the state after each action ``[S, A]``.
         terms: reward terms of each action by name, ``[S, A]``.
-        over: where all is done, ``[S]``.
+        over: where the task is done, ``[S]``.
         begins: where rounds may begin, ``[S]``.
     """
 
@@ -73,16 +72,16 @@ class Tables:
 
 
 class GymnasiumWorld(World):
-    """A world that is a Gymnasium environment; derive from it.
+    """Base class of a world from a Gymnasium environment; derive from it.
 
-    What it has to say besides the environment is what there is to see. The environment has to be
-    deterministic between resets, and what is not observed must not matter.
+    Implement :meth:`make` and :meth:`look`. The environment has to be deterministic between resets,
+    and unobserved parts of its state must not matter.
 
     Attributes:
         moves: the environment's actions that people may take, in the order of ``actions``; the
             first ones unless given.
-        layouts: how many resets, with the seeds 0, 1 and so on, the world is made of.
-        most_states: with more states than this an environment is refused.
+        layouts: number of resets, with the seeds 0, 1 and so on.
+        most_states: maximum number of states.
     """
 
     moves: tuple[int, ...] = ()
@@ -91,25 +90,25 @@ class GymnasiumWorld(World):
 
     @abstractmethod
     def make(self) -> gym.Env:
-        """The environment; it is reset and stepped, and copied by pickling."""
+        """Make the environment; it is reset and stepped, and copied by pickling."""
 
     @abstractmethod
     def look(self, env: Any) -> Mapping[str, Any]:
-        """What there is to observe now: ``ego`` of E numbers, each modality of K times F."""
+        """Return the full observation: ``ego`` ``[E]``, each modality ``[K, F]``."""
 
     def terms(self, env: Any, action: int, reward: float, terminated: bool) -> dict[str, float]:
-        """Reward terms of a step by name, the environment being as it is afterwards."""
+        """Return reward terms of a step by name; the environment is in the state after it."""
         del env, action, terminated
         return {self.reward_terms[0]: reward}
 
     def begins(self, env: Any) -> bool:
-        """Whether rounds may begin in a state that is no reset, as when one starts anywhere."""
+        """True if rounds may also begin in this state, which need not follow a reset."""
         del env
         return False
 
     @cached_property
     def tables(self) -> Tables:
-        """All that can happen; read from its file, or worked out.
+        """Tables of all states, read from their file or computed.
 
         Raises:
             DomainError: the environment fails, has actions that are not numbered, is not
@@ -132,7 +131,7 @@ class GymnasiumWorld(World):
         return _file(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without tables that other processes can read from the file."""
+        """Pickle without tables that other processes can read from the file."""
         kept = ("tables",) if self._path is None or not self._path.exists() else ()
         return {
             name: part for name, part in vars(self).items() if name not in CACHED or name in kept
@@ -141,12 +140,12 @@ class GymnasiumWorld(World):
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
     ) -> Place:
-        """One of the states in which rounds may begin, all alike."""
+        """Draw states in which rounds may begin, uniformly."""
         del scenario
         return self._drawn(self.tables.begins, batch, generator)
 
     def anywhere(self, batch: int, generator: torch.Generator) -> Place:
-        """Any state in which something is still to be done."""
+        """Draw states in which the task is not done, uniformly."""
         return self._drawn(~self.tables.over, batch, generator)
 
     def _drawn(self, where: Tensor, batch: int, generator: torch.Generator) -> Place:
@@ -155,28 +154,28 @@ class GymnasiumWorld(World):
         return Place(known[torch.randint(len(known), (batch,), generator=generator, device=device)])
 
     def transition(self, state: Place, action: Tensor) -> Place:
-        """Looked up."""
+        """Look up the next state."""
         return Place(self.tables.following.to(action.device)[state.number, action])
 
     def rewards(self, state: Place, action: Tensor, following: Place) -> dict[str, Tensor]:
-        """Looked up."""
+        """Look up the reward terms."""
         del following
         tables = self.tables.terms
         return {name: each.to(action.device)[state.number, action] for name, each in tables.items()}
 
     def over(self, state: Place) -> Tensor:
-        """Where the environment has terminated."""
+        """Return where the environment has terminated."""
         return self.tables.over.to(state.number.device)[state.number]
 
     def observe(self, state: Place) -> Observation:
-        """Looked up."""
+        """Look up the full observation."""
         device = state.number.device
         return {
             name: value.to(device)[state.number] for name, value in self.tables.observation.items()
         }
 
     def state_behind(self, observation: Observation) -> Place:
-        """The state with this observation; one that was never visited is taken for the nearest."""
+        """Return the state with this observation, or the nearest state if there is none."""
         rows = _rows(observation)
         names, order = self._names
         names, order = names.to(rows.device), order.to(rows.device)
@@ -189,7 +188,7 @@ class GymnasiumWorld(World):
         return Place(found)
 
     def knows(self, observation: Mapping[str, Any]) -> bool:
-        """Whether what `look` says is one of the states that were visited."""
+        """True if an observation from `look` is that of a visited state."""
         one = _tensors(observation)
         behind = self.tables.observation
         number = self.state_behind(one).number
@@ -201,13 +200,13 @@ class GymnasiumWorld(World):
         return names, order
 
     def nearest(self, observation: Observation) -> Observation:
-        """The observation of the nearest state, features in units of their scales."""
+        """Return the observation of the nearest state, with features in units of their scales."""
         shape = observation["ego"].shape[:-1]
         flat = {n: v.reshape(-1, *v.shape[len(shape) :]) for n, v in observation.items()}
         return self.observe(Place(self._nearest(flat).view(shape)))
 
     def _nearest(self, observation: Observation) -> Tensor:
-        """Numbers ``[n]`` of the states nearest to observations ``[n, ...]``."""
+        """Return indices ``[n]`` of the states nearest to observations ``[n, ...]``."""
         known, own = (
             torch.cat([part.flatten(1) for part in self._scaled(each).values()], -1)
             for each in (self.tables.observation, observation)
@@ -226,18 +225,18 @@ class GymnasiumWorld(World):
 
     @cached_property
     def _values(self) -> dict[float, Tensor]:
-        return {}  # by discount, once they were asked for
+        return {}  # by discount, once requested
 
     def reference_values(self, state: Place, discount: float) -> Tensor:
-        """Exact values ``[..., A]`` by value iteration; of a discount of 1 to the horizon.
+        """Return exact values ``[..., A]`` by value iteration; undiscounted to the horizon.
 
-        Of those of 1, alike ones differ a little by how soon the rewards come.
+        Undiscounted ties are broken in favour of earlier rewards.
         """
         known = self._values
         if discount not in known:
             known[discount] = self._iterated(discount)
             if discount == 1:
-                # Where it is the same, sooner is better: who waits as well as not never comes.
+                # Ties are broken in favour of sooner rewards, else an agent may wait forever.
                 known[discount] = known[discount] + LITTLE * self._iterated(SOONER)
         return known[discount].to(state.number.device)[state.number]
 
@@ -275,14 +274,14 @@ def _tensors(observation: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def _rows(observation: Observation) -> Tensor:
-    """Observations ``[...]`` as whole numbers ``[..., N]``, in the order of names."""
+    """Return observations ``[...]`` as whole numbers ``[..., N]``, in the order of names."""
     dimensions = observation["ego"].dim() - 1
     parts = [as_whole_numbers(part).flatten(dimensions) for _, part in sorted(observation.items())]
     return torch.cat(parts, -1)
 
 
 def _file(world: GymnasiumWorld) -> Path | None:
-    """Where tables of a world are kept; other code has another file, and code of no file none."""
+    """Return the cache file of a world's tables, by hash of its code; None without source."""
     kind, given = type(world), {n: v for n, v in vars(world).items() if n not in CACHED}
     content = f"{kind.version} {kind.layouts} {kind.horizon} {kind.moves} {given} {gym.__version__}"
     try:
@@ -334,7 +333,7 @@ def _visited(world: GymnasiumWorld) -> Tables:
             begins.append(False)
             waiting.append(b"" if end else pickle.dumps(env))
         elif over[number] != end:
-            raise DomainError(f"{world.name}: all is done or not in {own}; {UNSEEN}")
+            raise DomainError(f"{world.name}: both over and not over in {own}; {UNSEEN}")
         elif number < len(following) and not end and (begin or len(again) < most):
             again.append((number, pickle.dumps(env)))
         begins[number] |= not end and (begin or world.begins(env.unwrapped))
@@ -356,7 +355,7 @@ def _visited(world: GymnasiumWorld) -> Tables:
 
     with Progress(f"visit {world.name}", world.layouts) as progress:
         for seed in range(world.layouts):
-            # Of each layout a share: what differs between resets may be hidden, too.
+            # Some per layout, because unobserved state may also differ between resets.
             most = len(again) + max(TRIED_TWICE // world.layouts, 5)
             env.reset(seed=seed)
             visit(False, begin=True)
@@ -379,7 +378,7 @@ def _visited(world: GymnasiumWorld) -> Tables:
             )
             if not same:
                 raise DomainError(
-                    f"{world.name}: other things follow from {seen[number]} each time; {UNSEEN}"
+                    f"{world.name}: outcomes of actions in {seen[number]} vary; {UNSEEN}"
                 )
     return Tables(
         {name: torch.stack([one[name] for one in seen]) for name in seen[0]},

@@ -1,4 +1,4 @@
-"""What people keep in mind of items in worlds that have no memory of their own."""
+"""Default memory of people: items as they were last seen."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from mirror_ppl.domains.base import Modality, Observation, Visibility
 
 @dataclass(frozen=True)
 class LastSeen:
-    """What was last seen of each item of all modalities, one behind the other.
+    """Last seen features of each item, modalities concatenated.
 
     Attributes:
-        seen: whether an item was seen or told of in the round so far, boolean ``[..., K]``.
-        known: whether it still is as it was then, boolean ``[..., K]``.
-        content: its features as they were then, ``[..., K F]``; 0 of what was never seen.
+        seen: whether an item was seen or communicated in the round so far, boolean ``[..., K]``.
+        known: whether it is unchanged since then, boolean ``[..., K]``.
+        content: its features then, ``[..., K F]``; 0 for items never seen.
     """
 
     seen: Tensor
@@ -29,7 +29,7 @@ class LastSeen:
     def nothing(
         cls, modalities: Sequence[Modality], *batch: int, device: torch.device | None = None
     ) -> LastSeen:
-        """Before anything was seen, ``[*batch]``."""
+        """Return the memory ``[*batch]`` before anything was seen."""
         items = sum(len(m.items) for m in modalities)
         values = sum(len(m.items) * len(m.features) for m in modalities)
         never = torch.zeros(*batch, items, dtype=torch.bool, device=device)
@@ -42,13 +42,13 @@ class LastSeen:
         observation: Observation,
         visible: Visibility,
     ) -> LastSeen:
-        """After a step at which some items ``[..., K]`` were seen or told of.
+        """Return the memory after a step at which some items ``[..., K]`` were perceived.
 
         Args:
             modalities: of the world.
-            lasting: names of items that stay known once they were seen, however they change.
-            observation: everything there is to observe ``[..., K, F]``.
-            visible: what was seen or told.
+            lasting: names of items that stay known once seen, even if they change.
+            observation: full observation ``[..., K, F]``.
+            visible: items that were seen or communicated.
         """
         now = torch.cat([observation[m.name].flatten(-2) for m in modalities], -1)
         new = torch.cat([visible[m.name] for m in modalities], -1)
@@ -64,6 +64,6 @@ class LastSeen:
         return LastSeen(seen, seen & (as_seen | stays), content)
 
     def items(self, modalities: Sequence[Modality]) -> Visibility:
-        """Known items ``[..., K]`` by modality."""
+        """Return known items ``[..., K]`` by modality."""
         parts = self.known.split([len(m.items) for m in modalities], -1)
         return {m.name: part for m, part in zip(modalities, parts, strict=True)}

@@ -1,4 +1,4 @@
-"""What the package knows of a world besides its rules: settings, people, pictures, human models."""
+"""Records of worlds: settings, people, pictures and human models besides the rules."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from mirror_ppl.errors import DomainError
 
 @dataclass(frozen=True)
 class Record:
-    """What other parts of the package should do differently in a world; all may be left out.
+    """Settings of other parts of the package for a world; all are optional.
 
-    People, pictures and human models are given as they are or, so that a world can be loaded
-    without them, as ``"module:name"``.
+    People, pictures and human models are objects or strings ``"module:name"``, so that a world can
+    be loaded without them.
 
     Attributes:
         networks: :class:`~mirror_ppl.models.sizes.Sizes` of the robot that differ in this world.
-        paper_networks: of these what differs further in the supplement, where its cost is too much.
+        paper_networks: sizes that further differ in the supplement, where they cost too much.
         training: settings of :class:`~mirror_ppl.training.self_model.SelfModelOptions`, by name.
-        planning: those of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
-        baselines: those of baselines, by the baseline's name: ``bc`` and ``sqil``.
-        slow: what `evaluate` compares here on request only, because it takes minutes: `svi` where
-            there is much to sum over at each step, and SQIL where rounds are long.
+        planning: settings of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
+        baselines: settings of baselines, by the baseline's name: ``bc`` and ``sqil``.
+        slow: models that `evaluate` compares only on request, because they take minutes: `svi`
+            with many values to sum over at each step, and SQIL with long rounds.
         people: the simulated people, a :class:`~mirror_ppl.people.base.DomainPeople`; those of
             :mod:`mirror_ppl.people.robot_like` unless given.
-        human_models: classes that stand here for the human models of these names.
+        human_models: classes that replace the human models of these names.
         pictures: of what people see, :class:`~mirror_ppl.plots.picture.SightPicture` by file name.
-        rounds: pictures of rounds, by what they show: see :class:`mirror_ppl.plots.fit.FitPlots`.
+        rounds: pictures of rounds, by method of :class:`mirror_ppl.plots.fit.FitPlots`.
     """
 
     networks: Mapping[str, int] = field(default_factory=dict)
@@ -44,10 +44,10 @@ class Record:
     rounds: Any = field(default_factory=dict)
 
     def part(self, name: str) -> Any:
-        """One of the attributes; loaded, where it is the name of something in a module.
+        """Return one of the attributes, imported if it is a string ``"module:name"``.
 
         Raises:
-            DomainError: the module cannot be imported, or has no such thing.
+            DomainError: the module cannot be imported, or has no such name.
         """
         value = getattr(self, name)
         if not isinstance(value, str):
@@ -60,7 +60,7 @@ class Record:
 
 
 def settings_of(record: Record, kind: str, options: type) -> Mapping[str, Any]:
-    """Settings ``training`` or ``planning`` of a world.
+    """Return the settings ``training`` or ``planning`` of a world.
 
     Raises:
         DomainError: there is no such setting.

@@ -25,21 +25,21 @@ DOMAINS: dict[str, Domain] = {
 """The package's own worlds by name."""
 _ADDED: dict[str, World] = {}
 _LOADED: dict[tuple[Path, str, int], World] = {}
-"""Worlds of files that were loaded, by file, class and when it was changed last."""
+"""Worlds loaded from files, by file, class and modification time."""
 
 
 def added_worlds() -> tuple[World, ...]:
-    """Worlds that were added, for other processes to add."""
+    """Return the worlds that were added, for other processes to add."""
     return tuple(_ADDED.values())
 
 
 def known_domains() -> tuple[Domain, ...]:
-    """The package's own worlds, and those that were added."""
+    """Return the package's own worlds and those that were added."""
     return (*DOMAINS.values(), *_ADDED.values())
 
 
 def load_world(specification: str | type[World] | World) -> World:
-    """A world of ``path/to/file.py:Class``, whose code is run, or of a class; not looked at yet.
+    """Load a world from ``path/to/file.py:Class``, whose code is run, or a class; unchecked.
 
     Raises:
         DomainError: the file or class is missing, does not import, is no world or cannot be made.
@@ -65,20 +65,20 @@ def load_world(specification: str | type[World] | World) -> World:
 
 
 def add_domain(world: World | type[World] | str) -> World:
-    """Make a world known by its name, in place of another one that was added under it.
+    """Register a world by its name, replacing a world added under that name.
 
     Args:
         world: it or its class, or ``path/to/file.py:Class``, whose code is run.
 
     Raises:
         DomainError: it is no world, cannot be made, breaks the contract of worlds (see
-            :mod:`mirror_ppl.domains.checking`), or has the name of one of the package.
+            :mod:`mirror_ppl.domains.checking`), or has the name of a world of the package.
     """
     return know(require_sound(load_world(world)))
 
 
 def code_of(domain: Domain) -> str:
-    """Hash of the file of a world that a user wrote; empty for the package's own worlds."""
+    """Return a hash of the file of a user's world; empty for the package's own worlds."""
     if domain.name in DOMAINS:
         return ""
     try:
@@ -88,13 +88,13 @@ def code_of(domain: Domain) -> str:
 
 
 def know(world: World) -> World:
-    """Make a world known that was looked at before."""
+    """Register a world that was already checked."""
     _ADDED[world.name] = world
     return world
 
 
 def domain_of(world: World | type[World] | str) -> Domain:
-    """A world by name, or one of somebody's own; see `get_domain` and `add_domain`."""
+    """Return a world by name, or add a user's world; see `get_domain` and `add_domain`."""
     return get_domain(world) if isinstance(world, str) else add_domain(world)
 
 
@@ -102,12 +102,12 @@ def get_domain(name: str) -> Domain:
     """Return a world.
 
     Args:
-        name: of one of the package, or of one that was added or that an installed package has
+        name: of a world of the package, an added world, or a world that an installed package has
             under the entry point ``mirror_ppl.domains``; or ``path/to/file.py:Class``, whose code
             is run.
 
     Raises:
-        UnknownNameError: there is none, listing the known ones.
+        UnknownNameError: no world has that name; lists the known ones.
         DomainError: the file or class is missing, does not import, or is no world.
     """
     if not isinstance(name, str):

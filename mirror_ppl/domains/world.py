@@ -1,10 +1,9 @@
-"""The base of a world in one file: a core that has to be written, and defaults for all the rest.
+"""Base class of worlds: a core to implement, and defaults for the rest of the interface.
 
-The core is what only its author knows: items and their features, actions, how a round begins, how
-the world moves, rewards, and what there is to observe. Everything else that a
-:class:`~mirror_ppl.domains.base.Domain` offers has a default here, made of the core; docstrings say
-what it takes for granted, and overriding it says more. ``docs/adding_a_world.md`` goes through it
-step by step.
+The core is items and their features, actions, initial states, transitions, rewards and full
+observations. Every other member of :class:`~mirror_ppl.domains.base.Domain` has a default here,
+derived from the core; docstrings state what the default assumes. ``docs/adding_a_world.md`` is a
+step-by-step guide.
 """
 
 from __future__ import annotations
@@ -29,33 +28,33 @@ VISUAL = "visual"
 
 
 class World(ABC):
-    """A world of which only the core is written; derive from it.
+    """Base class of a world; derive from it and implement the core.
 
     States are frozen dataclasses of tensors whose first dimensions are those of the batch. All
-    methods are batched and pure: what is random is drawn in `initial`, from its generator.
+    methods are batched and pure: randomness is drawn only in `initial`, from its generator.
 
     Attributes:
-        name: of the world; that of the class in lower case unless given, as ``tea_kitchen`` of
+        name: of the world; by default the class name in snake case, such as ``tea_kitchen`` for
             ``TeaKitchen``.
         version: raise it when recordings and self-models of the world no longer fit.
-        modalities: channels; the one called ``visual`` is what can be seen, others can be said.
-        ego_features: names of what people always know of their own situation, at least one.
-        actions: names of what can be done.
+        modalities: channels; items of ``visual`` can be seen, those of others can be said.
+        ego_features: names of features that people always know of themselves, at least one.
+        actions: names of the actions.
         horizon: steps of a round.
         settings: names of the settings, such as ``("clear", "fog")``.
-        reward_terms: names of the terms of which `rewards` returns the amounts.
+        reward_terms: names of the terms that `rewards` returns.
         positions: features of visual items that are offsets from the person, in one unit. The
-            largest of them is the distance of an item, on which thresholds of sight act. Without
-            any, all items are at distance 1.
-        reach_bins: distances of which one is somebody's threshold of sight; whole numbers up to the
-            largest scale of ``positions`` unless given. The last one is everything.
-        levels: of features that are whole numbers, which they can be, by name. Networks read such a
-            feature as one number for each level, and others as a number in units of their scales.
-        lasting: items that people keep in mind once they were seen or told of, however these
-            change; others are known where they are as they were last seen.
-        record: settings of training, planning and networks, people and pictures of this world's
-            own; see :class:`~mirror_ppl.domains.record.Record`.
-        mishap: reward term of what people should be kept from, and what several are called.
+            largest of them is an item's distance, to which sight thresholds apply. Without any, all
+            items are at distance 1.
+        reach_bins: possible sight thresholds; whole numbers up to the largest scale of
+            ``positions`` unless given. The last one is everything.
+        levels: possible values of whole-number features, by name. Networks read such a feature
+            one-hot, and others as a number in units of their scales.
+        lasting: items that people remember once seen or communicated, even if they change; other
+            items are known while they are as last seen.
+        record: this world's settings of training, planning and networks, its people and pictures;
+            see :class:`~mirror_ppl.domains.record.Record`.
+        mishap: reward term of a harmful event, and the plural of its name.
     """
 
     name: str
@@ -89,10 +88,10 @@ class World(ABC):
     _derived: frozenset[str]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Work out what follows from the rest.
+        """Set derived attributes.
 
         Raises:
-            DomainError: something that only the author can know is missing.
+            DomainError: a required attribute is missing.
         """
         del args, kwargs
         cls._complete()
@@ -137,7 +136,7 @@ class World(ABC):
 
     @classmethod
     def _given(cls, name: str) -> bool:
-        """Whether an attribute was written, and not worked out, in this class or one above."""
+        """True if an attribute was given, not derived, in this class or a base class."""
         return any(
             name in vars(each) and name not in vars(each).get("_derived", ())
             for each in cls.__mro__
@@ -145,7 +144,7 @@ class World(ABC):
 
     @classmethod
     def _levels(cls) -> Mapping[str, Sequence[range | None]]:
-        """The levels of each feature, by modality; of what is said, the sentences' numbers."""
+        """Return the levels of each feature by modality; for utterances, the sentence indices."""
         return {"ego": [cls.levels.get(name) for name in cls.ego_features]} | {
             m.name: [range(len(m.utterances[0]))]
             if m.utterances
@@ -157,40 +156,40 @@ class World(ABC):
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
     ) -> Any:
-        """States ``[batch]`` at the start of a round, drawn with the generator.
+        """Draw states ``[batch]`` at the start of a round, with the generator.
 
-        With scenarios of its own, a world begins in those that are given ``[batch]``.
+        A world with its own scenarios begins in those that are given ``[batch]``.
         """
 
     @abstractmethod
     def transition(self, state: Any, action: Tensor) -> Any:
-        """State at t + 1 from the state at t and the action at t, both ``[...]``."""
+        """Return the state at t + 1 from the state and action at t, both ``[...]``."""
 
     @abstractmethod
     def rewards(self, state: Any, action: Tensor, following: Any) -> dict[str, Tensor]:
-        """Reward terms ``[...]`` by name, in units of reward."""
+        """Return reward terms ``[...]`` by name, in units of reward."""
 
     @abstractmethod
     def observe(self, state: Any) -> Observation:
-        """All that there is to observe: ``ego`` ``[..., E]``, each modality ``[..., K, F]``."""
+        """Return the full observation: ``ego`` ``[..., E]``, each modality ``[..., K, F]``."""
 
     @abstractmethod
     def state_behind(self, observation: Observation) -> Any:
-        """The state ``[...]`` of which this is everything that can be observed.
+        """Return the state ``[...]`` with this full observation.
 
-        What cannot be observed must not matter: states with the same observation lead to the same
-        observations and rewards.
+        Unobserved parts must not matter: states with equal observations lead to equal observations
+        and rewards.
         """
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
-        """What an unaided person sees ``[..., K]``: everything, and nothing is said to them."""
+        """Return what an unaided person perceives ``[..., K]``: all visual items, no others."""
         require_known(setting, "setting", self.settings, self.name)
         return self._all(observation, lambda m: m.name == VISUAL)
 
     def scenario(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
     ) -> Tensor:
-        """Indices ``[batch]`` into ``scenarios``: those that are given, or drawn uniformly."""
+        """Return indices ``[batch]`` into ``scenarios``: as given, or drawn uniformly."""
         if scenario is not None:
             return scenario
         many, device = len(self.scenarios), generator.device
@@ -198,23 +197,23 @@ class World(ABC):
 
     @property
     def as_believed(self) -> Self:
-        """The world itself: the robot was taught how it is."""
+        """World as the robot was taught it: this world itself."""
         return self
 
     def anywhere(self, batch: int, generator: torch.Generator) -> Any:
-        """States ``[batch]`` from which the robot learns: those in which rounds begin."""
+        """Draw states ``[batch]`` for the robot's training: those in which rounds begin."""
         return self.initial(batch, generator)
 
     def over(self, state: Any) -> Tensor:
-        """Where ``[...]`` all is done: nowhere before the horizon."""
+        """Return where ``[...]`` the task is done: nowhere before the horizon."""
         return torch.zeros_like(self.observe(state)["ego"][..., 0], dtype=torch.bool)
 
     def communicable(self, observation: Observation) -> Visibility:
-        """Which items ``[..., K]`` may be communicated: all."""
+        """Return items ``[..., K]`` that may be communicated: all."""
         return self._all(observation, lambda m: True)
 
     def faults(self, observation: Observation) -> dict[str, Tensor]:
-        """Which observations ``[...]`` cannot be: of features with levels those without one."""
+        """Return impossible observations ``[...]``: those with a feature outside its levels."""
         found = {}
         names = {"ego": self.ego_features} | {m.name: m.features for m in self.modalities}
         for modality, levels in self._levels().items():
@@ -227,7 +226,7 @@ class World(ABC):
         return found
 
     def nothing_known(self, *batch: int, device: torch.device | None = None) -> Any:
-        """Knowledge ``[*batch]`` before anything was observed."""
+        """Return knowledge ``[*batch]`` before anything was observed."""
         return LastSeen.nothing(self.modalities, *batch, device=device)
 
     def learn(
@@ -237,28 +236,28 @@ class World(ABC):
         visible: Visibility,
         sees: Callable[[Observation], Visibility],
     ) -> Any:
-        """Knowledge ``[...]`` after a step: what was last seen of each item."""
+        """Return knowledge ``[...]`` after a step: each item as last seen."""
         del sees
         return knowledge.after(self.modalities, self.lasting, observation, visible)
 
     def known(self, knowledge: Any) -> Visibility:
-        """Items ``[..., K]`` that are as they were last seen, and the lasting ones once seen."""
+        """Return items ``[..., K]`` that are as last seen, and lasting items once seen."""
         return knowledge.items(self.modalities)
 
     def assume(
         self, knowledge: Any, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """What somebody may take for granted: nothing."""
+        """Return what a person may take for granted: nothing."""
         del knowledge
         return {}, observation
 
     def supposed(self, state: Any, knowledge: Any, assumes: Mapping[str, Tensor]) -> Any:
-        """The state as somebody believes it to be: as it is."""
+        """Return the state as a person believes it to be: the true state."""
         del knowledge, assumes
         return state
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
-        """Observations as networks read them, ``[..., K, symbol_sizes]``; see ``levels``."""
+        """Encode observations for networks, ``[..., K, symbol_sizes]``; see ``levels``."""
         scales = {"ego": (1.0,) * len(self.ego_features)}
         scales |= {m.name: m.scales for m in self.modalities}
         return {
@@ -273,7 +272,7 @@ class World(ABC):
         }
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
-        """Direction and distance ``[..., K]`` of visual items: the largest of ``positions``."""
+        """Return directions and distances ``[..., K]`` of visual items, from ``positions``."""
         items = observation[VISUAL]
         visual = next(m for m in self.modalities if m.name == VISUAL)
         if self.positions:
@@ -284,11 +283,11 @@ class World(ABC):
         return torch.zeros_like(far, dtype=torch.long), far
 
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
-        """What there is to observe after an action ``[...]``."""
+        """Return the full observation after an action ``[...]``."""
         return self.observe(self.transition(self.state_behind(observation), action))
 
     def nearest(self, observation: Observation) -> Observation:
-        """The possible observation nearest to a decoded one: features with levels take one."""
+        """Return the possible observation nearest to a decoded one: features rounded to levels."""
 
         def possible(value: Tensor, known: range | None) -> Tensor:
             if known is None:
@@ -304,15 +303,15 @@ class World(ABC):
         }
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
-        """Items ``[..., K]`` that matter now: all, for all that is known here."""
+        """Return relevant items ``[..., K]``: all."""
         return {"anything": self._all(observation, lambda m: True)}
 
     def decisive(self, observation: Observation) -> Visibility:
-        """Items ``[..., K]`` that have to be known to choose well: all."""
+        """Return items ``[..., K]`` that suffice for the choice made with full knowledge: all."""
         return self._all(observation, lambda m: True)
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:
-        """An item of one observation in words, such as "key: row 1 cells, column 3 cells"."""
+        """Describe an item of one observation, such as "key: row 1 cells, column 3 cells"."""
         own = next(m for m in self.modalities if m.name == modality)
         place = own.items.index(item)
         if own.utterances:
@@ -321,16 +320,16 @@ class World(ABC):
         return f"{item}: " + ", ".join(f"{name} {v:g} {unit}".strip() for name, v, unit in values)
 
     def deed(self, observation: Observation, item: str | None, action: int) -> str:
-        """An action in words: its name."""
+        """Describe an action: its name."""
         del observation, item
         return self.actions[action]
 
     def reference_values(self, state: Any, discount: float) -> Tensor:
-        """Exact discounted action values ``[..., A]``; there are none unless a world has them."""
+        """Return exact discounted action values ``[..., A]``, if a world implements them."""
         raise DomainError(f"{self.name} has no exact action values (reference_values)")
 
     def render(self, state: Any) -> np.ndarray:
-        """A picture ``uint8 [height, width, 3]``: items below each other, darker where more."""
+        """Draw ``uint8 [height, width, 3]``: a row per item, darker for larger features."""
         visual = next(m for m in self.modalities if m.name == VISUAL)
         items = self.observe(state)[VISUAL].reshape(len(visual.items), -1)
         share = (items / torch.tensor(visual.scales)).abs().clamp(0, 1)
@@ -338,7 +337,7 @@ class World(ABC):
         return np.kron(grey, np.ones((PIXELS, PIXELS), np.uint8))[..., None].repeat(3, -1)
 
     def _all(self, observation: Observation, which: Callable[[Modality], bool]) -> Visibility:
-        """Masks ``[..., K]``, all alike in each modality."""
+        """Return masks ``[..., K]``, constant in each modality."""
         return {
             m.name: torch.full_like(observation[m.name][..., 0], which(m), dtype=torch.bool)
             for m in self.modalities
@@ -346,7 +345,7 @@ class World(ABC):
 
 
 def _symbol(value: Tensor, levels: range | None, scale: float) -> Tensor:
-    """A feature as networks read it ``[..., L]``: one number for each level, or one in all."""
+    """Encode a feature for networks ``[..., L]``: one-hot levels, or one scaled number."""
     if levels is None:
         return value[..., None] / scale
     known = torch.tensor(list(levels), device=value.device)
@@ -354,5 +353,5 @@ def _symbol(value: Tensor, levels: range | None, scale: float) -> Tensor:
 
 
 def offers(domain: Any, capability: str) -> bool:
-    """Whether a world has a method or attribute of its own, and not the default of `World`."""
+    """True if a world has its own method or attribute, not the default of `World`."""
     return getattr(type(domain), capability, None) != getattr(World, capability, None)

@@ -1,4 +1,4 @@
-"""The Pyro programs: the robot's self-model, and the model of people that is made of it."""
+"""The Pyro programs: the robot's self-model, and the human model built on it."""
 
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import Rounds, SelfModel

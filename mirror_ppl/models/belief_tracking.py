@@ -1,9 +1,8 @@
-"""Beliefs along a round, each of them inferred once.
+"""Tracks beliefs along a round, inferring each distinct belief once.
 
-At each step people perceive; what they perceive is evidence; from it, from their belief before and
-from the action in between they infer a belief (:mod:`mirror_ppl.models.human`). Where these three
-agree, beliefs agree. Simulation, tables of views, chains and the planner all track beliefs by
-:meth:`BeliefState.after`.
+A belief is a function of the belief before, the action in between and the evidence perceived
+(:mod:`mirror_ppl.models.human`). Where these three are equal, beliefs are equal. Simulation, tables
+of views, chains and the planner all track beliefs by :meth:`BeliefState.after`.
 
 n stands for people or histories that are tracked, m for distinct beliefs.
 """
@@ -25,21 +24,21 @@ from mirror_ppl.models.view import View
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, row_numbers
 
 CHUNK = 4096
-"""Beliefs that are inferred at once; bounds memory."""
+"""Number of beliefs that are inferred at once; bounds memory."""
 NOT_SHOWN = -1
-"""Number of all evidence that does not count, because nothing came up."""
+"""Key of evidence that is not used because nothing is new."""
 
 
 @dataclass(frozen=True)
 class Transition:
-    """What leads from one step to the next.
+    """The inputs of one step: implants, action, observation and messages.
 
     Attributes:
         implants: values ``[n]`` of the discrete sites.
-        action: what was done in between ``[n]``; the number of actions at the start of a round.
-        observation: what there is to observe, ``[rows, ...]``.
-        told: what is communicated, ``[n, K]`` by modality, or ``[1, K]`` for all.
-        row: which of the observations each has, ``[n]``; ``None`` if all have the only one.
+        action: the action in between ``[n]``; the number of actions at the start of a round.
+        observation: full observations, ``[rows, ...]``.
+        told: communicated items, ``[n, K]`` by modality, or ``[1, K]`` for all.
+        row: row of the observation of each, ``[n]``; ``None`` if there is only one row.
     """
 
     implants: Mapping[str, Tensor]
@@ -51,13 +50,13 @@ class Transition:
 
 @dataclass(frozen=True)
 class Memory:
-    """How beliefs came about in R rounds so far, as the same can come about time and again.
+    """Cache of the beliefs inferred in R rounds so far, by their causes.
 
     Attributes:
         observed: a number for the observation of each step ``[R, T]``, equal where the encoder
             cannot tell observations apart.
         causes: belief before, action and key of the evidence, ``[k, 3]``.
-        effects: the belief after each of them, ``[k]``.
+        effects: the belief that follows from each, ``[k]``.
     """
 
     observed: Tensor
@@ -66,7 +65,7 @@ class Memory:
 
     @classmethod
     def of_rounds(cls, human: HumanModel, observation: Observation) -> Memory:
-        """Of the beginning of rounds with observations ``[R, T, ...]``."""
+        """Return an empty cache for rounds with observations ``[R, T, ...]``."""
         symbols = human.domain.symbols(observation)
         if overrides(human, "evidence"):
             symbols = observation  # it may read whatever there is
@@ -77,17 +76,17 @@ class Memory:
 
 @dataclass(frozen=True)
 class BeliefState:
-    """What n people believe and know before a step of their rounds.
+    """Beliefs and knowledge of n people before a step of their rounds.
 
     Attributes:
         human: the model of these people.
         mean: distinct beliefs ``[m, Z]``: of this step, or with a memory of all steps so far.
         scale: of their densities ``[m, Z]``; ``None`` before the first step, with a memory, or if
             beliefs have no density.
-        belief: which of them each has, ``[n]``.
+        belief: index of each person's belief, ``[n]``.
         knowledge: the domain's, ``[n]``.
         step: the number of the next step.
-        memory: of how beliefs came about; nothing is remembered unless it is given.
+        memory: cache of inferred beliefs; no cache unless given.
     """
 
     human: HumanModel
@@ -100,7 +99,7 @@ class BeliefState:
 
     @classmethod
     def initial(cls, human: HumanModel, number: int, memory: Memory | None = None) -> BeliefState:
-        """Of n people before the first step, when every belief is zero."""
+        """Return the state of n people before the first step, when every belief is zero."""
         zero = next(human.parameters()).new_zeros(1, human.belief_size)
         own = torch.zeros(number, dtype=torch.long, device=zero.device)
         knowledge = human.domain.nothing_known(number, device=zero.device)
@@ -108,34 +107,34 @@ class BeliefState:
 
     @property
     def believed(self) -> Tensor:
-        """The belief of each person, ``[n, Z]``."""
+        """Belief of each person, ``[n, Z]``."""
         return self.mean[self.belief]
 
     def at(self, rows: Tensor | slice) -> BeliefState:
-        """Of some of these people, or of some more than once."""
+        """Select some of these people, possibly more than once."""
         knowledge = map_state(lambda part: part[rows], self.knowledge)
         return replace(self, belief=self.belief[rows], knowledge=knowledge)
 
     def key(self) -> Tensor:
-        """Whole numbers ``[n, ...]``, equal where belief and knowledge are."""
+        """Return whole numbers ``[n, ...]``, equal where belief and knowledge are equal."""
         known = [getattr(self.knowledge, part.name) for part in fields(self.knowledge)]
         known = [as_whole_numbers(part).flatten(1) for part in known]
         return torch.cat([self.belief[:, None], *known], 1)
 
     def distinct(self) -> tuple[BeliefState, Tensor]:
-        """Each belief with the same knowledge once, and which of these each person has ``[n]``."""
+        """Return distinct beliefs with knowledge, and each person's index among them ``[n]``."""
         first, index = distinct_rows(self.key())
         return self.at(first), index
 
     def after(self, transition: Transition) -> BeliefState:
-        """What the same people believe and know after one step."""
+        """Return the state of the same people after one step."""
         return self.through([transition])[-1]
 
     def through(self, transitions: Sequence[Transition]) -> list[BeliefState]:
-        """What the same people believe and know after each of some steps.
+        """Return the state of the same people after each of several steps.
 
         Raises:
-            HumanModelError: a method that leads to beliefs has sites.
+            HumanModelError: a method that computes beliefs has sample sites.
         """
         with WithoutSites(BELIEVING):
             return self._through(transitions)
@@ -149,7 +148,7 @@ class BeliefState:
             key = torch.where(view.still[..., None], NOT_SHOWN, key)
         key = row_numbers(key)  # [n, T]
         action = torch.stack([one.action for one in transitions], -1)
-        # People with the same belief who then do the same and are shown the same count as one.
+        # People with equal beliefs, actions and evidence are tracked as one.
         one, same = distinct_rows(torch.cat([self.belief[:, None], action, key], -1))
         first, shown = distinct_rows(key[one].view(-1, 1))
         person, step = one[first // steps], first % steps
@@ -174,9 +173,9 @@ class BeliefState:
         return states
 
     def perceive(self, transitions: Sequence[Transition]) -> tuple[View, list[Any]]:
-        """What these people perceive at each of some steps ``[n, T, K]``, and know after each.
+        """Return views of several steps ``[n, T, K]``, and the knowledge after each.
 
-        It does not depend on what they believe.
+        They do not depend on beliefs.
         """
         number, knowledge = len(self.belief), self.knowledge
         views, known = [], []
@@ -191,7 +190,7 @@ class BeliefState:
         return View.stack(views).map(lambda part: part.expand(number, *part.shape[1:])), known
 
     def _observed(self, transitions: Sequence[Transition]) -> tuple[Tensor, Tensor]:
-        """Which of all observations each has at each step ``[n, T]``, and numbers of these."""
+        """Return the row of each observation at each step ``[n, T]``, and keys of these."""
         rows, numbers, begin = [], [], 0
         for step, one in enumerate(transitions, self.step):
             own = torch.zeros_like(self.belief) if one.row is None else one.row
@@ -210,14 +209,14 @@ class BeliefState:
         evidence: Tensor,
         still: Tensor | None,
     ) -> BeliefState:
-        """The state after a step, but for what they know.
+        """Return the state after a step, with knowledge unchanged.
 
         Args:
-            action: what was done in between ``[n]``.
-            key: equal where evidence is, ``[n]``.
-            shown: which of the evidence each is shown ``[n]``.
+            action: the action in between ``[n]``.
+            key: equal where evidence is equal, ``[n]``.
+            shown: row of each person's evidence ``[n]``.
             evidence: ``[e, H]``.
-            still: for whom nothing came up ``[n]``; something always does unless given.
+            still: where nothing is new ``[n]``; nowhere unless given.
         """
         causes = torch.stack([self.belief, action, key], -1)
         mean, effects = self.mean[:0], causes[:0, 0]
@@ -235,13 +234,13 @@ class BeliefState:
         scales = [part.scale for part in found if isinstance(part, Gaussian)]
         scale = torch.cat(scales) if scales and self.memory is None else None
         if still is not None and scale is not None and self.scale is not None:
-            # A belief that stays as it is stays as sure as it was.
+            # A belief that does not change keeps its scale.
             scale = torch.where(still[some, None], self.scale[self.belief[some]], scale)
         begin = len(mean)
         mean = torch.cat([mean, *(part.mean if scales else part for part in found)])
         place = torch.arange(begin, len(mean), device=mean.device)
         if still is not None and len(some):
-            # Beliefs that stay as they are, are the same ones however long ago they were formed.
+            # Beliefs that do not change are merged, however long ago they were formed.
             kept, own = _first_of_equal(mean if scale is None else torch.cat([mean, scale], 1))
             mean, scale, place = mean[kept], None if scale is None else scale[kept], own[begin:]
         effects = torch.cat([effects, torch.zeros_like(action)])
@@ -260,7 +259,7 @@ class BeliefState:
 
 
 def _first_of_equal(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether each row ``[n, Z]`` is the first of those equal to it, and which of these it is."""
+    """Return a mask of the first of equal rows ``[n, Z]``, and each row's index among these."""
     first, which = distinct_rows(as_whole_numbers(values))
     origin = first[which]
     kept = origin == torch.arange(len(values), device=values.device)

@@ -1,10 +1,10 @@
-"""What depends on what in a human program, read from one run of it.
+"""Dependencies between the sites of a human program, found by running it.
 
-Sampled values are followed through the run by Pyro's provenance tensors, as in
-:func:`pyro.infer.inspect.get_dependencies`: a site depends on those of whose values its log density
-is computed. Zero times a value counts as a dependence; a shape, a dtype or a device that is taken
-from a value (``new_full``, ``expand_as``, ``to``) does not. Provenance is lost where a value is
-assigned to part of a tensor or leaves torch. So densities are also compared under different values.
+Pyro's provenance tensors track sampled values through one run, as in
+:func:`pyro.infer.inspect.get_dependencies`: a site depends on the sites whose values enter its log
+density. Zero times a value counts as a dependence; a shape, a dtype or a device that is taken from
+a value (``new_full``, ``expand_as``, ``to``) does not. Provenance is lost where a value is assigned
+to part of a tensor or leaves torch, so densities are also compared under different values.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from mirror_ppl.models.sites import latent_sites, latent_values, sample_nodes
 
 Sites = frozenset[str]
 TRIED = 32
-"""Values of a discrete site, at most, under which densities are compared."""
+"""Maximum number of values of a discrete site under which densities are compared."""
 
 FROM_SHAPE_OF_FIRST = {
     *(getattr(Tensor, f"new_{kind}") for kind in ("empty", "full", "ones", "tensor", "zeros")),
     *(getattr(torch, f"{kind}_like") for kind in ("empty", "full", "ones", "rand", "zeros")),
 }
-"""Functions whose result takes only shape, dtype and device from their first argument,"""
+"""Functions whose result takes only shape, dtype and device from their first argument."""
 FROM_SHAPE_OF_OTHERS = {
     *(getattr(Tensor, f"{kind}_as") for kind in ("expand", "reshape", "type", "view")),
     Tensor.to,
 }
-"""and those whose result takes only these from all others."""
+"""Functions whose result takes only these from all other arguments."""
 
 
 @dataclass(frozen=True)
 class Dependencies:
-    """Of a human program: the sites on whose values something depends directly.
+    """The direct dependencies in a human program.
 
     Attributes:
-        prior: of each site of ``prior``, observed sites and factors among them, other sites of it.
-        round_latents: of each site of ``round_latents``, sites of ``prior`` and others of it.
-        actions: of the action of a step, and of what else ``act`` observes or adds, given beliefs.
+        prior: parents of each site of ``prior``, including its observed sites and factors.
+        round_latents: parents of each site of ``round_latents``, from ``prior`` or itself.
+        actions: parents, given beliefs, of a step's action and of other terms that ``act`` adds.
         latent: the sites of ``prior`` that are sampled.
-        adds_to_actions: whether ``act`` says more than how probable actions are: by a factor, an
-            observed site, a scale or a mask.
-        adds_to_latents: whether ``round_latents`` says more than what it samples.
+        adds_to_actions: whether ``act`` adds terms besides the probabilities of actions: a factor,
+            an observed site, a scale or a mask.
+        adds_to_latents: whether ``round_latents`` adds terms besides its sampled sites.
     """
 
     prior: Mapping[str, Sites]
@@ -70,7 +70,7 @@ _found: WeakKeyDictionary[HumanModel, Dependencies] = WeakKeyDictionary()
 
 
 def dependencies(human: HumanModel) -> Dependencies:
-    """The dependencies of a human model's program; it runs once, for one person and round."""
+    """Return the dependencies of a human model's program; cached for each model."""
     if human not in _found:
         _found[human] = _run(human)
     return _found[human]
@@ -112,14 +112,14 @@ def _run(human: HumanModel) -> Dependencies:
 
 
 def _changed(node: Mapping[str, Any]) -> bool:
-    """Whether a scale or a mask is around a node."""
+    """True if a node has a scale or a mask."""
     plain = isinstance(node["scale"], (int, float)) and node["scale"] == 1
     return node["mask"] is not None or not plain
 
 
 @contextmanager
 def _as_drawn(seed: int, given: Mapping[str, Tensor]) -> Iterator[None]:
-    """The program runs for one person, with other draws for another seed."""
+    """Run the program for one person, with draws that depend on the seed."""
     with (
         torch.random.fork_rng(devices=[]),
         pyro.validation_enabled(False),
@@ -132,10 +132,10 @@ def _as_drawn(seed: int, given: Mapping[str, Tensor]) -> Iterator[None]:
 
 
 def _hidden_parents(human: HumanModel, found: Mapping[str, Sites]) -> dict[str, Sites]:
-    """Parents of sites of ``prior`` that provenance loses, as where parts of a tensor are assigned.
+    """Find parents of sites of ``prior`` that provenance loses, as by assignment to a slice.
 
-    A density that differs between two draws of everything else depends on some of it, and is said
-    to depend on all.
+    A density that differs between two draws of all other sites depends on some of them; all count
+    as its parents.
     """
     nodes = []
     for seed in range(2):
@@ -154,9 +154,9 @@ def _hidden_parents(human: HumanModel, found: Mapping[str, Sites]) -> dict[str, 
 def _hidden_causes(
     human: HumanModel, sites: Mapping[str, Any], latents: Mapping[str, Any]
 ) -> tuple[Sites, Sites]:
-    """Discrete sites of ``prior`` that change ``round_latents`` or ``act``, by their densities.
+    """Find discrete sites of ``prior`` that change densities of ``round_latents`` or ``act``.
 
-    Provenance may have lost them. Each is tried at its values, with all others the same.
+    Provenance may have lost them. Each site is tried at its values, with all others fixed.
     """
     like = next(human.parameters())
     with torch.random.fork_rng(devices=[]):
@@ -188,13 +188,13 @@ def _hidden_causes(
 
 
 def _some(support: Tensor) -> Tensor:
-    """All of a few values, and of many some that are spread evenly."""
+    """Return at most `TRIED` values of a support, evenly spaced."""
     number = min(len(support), TRIED)
     return support[torch.linspace(0, len(support) - 1, number).round().long()]
 
 
 def _densities(trace: poutine.Trace) -> list[Tensor]:
-    """Of all nodes, with what scales and masks them."""
+    """Return the densities of all nodes, with their scales and masks."""
     return [_density(node, node["value"]) for node in sample_nodes(trace).values()]
 
 
@@ -208,7 +208,7 @@ def _equal(one: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
 
 
 def _parents(trace: poutine.Trace) -> dict[str, Sites]:
-    """The sites on which the density of each node depends, but for its own value if sampled."""
+    """Return the sites on which the density of each node depends, without its own sampled value."""
     latent, found = latent_sites(trace), {}
     for name, node in sample_nodes(trace).items():
         value = detach_provenance(node["value"]) if name in latent else node["value"]
@@ -218,7 +218,7 @@ def _parents(trace: poutine.Trace) -> dict[str, Sites]:
 
 
 class _Followed(Messenger):
-    """Values of latent sites carry the name of their site wherever they go."""
+    """Tags values of latent sites with the name of their site."""
 
     def _pyro_post_sample(self, msg: Any) -> None:
         if not (msg["is_observed"] or site_is_subsample(msg)):
@@ -227,7 +227,7 @@ class _Followed(Messenger):
 
 
 class _ValuesAlone(TorchFunctionMode):
-    """What takes only its shape or kind from a value does not depend on it."""
+    """Drops provenance where only the shape, dtype or device of a value is used."""
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None

@@ -1,8 +1,7 @@
-"""Distributions of the models: a Gaussian Markov chain, and choices among few values.
+"""Distributions of the models: a Gaussian Markov chain and a normalized categorical.
 
-Latent trajectories are one sample site, ``z`` ``[T + 1, Z]``. Drawing from the chain walks through
-time; its log density, given the whole trajectory, needs no walk and is computed for all steps at
-once, which is what makes the evidence lower bound cheap.
+A latent trajectory is one sample site, ``z`` ``[T + 1, Z]``. Sampling is sequential; the log
+density of a trajectory is computed for all steps at once, so the evidence lower bound is cheap.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ Step = Callable[[Tensor, Tensor], Gaussian]
 
 
 class NormalizedCategorical(Categorical):
-    """A categorical distribution of log-probabilities that are normalized already.
+    """A categorical distribution with log-probabilities that are already normalized.
 
     Args:
         log_probabilities: of each value, ``[..., n]``.
@@ -30,11 +29,11 @@ class NormalizedCategorical(Categorical):
         self.logits = log_probabilities  # pyright: ignore[reportAttributeAccessIssue] - lazy
         self._param = log_probabilities
         self._num_events = log_probabilities.shape[-1]
-        # That of Categorical would normalize them once more.
+        # Categorical.__init__ would normalize them again.
         Distribution.__init__(self, log_probabilities.shape[:-1], validate_args=False)
 
     def expand(self, batch_shape: torch.Size, _instance: object = None) -> NormalizedCategorical:
-        """The same choice in every place of a batch."""
+        """Expand to a batch shape; see :meth:`torch.distributions.Distribution.expand`."""
         del _instance
         return NormalizedCategorical(self.logits.expand(*batch_shape, -1))
 
@@ -70,7 +69,7 @@ class GaussianChain(TorchDistribution):
         super().__init__(batch, event, validate_args=False)
 
     def expand(self, batch_shape: torch.Size, _instance: object = None) -> GaussianChain:
-        """Itself: there is one trajectory for each of its inputs."""
+        """Return itself; only its own batch shape is allowed."""
         if torch.Size(batch_shape) != self.batch_shape:
             raise ValueError("a GaussianChain has one trajectory for each of its inputs")
         return self

@@ -1,4 +1,4 @@
-"""Effect handlers of the human program: names of steps, and padding."""
+"""Effect handlers of the human program: step numbers in site names, and masks for padding."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from torch import Tensor
 from mirror_ppl.errors import HumanModelError
 
 BELIEVING = "sees, perceive, evidence or believe"
-"""Methods that lead to beliefs."""
+"""The methods that compute beliefs, for messages."""
 
 
 class AtStep(Messenger):
-    """Sites get the number of the step appended: ``action`` becomes ``action_3``."""
+    """Appends the number of the step to site names: ``action`` becomes ``action_3``."""
 
     def __init__(self, step: int) -> None:
         super().__init__()
         self.step = step
 
     def _pyro_sample(self, msg: Any) -> None:
-        # Once: `pyro.do` sends a copy of what it replaces through all handlers again.
+        # Only once, because `pyro.do` sends a copy of a replaced site through all handlers again.
         if not msg["infer"].get("has_step"):
             msg["infer"] = {**msg["infer"], "has_step": True}
             msg["name"] = f"{msg['name']}_{self.step}"
 
 
 class WithoutSites(Messenger):
-    """Refuses sites where a human model has none, as engines would leave them out.
+    """Refuses sample sites in methods where engines would leave them out.
 
     Args:
-        methods: that run, for the message.
+        methods: the methods that run, for the message.
     """
 
     def __init__(self, methods: str) -> None:
@@ -49,13 +49,13 @@ class WithoutSites(Messenger):
 
 
 class MaskObserved(Messenger):
-    """Observed sites and factors do not count where a mask is false.
+    """Masks out observed sites and factors where a mask is false.
 
-    Sampled ones do, without scales and masks of their own: summed or integrated out, each of them
-    comes to 1.
+    Sampled sites count there without their own scales and masks: summed or integrated out, each
+    contributes a factor of 1.
 
     Args:
-        mask: which of them count, boolean ``[P, B]``.
+        mask: where observed sites count, boolean ``[P, B]``.
     """
 
     def __init__(self, mask: Tensor) -> None:

@@ -5,8 +5,8 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
     psi_p      ~ prior                                     inside pyro.plate("person", P)
     m_b        ~ what differs from round to round          inside pyro.plate("round", B); or nothing
     n_t        = natural visibility of each item           perceptual implants and m_b
-    k_t        = what follows from everything seen and told up to t
-    v_t        = n_t or told_t or k_t                      what was communicated is overlaid
+    k_t        = items that follow from everything seen and communicated up to t
+    v_t        = n_t or told_t or k_t                      told_t are the communicated items
     u_t        = what psi_p takes for granted about the rest
     zH_t       = mean of q(. | zH_{t-1}, v_t * x_t + u_t, v_t, a_{t-1})   social projection
     a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
@@ -16,9 +16,9 @@ To change the model, derive from :class:`HumanModel` and override one of ``prior
 ``round_latents``, ``sees``, ``perceive``, ``evidence``, ``believe`` and ``act``, in Pyro's syntax.
 The last five are about one step of a round; fitting, predicting, simulating and planning call them.
 
-Departures from the supplement: thresholds are inferred by the bin between distances that can occur;
-a person may take things for granted (``assumes_clear``, ``assumes_closing``); actions may be
-lapses. Reasons and measurements stand in ``docs/decisions.md``.
+Departures from the supplement: thresholds are inferred up to bins between possible distances; a
+person may take things for granted (``assumes_clear``, ``assumes_closing``); actions may be lapses.
+Reasons and measurements are in ``docs/decisions.md``.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ Implants = Mapping[str, Tensor]
 ACTION = "action"
 """Site of the action of a step."""
 ABOUT_SPANS = ("round_latents", "sees", "perceive")
-"""Methods that decide at which steps latents of rounds are read."""
+"""Methods that determine at which steps round latents are read."""
 
 
 class HumanModel(nn.Module):
     """The probabilistic model of people.
 
     Args:
-        self_model: the robot's networks; they are frozen here. Anything else is an `InputError`.
+        self_model: the robot's networks, which are frozen. Anything else is an `InputError`.
 
     Batch dimensions of implants are ``[..., P, 1]``: people at -2, and -1 left for their rounds or
     views. Weights and the like follow as event dimensions.
@@ -66,19 +66,19 @@ class HumanModel(nn.Module):
     Attributes:
         value_names: names of the values 0, 1 and so on of discrete sites whose values have no
             order. Summaries have the most probable value of these, and quantiles of all others.
-        stratified_by: a discrete site of :meth:`prior`, which perception does not read and on which
-            no other site depends, if people of its values behave so differently that each value
-            needs policies of its own where combinations are given up and moments merged.
+        stratified_by: a discrete site of :meth:`prior`, not read by perception and without
+            dependents, or None. Set it if behaviour differs so much between its values that
+            inference should keep combinations and moments apart for each value.
     """
 
     value_names: Mapping[str, Sequence[str]] = MappingProxyType({})
     stratified_by: str | None = None
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Make sure that a class that changes what spans are about declares them.
+        """Check that a class that changes methods on which spans depend declares its spans.
 
         Raises:
-            HumanModelError: they are not, or it overrides what is not to be overridden.
+            HumanModelError: it does not, or it overrides a method that is final.
         """
         super().__init_subclass__(**options)
         for name in {"infer", "belief_after"} & vars(cls).keys():
@@ -101,16 +101,16 @@ class HumanModel(nn.Module):
 
     @property
     def domain(self) -> Domain:
-        """The domain that people act in."""
+        """Domain in which people act."""
         return self.self_model.domain
 
     @property
     def belief_size(self) -> int:
-        """Z, the size of beliefs; larger ones begin with the robot's own."""
+        """Size Z of beliefs; larger beliefs begin with the robot's own."""
         return self.self_model.latent
 
     def action_values(self, belief: Tensor) -> Tensor:
-        """Action values ``[..., A]`` at beliefs ``[..., Z]``, which :meth:`act` gets to read."""
+        """Return action values ``[..., A]`` at beliefs ``[..., Z]``, an argument of :meth:`act`."""
         return self.self_model.action_values(belief)
 
     def prior(self) -> dict[str, Tensor]:
@@ -125,39 +125,39 @@ class HumanModel(nn.Module):
         ) | implant_priors.policy_implants(self.domain, self.self_model.latent, like)
 
     def round_latents(self, implants: Implants) -> dict[str, Tensor]:
-        """Sample what differs from round to round in what somebody sees: their attention ``m_b``.
+        """Sample the latents of a round that affect what a person sees: their attention ``m_b``.
 
         Runs inside ``pyro.plate("person", P, dim=-2)`` and ``pyro.plate("round", B, dim=-1)``. Its
         sites are discrete with finite support, and :meth:`perceive` reads them like those of
-        :meth:`prior`; nothing differs unless this is overridden.
+        :meth:`prior`. There are none unless this is overridden.
 
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``, with the :meth:`covariates`
-                of the rounds, ``[..., P, B]``, where they are known.
+                of the rounds, ``[..., P, B]``, where rounds are given.
         """
         del implants
         return {}
 
     def covariates(self, observation: Observation) -> dict[str, Tensor]:
-        """What of a round decides, besides themselves, what somebody attends to, ``[...]``.
+        """Return covariates ``[...]`` of a round on which a person's attention depends.
 
-        :meth:`round_latents` reads it by these names, which are no sites. Nothing does unless this
-        is overridden.
+        :meth:`round_latents` reads them by these names, which are not sites. There are none unless
+        this is overridden.
 
         Args:
-            observation: everything there was to observe, ``[..., T, K, F]``, as far as the round
-                went; T is 0 of padding.
+            observation: full observations, ``[..., T, K, F]``, of the steps played; T is 0 for
+                padding.
         """
         del observation
         return {}
 
     def spans(self, observation: Observation) -> dict[str, Span]:
-        """At which steps of a round each site of :meth:`round_latents` is read, in this order.
+        """Return the steps of a round at which each site of :meth:`round_latents` is read.
 
-        Where this is known, they are summed out exactly (:mod:`mirror_ppl.likelihood.chain`). Sites
-        are read throughout the round, or at a span of it that ends before the next one begins;
-        those read throughout come first. Their distributions do not depend on each other's values.
-        Unless this is overridden, values are drawn that stand for all there could be
+        With spans, the sites are summed out exactly (:mod:`mirror_ppl.likelihood.chain`). A site is
+        read throughout the round, or in a span that ends before the next one begins; those read
+        throughout come first. Their distributions must not depend on each other's values. Without
+        spans, the default, weighted samples of their values are used
         (:mod:`mirror_ppl.likelihood.attention`).
 
         A class that derives from one with spans and overrides ``round_latents``, ``sees`` or
@@ -165,32 +165,32 @@ class HumanModel(nn.Module):
         ``spans = HumanModel.spans`` if there are none.
 
         Args:
-            observation: of one round, as far as it went, ``[t, K, F]``; t is 0 of padding.
+            observation: of the steps played in one round, ``[t, K, F]``; t is 0 for padding.
         """
         del observation
         return {}
 
     @property
     def chained(self) -> bool:
-        """Whether attention is summed out exactly: the model has it, and declares :meth:`spans`."""
+        """True if the model has attention and declares :meth:`spans`: it is summed out exactly."""
         return self.has_round_latents and overrides(self, "spans")
 
     def log_proposal(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
-        """How well values of attention explain what was done, as logarithms ``[n]`` by site.
+        """Return log weights ``[n]`` by site of values of attention, given the actions so far.
 
-        Attention is proposed by that; whatever it says, what is inferred is right in the limit.
-        Nothing is known unless this is overridden.
+        The proposal distribution of attention uses them; inference converges whatever they are.
+        There are none unless this is overridden.
 
         Args:
             observation: of one round, ``[t, K, F]``.
-            actions: what was done so far, ``[t]``.
+            actions: actions so far, ``[t]``.
         """
         del observation, actions
         return {}
 
     @cached_property
     def has_round_latents(self) -> bool:
-        """Whether something differs from round to round."""
+        """True if the model has round latents."""
         if not overrides(self, "round_latents"):
             return False
         with (
@@ -202,7 +202,7 @@ class HumanModel(nn.Module):
             return bool(self.round_latents(self.prior()))
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """What a person sees by themselves at one step, masks ``[..., K]``: ``n_t``.
+        """Return masks ``[..., K]`` of the items a person sees without messages at a step: ``n_t``.
 
         Args:
             implants: the discrete sites of :meth:`prior` and :meth:`round_latents`, ``[...]``.
@@ -224,7 +224,7 @@ class HumanModel(nn.Module):
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """What a person sees, is told, remembers and takes for granted at one step.
+        """Return what a person sees, hears, remembers and takes for granted at one step.
 
         Args:
             implants: the discrete sites of :meth:`prior` and :meth:`round_latents`, ``[...]``.
@@ -240,7 +240,7 @@ class HumanModel(nn.Module):
         return perceived_by(sees, self.domain, implants, knowledge, observation, told)
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
-        """What a view ``[..., K]`` of an observation tells the encoder, ``[..., H]``."""
+        """Return the encoder's evidence ``[..., H]`` in a view ``[..., K]`` of an observation."""
         encoder, domain = self.self_model.encoder, self.domain
         embedded = encoder.embed(domain.symbols(observation))
         if not view.taken:
@@ -251,16 +251,16 @@ class HumanModel(nn.Module):
     def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
     ) -> Gaussian | Tensor:
-        """The belief after one step: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.
+        """Return the belief after one step: ``q(zH_t | zH_{t-1}, v_t * x_t, v_t, a_{t-1})``.
 
-        The mean of what is returned is the belief; a model whose beliefs have no density returns
-        the belief itself, ``[..., Z]`` with Z the model's :attr:`belief_size`.
+        The mean of the Gaussian is the belief; a model whose beliefs have no density returns the
+        belief itself, ``[..., Z]`` with Z the model's :attr:`belief_size`.
 
         Args:
             belief: of the step before ``[..., Z]``; zero before the first.
             evidence: of this step ``[..., H]``, from :meth:`evidence`.
-            action: what was done in between ``[...]``; the number of actions if nothing was.
-            still: where nothing came up and the mean stays ``[...]``, see :class:`View`; evidence
+            action: the action in between ``[...]``; the number of actions before the first.
+            still: where nothing is new and the mean stays ``[...]``, see :class:`View`; evidence
                 is 0 there.
         """
         encoder = self.self_model.encoder
@@ -272,23 +272,23 @@ class HumanModel(nn.Module):
     def belief_after(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
     ) -> Tensor:
-        """The belief ``[..., Z]`` itself; arguments as of :meth:`believe`."""
+        """Return the belief ``[..., Z]`` itself; arguments as for :meth:`believe`."""
         found = self.infer(belief, evidence, action, still)
         return found.mean if isinstance(found, Gaussian) else found
 
     def infer(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
     ) -> Gaussian | Tensor:
-        """What :meth:`believe` returns; it is not shown evidence where nothing came up."""
+        """Call :meth:`believe`, with evidence set to 0 where nothing is new."""
         if still is not None:
             evidence = torch.where(still[..., None], 0.0, evidence)
         return self.believe(belief, evidence, action, still)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of actions at one step, ``[..., P, B, A]``.
+        """Return log-probabilities of actions at one step, ``[..., P, B, A]``.
 
-        Runs inside the person plate and a plate of rounds; where several rounds come to the same
-        belief, B counts distinct ones.
+        Runs inside the person plate and a plate of rounds; where several rounds lead to the same
+        belief, B counts distinct beliefs.
 
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
@@ -304,23 +304,23 @@ class HumanModel(nn.Module):
     def choose(
         self, implants: Implants, belief: Tensor, values: Tensor, action: Tensor | None = None
     ) -> Tensor:
-        """Sample the action ``[..., P, B]`` of one step, or observe the recorded one."""
+        """Sample the action ``[..., P, B]`` of one step, or observe the recorded action."""
         chances = self.act(implants, belief, values)
         return pyro.sample(ACTION, NormalizedCategorical(chances), obs=action)
 
     def model(self, rounds: Demonstrations, world: bool = False) -> None:
-        """The program: what P people see, believe and do in their rounds, step after step.
+        """Run the program: what P people see, believe and do in their rounds, step by step.
 
-        Every engine computes what this says; :mod:`mirror_ppl.likelihood` does it at once for all
-        that a person may have seen. Sites of steps are ``message_<modality>_<t>``, ``belief_<t>``
-        and ``action_<t>``, besides what :meth:`act` adds, and with ``world`` ``state_<t>``,
-        ``observation_<modality>_<t>`` and ``reward_<t>``. Padding does not count.
+        It defines the density that every engine computes; :mod:`mirror_ppl.likelihood` vectorizes
+        it over all that a person may have seen. Sites of steps are ``message_<modality>_<t>``,
+        ``belief_<t>`` and ``action_<t>``, besides what :meth:`act` adds, and with ``world``
+        ``state_<t>``, ``observation_<modality>_<t>`` and ``reward_<t>``. Padding is masked out.
 
         Args:
-            rounds: recorded, to condition on; under ``pyro.poutine.uncondition`` only how they
-                begin and what is communicated counts, and how long they are.
-            world: whether what the self-model says of the world is part of it. Given recordings it
-                does not depend on implants; without, it takes the place of a simulator.
+            rounds: recordings to condition on; under ``pyro.poutine.uncondition`` only their first
+                observations, messages and lengths are used.
+            world: whether to include the self-model's states, observations and rewards. Given
+                recordings they do not depend on implants; unconditioned they replace a simulator.
         """
         device, (people, number, steps) = rounds.actions.device, rounds.shape
         observation, actions = rounds.observation(), rounds.actions.clamp(min=0)
@@ -358,24 +358,24 @@ class HumanModel(nn.Module):
 
 
 def has_own_program(human: HumanModel) -> bool:
-    """Whether a human model overrides the program itself, and not only what it calls."""
+    """True if a human model overrides the program itself, and not only methods it calls."""
     return overrides(human, "model") or overrides(human, "choose")
 
 
 def overrides(human: HumanModel, method: str) -> bool:
-    """Whether the class of a human model, or it alone, has a method of its own."""
+    """True if a human model, or its class, overrides a method."""
     return method in vars(human) or getattr(type(human), method) is not getattr(HumanModel, method)
 
 
 def require_standard_program(human: HumanModel, what: str) -> None:
-    """Refuse human models whose program is their own, for what is made of the methods it calls.
+    """Refuse human models that override the program itself.
 
     Args:
         human: the model of people.
-        what: they cannot do, such as "be compiled".
+        what: what such a model cannot do, such as "be compiled", for the message.
 
     Raises:
-        HumanModelError: this is one.
+        HumanModelError: the model overrides it.
     """
     if has_own_program(human):
         raise HumanModelError(
@@ -386,7 +386,7 @@ def require_standard_program(human: HumanModel, what: str) -> None:
 
 
 def recorded_covariates(human: HumanModel, rounds: Demonstrations) -> dict[str, Tensor]:
-    """The covariates ``[P, B]`` of recorded rounds, of each as far as it went."""
+    """Return the covariates ``[P, B]`` of the steps played in recorded rounds."""
     if not overrides(human, "covariates"):
         return {}
     observation = rounds.observation()
@@ -406,7 +406,7 @@ def recorded_covariates(human: HumanModel, rounds: Demonstrations) -> dict[str, 
 
 
 def at_step(rounds: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
-    """Observations ``[..., T, K, F]``, with ``"ego"`` ``[..., T, E]``, at one step."""
+    """Select one step of observations ``[..., T, K, F]``, with ``"ego"`` ``[..., T, E]``."""
     return {
         name: value[..., step, :] if name == "ego" else value[..., step, :, :]
         for name, value in rounds.items()
@@ -414,5 +414,5 @@ def at_step(rounds: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
 
 
 def messages_at(told: Mapping[str, Tensor], step: int) -> Visibility:
-    """Masks ``[..., T, K]`` at one step."""
+    """Select one step of masks ``[..., T, K]``."""
     return {name: mask[..., step, :] for name, mask in told.items()}

@@ -1,7 +1,7 @@
-"""Implants: what distinguishes a person from the robot, as priors (supplement, section C).
+"""Priors of implants, what distinguishes a person from the robot (supplement, section C).
 
-Perceptual implants say what a person sees, and what they make of the rest; policy implants say how
-they decide. Each is a sample site of the human model, with one value a person.
+Perceptual implants are what a person sees and assumes about the rest; policy implants are how they
+decide. Each is a sample site of the human model, with one value per person.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from mirror_ppl.domains.base import Domain
 SIGHT = "sight_"
 """Prefix of the sites of directional sight thresholds, one for each direction of the domain."""
 ASSUMES = "assumes_"
-"""Prefix of the sites of what a person takes for granted, one for each assumption of the domain."""
+"""Prefix of the sites of assumptions a person makes, one for each assumption of the domain."""
 NOTICES, NOTICED = "notices_", "noticed_"
-"""Prefixes of the sites of how probably each item is noticed at a step, and of when it was."""
+"""Prefixes of the sites of each item's probability of being noticed at a step, and of the step."""
 LEAST_PROBABILITY = 1e-6
-"""So near to 0 or 1 probabilities count as this far away, so that logarithms are finite."""
+"""Probabilities are clamped to at least this distance from 0 and 1, so logarithms are finite."""
 CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 3.0, 0.5
-"""Of the prior of inverse temperatures per unit of reward, and the spread of their logarithms."""
+"""Prior median of the inverse temperature per unit of reward; prior SD of its logarithm."""
 RESIDUAL_HIDDEN = 8
 
 
@@ -35,37 +35,37 @@ def sight_sites(domain: Domain) -> tuple[str, ...]:
 
 
 def assumption_sites(domain: Domain) -> tuple[str, ...]:
-    """Names of the sites of what is taken for granted, in the order of the domain."""
+    """Names of the sites of assumptions, in the order of the domain."""
     return tuple(ASSUMES + assumption for assumption in domain.assumptions)
 
 
 def perceptual_implants(
     domain: Domain, like: Tensor, assumption_probability: float = 0.5
 ) -> dict[str, Tensor]:
-    """Sample what a person sees, as indices that can be enumerated.
+    """Sample what a person sees and assumes, as indices that can be enumerated.
 
-    ``sight_<direction>`` is an index into the domain's ``reach_bins``, uniform: a threshold matters
-    only where it crosses a distance that can occur, so those crossings are all there is to infer.
+    ``sight_<direction>`` is an index into the domain's ``reach_bins``, uniform. The data identify a
+    threshold only up to the distances that can occur, so these bins lose nothing.
     """
     implants = {site: reach_implant(site, domain, like) for site in sight_sites(domain)}
     return implants | assumption_implants(domain, like, assumption_probability)
 
 
 def reach_implant(site: str, domain: Domain, like: Tensor) -> Tensor:
-    """Sample how far somebody sees, as an index into the domain's ``reach_bins``; uniform."""
+    """Sample how far a person sees, as an index into the domain's ``reach_bins``; uniform."""
     bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
     return pyro.sample(site, dist.Categorical(bins / bins.sum()))
 
 
 def noticed_sites(domain: Domain) -> tuple[str, ...]:
-    """Names of the sites of when items are noticed, in the order of the visual items."""
+    """Names of the sites of the step at which items are noticed, in the order of visual items."""
     return tuple(NOTICED + item for item in _visual_items(domain))
 
 
 def notice_implants(
     domain: Domain, like: Tensor, success: Tensor | float = 1.0, failure: Tensor | float = 1.0
 ) -> dict[str, Tensor]:
-    """Sample how probably somebody notices each item at a step: ``notices_<item>``.
+    """Sample a person's probability of noticing each item at a step: ``notices_<item>``.
 
     The prior is a Beta density, uniform unless its parameters are given.
     """
@@ -77,9 +77,9 @@ def notice_implants(
 
 
 def notice_times(domain: Domain, implants: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Sample at which step of a round each item is noticed: ``noticed_<item>``, from 0.
+    """Sample the step of a round at which each item is noticed: ``noticed_<item>``, from 0.
 
-    Geometric, cut off at the domain's horizon, which stands for never.
+    Geometric, truncated at the domain's horizon, which stands for never.
     """
     return {
         NOTICED + item: pyro.sample(
@@ -90,11 +90,11 @@ def notice_times(domain: Domain, implants: Mapping[str, Tensor]) -> dict[str, Te
 
 
 def first_success(probability: Tensor, trials: int) -> dist.Categorical:
-    """Failures before the first success: geometric, cut off at a number that stands for none.
+    """Return the distribution of failures before the first success, a truncated geometric.
 
     Args:
-        probability: of success of a trial, ``[...]``.
-        trials: number of trials; the support is from 0 to this number.
+        probability: of success in a trial, ``[...]``.
+        trials: number of trials; the support is 0 to this number, which stands for no success.
     """
     probability = probability.clamp(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)[..., None]
     failures = torch.arange(trials + 1, device=probability.device)
@@ -111,8 +111,8 @@ def assumption_implants(
 ) -> dict[str, Tensor]:
     """Sample what a person takes for granted: ``assumes_<assumption>``, 1 if they do.
 
-    0 stands for one to whom it is open, as it is to the robot. The prior probability of 1 can be
-    given.
+    0 stands for a person who, like the robot, does not assume it. ``probability`` is the prior
+    probability of 1.
     """
     open_or_taken = torch.tensor(
         [1 - probability, probability], dtype=like.dtype, device=like.device
@@ -126,16 +126,16 @@ def assumption_implants(
 def policy_implants(
     domain: Domain, latent: int, like: Tensor, lapse: float = 1 / 31
 ) -> dict[str, Tensor]:
-    """Sample how a person decides: their choices and what distinguishes their policy."""
+    """Sample how a person decides: choice parameters and the residual of the policy."""
     return choice_implants(like, lapse) | residual_implants(domain, latent, like)
 
 
 def choice_implants(like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
-    """Sample how strictly a person chooses.
+    """Sample the parameters of a person's choices.
 
     - ``consistency``: inverse temperature of the choice between action values, per unit of reward;
-    - ``lapse``: probability that an action has nothing to do with the belief; its prior mean can
-      be given.
+    - ``lapse``: probability that an action is independent of the belief; the argument ``lapse``
+      is its prior mean.
     """
 
     def number(value: float) -> Tensor:
@@ -151,7 +151,7 @@ def choice_implants(like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
 
 
 def residual_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tensor]:
-    """Sample what distinguishes a person's policy from the robot's.
+    """Sample the residual by which a person's policy differs from the robot's.
 
     ``residual_in`` ``[..., Z + 1, R]`` and ``residual_out`` ``[..., R + 1, A]`` are weights (the
     last row is the bias) of the network of the residual ``delta(zH_t)``. The prior keeps its output
@@ -173,16 +173,16 @@ def residual_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Te
 
 
 def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
-    """Sight thresholds ``[..., D]`` in the domain's unit of distance."""
+    """Return sight thresholds ``[..., D]`` in the domain's unit of distance."""
     sites = [implants[site] for site in sight_sites(domain)]
     bins = torch.tensor(domain.reach_bins, device=sites[0].device)
-    # Stacked in front, which copies whole blocks; a hundred thousand combinations are looked up.
+    # Stacking in front copies whole blocks; a hundred thousand combinations are looked up.
     found = [bins.index_select(0, site.flatten()).view(site.shape) for site in sites]
     return torch.stack(torch.broadcast_tensors(*found)).movedim(0, -1)
 
 
 def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Draws ``[S, P, 1, ...]`` as ``[S, P, ...]``, indices of sight bins replaced by distances."""
+    """Squeeze draws ``[S, P, 1, ...]`` to ``[S, P, ...]``; sight bins become distances."""
     bins = torch.tensor(domain.reach_bins)
     return {
         name: (bins[value] if is_reach(name, value) else value).squeeze(2)
@@ -191,12 +191,12 @@ def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def is_reach(name: str, value: Tensor) -> bool:
-    """Whether draws of a site are indices into the domain's ``reach_bins``."""
+    """True if draws of a site are indices into the domain's ``reach_bins``."""
     return name.startswith(SIGHT) and not value.is_floating_point()
 
 
 def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
-    """``delta(zH_t)`` ``[..., P, B, A]`` of beliefs ``[..., P, B, Z]``: one hidden layer; or 0."""
+    """Return ``delta(zH_t)`` ``[..., P, B, A]`` of beliefs ``[..., P, B, Z]``; 0 if not sampled."""
     if "residual_in" not in implants:
         return belief.new_zeros(())
     hidden = torch.tanh(_layer(implants["residual_in"], belief))
@@ -204,13 +204,13 @@ def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
 
 
 def residual_features(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
-    """What the rows of ``residual_out`` weigh in the residual, ``[..., P, B, R + 1]``."""
+    """Return the features that ``residual_out`` weighs, ``[..., P, B, R + 1]``."""
     hidden = torch.tanh(_layer(implants["residual_in"], belief))
     return torch.nn.functional.pad(hidden, [0, 1], value=1.0)
 
 
 def _layer(weights: Tensor, inputs: Tensor) -> Tensor:
-    """Per-person linear layer: weights ``[..., P, 1, I + 1, O]`` on inputs ``[..., P, B, I]``."""
+    """Apply per-person linear weights ``[..., P, 1, I + 1, O]`` to inputs ``[..., P, B, I]``."""
     if weights.dim() > 2 and weights.shape[-3] == 1:
         # The rounds of a person share the weights: one product for all of them.
         weights = weights.squeeze(-3)
@@ -221,7 +221,7 @@ def _layer(weights: Tensor, inputs: Tensor) -> Tensor:
 
 
 def _of_all_draws(weights: Tensor, inputs: Tensor) -> Tensor:
-    """S draws of weights ``[S, ..., I + 1, O]`` on the same inputs ``[..., B, I]``: one product."""
+    """Apply S draws of weights ``[S, ..., I + 1, O]`` to shared inputs ``[..., B, I]`` at once."""
     draws, outputs = weights.shape[0], weights.shape[-1]
     joined = weights.movedim(0, -2).flatten(-2)  # [..., I + 1, S O]
     product = inputs @ joined[..., :-1, :] + joined[..., -1:, :]

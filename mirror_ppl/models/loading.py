@@ -1,4 +1,4 @@
-"""Human models from files of other people, and what such a class has to offer."""
+"""Loads human models by name or from users' files."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.user_code import class_in_file, describe
 
 MIRROR = "mirror"
-"""The package's own model; which it is depends on the domain."""
+"""Name of the package's own model, which depends on the domain."""
 
 
 def model_name(class_name: str) -> str:
-    """What commands call a human model of that class; of somebody's own the name of the class."""
+    """Return the name that commands use for a class; for a user's class its own name."""
     for variants in (VARIANTS, *map(human_models_of, known_domains())):
         for name, kind in variants.items():
             if kind.__name__ == class_name:
@@ -30,12 +30,12 @@ def model_name(class_name: str) -> str:
 
 
 def human_models_of(domain: Domain) -> Mapping[str, type[HumanModel]]:
-    """The package's human models by name, with those of a world's own in place of some."""
+    """Return the package's human models by name, some replaced by those of the domain."""
     return {**VARIANTS, **domain.record.part("human_models")}
 
 
 def file_of(specification: str | None) -> Path | None:
-    """Of ``path/to/file.py:Class`` the file; the package's own models have none."""
+    """Return the file in ``path/to/file.py:Class``; None for the package's own models."""
     if specification is None or specification in VARIANTS:
         return None
     return Path(specification.rpartition(":")[0])

@@ -1,4 +1,4 @@
-"""What was measured of people beside their rounds, such as answers: observed sites of the prior."""
+"""Measurements of people besides their rounds, such as answers, as observed sites of the prior."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mirror_ppl.models.prior import Draws, sample_sites
 
 
 def require_measurable(human: HumanModel, rounds: Demonstrations) -> None:
-    """Refuse measurements that are no values of sites of the prior.
+    """Check that measurements are values of scalar sites of the prior.
 
     Raises:
-        InputError: these are not.
+        InputError: they are not.
     """
     with torch.random.fork_rng(devices=[]):
         sites = sample_sites(human, 1)
@@ -32,13 +32,13 @@ def require_measurable(human: HumanModel, rounds: Demonstrations) -> None:
             )
         possible = sites[name]["fn"].support.check(values[~values.isnan()])
         if not bool(possible.all()):
-            raise InputError(f'"{name}" was measured as what its site cannot be')
+            raise InputError(f'"{name}" has measurements outside the support of its site')
 
 
 def with_measurements(human: HumanModel, rounds: Demonstrations) -> HumanModel:
-    """The human model of these P people, whose measured sites are observed.
+    """Return the human model of these P people, conditioned on their measured sites.
 
-    Of all of them the same sites are known, see :func:`alike_measured`.
+    The same sites have to be measured for all of them, see :func:`alike_measured`.
     """
     known = _known(rounds)
     if not known:
@@ -50,12 +50,12 @@ def with_measurements(human: HumanModel, rounds: Demonstrations) -> HumanModel:
 
 
 def measured_draws(rounds: Demonstrations, number: int) -> Draws:
-    """Measured sites as draws ``[S, P, 1]``, so that there are draws of every site."""
+    """Return measured sites as draws ``[S, P, 1]``, so that there are draws of every site."""
     return {name: value.expand(number, *value.shape) for name, value in _known(rounds).items()}
 
 
 def alike_measured(rounds: Demonstrations) -> list[range]:
-    """People one after another of whom the same is known."""
+    """Return ranges of consecutive people with the same sites measured."""
     people = range(rounds.num_people)
     if not rounds.measurements:
         return [people]
@@ -68,7 +68,7 @@ def alike_measured(rounds: Demonstrations) -> list[range]:
 
 
 def _known(rounds: Demonstrations) -> dict[str, Tensor]:
-    """Values ``[P, 1]`` of the sites that were measured."""
+    """Return values ``[P, 1]`` of the sites that were measured."""
     return {
         name: value[:, None]
         for name, value in rounds.measurements.items()

@@ -1,6 +1,6 @@
-"""The small networks of the self-model, each named by the density that it parameterizes.
+"""The networks of the self-model, each named by the density that it parameterizes.
 
-Sizes are those of `mirror_ppl.models.sizes`; shape letters those of ``mirror_ppl.domains.base``.
+Sizes are in `mirror_ppl.models.sizes`; shape letters are those of ``mirror_ppl.domains.base``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mirror_ppl.models.sizes import Sizes
 
 MIN_SCALE = 0.01
 PIXEL_SCALE = 0.1
-"""Least scale of a pixel: of hundreds that are always the same none may count for much."""
+"""Least scale of a pixel, so that the many constant pixels do not dominate the density."""
 
 
 class Gaussian(NamedTuple):
@@ -39,16 +39,16 @@ class Gaussian(NamedTuple):
 
 
 def log_softmax_of_few(logits: Tensor) -> Tensor:
-    """``logits - log sum exp logits`` ``[..., A]`` of few actions, much quicker than by ``torch``.
+    """Return the log-softmax of logits ``[..., A]`` of few actions, faster than ``torch``.
 
-    That goes through rows one by one; here all rows go side by side.
+    ``torch`` processes rows one by one; here rows are processed in parallel.
     """
     side_by_side = logits.reshape(-1, logits.shape[-1]).T.contiguous().log_softmax(0)
     return side_by_side.view(logits.shape[-1], *logits.shape[:-1]).movedim(0, -1)
 
 
 class GaussianHead(nn.Module):
-    """Mean and scale of a diagonal Gaussian of ``size`` dimensions, from features ``[..., H]``."""
+    """Maps features ``[..., H]`` to a diagonal Gaussian of ``size`` dimensions."""
 
     def __init__(self, hidden: int, size: int, initial_scale: float) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class GaussianHead(nn.Module):
             self.linear.bias[size:] += offset
 
     def forward(self, features: Tensor) -> Gaussian:
-        """Of ``features`` ``[..., H]``; mean and scale ``[..., size]``."""
+        """Return mean and scale ``[..., size]`` for ``features`` ``[..., H]``."""
         mean, raw = self.linear(features).chunk(2, -1)
         return Gaussian(mean, softplus(raw) + MIN_SCALE)
 
@@ -74,7 +74,7 @@ class Transition(nn.Module):
         self.head = GaussianHead(hidden, latent, 0.5)
 
     def forward(self, previous: Tensor, action: Tensor) -> Gaussian:
-        """Of ``previous`` ``[..., Z]`` and ``action`` (index) ``[...]``."""
+        """Return the Gaussian for ``previous`` ``[..., Z]`` and ``action`` (index) ``[...]``."""
         chosen = nn.functional.one_hot(action, self.actions).to(previous.dtype)
         chosen = chosen.expand(*previous.shape[:-1], -1)
         change = self.head(self.body(torch.cat([previous, chosen], -1)))
@@ -84,13 +84,13 @@ class Transition(nn.Module):
 class Encoder(nn.Module):
     """``q(z_t | z_{t-1}, v_t * x_t, v_t, a_{t-1})``: three layers to a diagonal Gaussian.
 
-    The first layer reads every symbolic item through weights of its own, and an item that is not
-    visible adds nothing. This is the usual linear layer on masked values and masks, written as a
-    sum, so that the many views of one round share the work (see :meth:`embed`). Images and speech
-    have readers of their own, see `mirror_ppl.models.readers`.
+    The first layer has separate weights for every symbolic item, and an item that is not visible
+    adds nothing. It is the usual linear layer on masked values and masks, written as a sum, so that
+    the many views of one round share the work (see :meth:`embed`). Images and speech have their own
+    readers, see `mirror_ppl.models.readers`.
 
     Args:
-        domain: what there is to read.
+        domain: whose observations are read.
         sizes: of the layers.
         codes: of the utterances of each modality that has some, ``[K, U, C]``.
     """
@@ -119,7 +119,7 @@ class Encoder(nn.Module):
         self.head = GaussianHead(hidden, latent, 0.5)
 
     def embed(self, symbols: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """First-layer contribution of the ego ``[..., H]``, and each item by itself."""
+        """Return the first-layer contributions of the ego ``[..., H]`` and of each item."""
         embedded = {"ego": self.ego(symbols["ego"])}
         for name, reader in self.items.items():
             embedded[name] = cast(Reader, reader).embed(symbols[name])
@@ -132,13 +132,13 @@ class Encoder(nn.Module):
         imagined: Mapping[str, Tensor] | None = None,
         taken: Visibility | None = None,
     ) -> Tensor:
-        """What a view ``[..., K]`` of the embedded observation tells, ``[..., H]``.
+        """Return the evidence ``[..., H]`` in a view ``[..., K]`` of the embedded observation.
 
         Args:
             embedded: the observation, from :meth:`embed`.
-            visible: which of its items there are.
+            visible: its items that are in the view.
             imagined: another embedded observation from which items are taken.
-            taken: which; none of those that are visible.
+            taken: the items taken from it; none of them is visible.
         """
         sources = [(embedded, visible)]
         if imagined is not None and taken:
@@ -155,12 +155,12 @@ class Encoder(nn.Module):
         return total
 
     def previous_actions(self, actions: Tensor) -> Tensor:
-        """Contribution ``[..., T + 1, H]`` of the action before each observation."""
+        """Return the contribution ``[..., T + 1, H]`` of the action before each observation."""
         none = actions.new_full((*actions.shape[:-1], 1), self.actions)
         return self.action(torch.cat([none, actions], -1))
 
     def forward(self, previous: Tensor, evidence: Tensor) -> Gaussian:
-        """Of ``previous`` ``[..., Z]`` and ``evidence`` ``[..., H]`` of ``x_t, v_t, a_{t-1}``."""
+        """Return the Gaussian for ``previous`` ``[..., Z]`` and ``evidence`` ``[..., H]``."""
         features = torch.relu(self.previous(previous) + evidence)
         change = self.head(self.body(features))
         return Gaussian(previous + change.mean, change.scale)
@@ -176,7 +176,7 @@ class Decoder(nn.Module):
         self.head = GaussianHead(hidden, items * features, 0.5)
 
     def forward(self, latent: Tensor) -> Gaussian:
-        """Of ``latent`` ``[..., Z]``; mean and scale ``[..., K, F]`` in units of the scales."""
+        """Return mean and scale ``[..., K, F]``, in units of the scales, for ``latent``."""
         mean, scale = self.head(self.body(latent))
         shape = latent.shape[:-1] + self.shape
         return Gaussian(mean.reshape(shape), scale.reshape(shape))
@@ -185,8 +185,8 @@ class Decoder(nn.Module):
 class ImageDecoder(nn.Module):
     """``p(x^m_t | z_t)`` of images: layers, and a deconvolution to a diagonal Gaussian of pixels.
 
-    What is the same in every image is a mean of its own for each pixel; the deconvolution, whose
-    kernel and stride are those of the encoder's convolution, adds what differs.
+    Each pixel has a constant mean; the deconvolution, with the kernel size and stride of the
+    encoder's convolution, adds what differs between images.
     """
 
     patches: Tensor
@@ -206,7 +206,7 @@ class ImageDecoder(nn.Module):
         self.register_buffer("patches", patches, persistent=False)
 
     def forward(self, latent: Tensor) -> Gaussian:
-        """Of ``latent`` ``[..., Z]``; mean and scale ``[..., K, F]`` of intensities."""
+        """Return mean and scale ``[..., K, F]`` of intensities for ``latent`` ``[..., Z]``."""
         shape = (*latent.shape[:-1], self.items, -1)
         channels = self.head(self.body(latent)).view(shape)
         mean = self.same + channels @ self._kernels(self.mean)
@@ -214,7 +214,7 @@ class ImageDecoder(nn.Module):
         return Gaussian(mean, softplus(raw) + PIXEL_SCALE)
 
     def _kernels(self, kernel: Tensor) -> Tensor:
-        """The deconvolution as one matrix ``[places * channels, pixels]``."""
+        """Return the deconvolution as one matrix ``[places * channels, pixels]``."""
         places = len(self.patches)
         matrix = kernel.new_zeros(places, self.channels, self.pixels)
         index = self.patches[:, None].expand(-1, self.channels, -1)
@@ -231,7 +231,7 @@ class Reward(nn.Module):
         self.head = GaussianHead(hidden, 1, 1.0)
 
     def forward(self, latent: Tensor, action: Tensor) -> Gaussian:
-        """Of ``latent`` ``[..., Z]`` and ``action`` ``[...]``; mean and scale ``[...]``."""
+        """Return mean and scale ``[...]`` for ``latent`` ``[..., Z]`` and ``action`` ``[...]``."""
         chosen = nn.functional.one_hot(action, self.actions).to(latent.dtype)
         chosen = chosen.expand(*latent.shape[:-1], -1)
         mean, scale = self.head(self.body(torch.cat([latent, chosen], -1)))
@@ -239,7 +239,7 @@ class Reward(nn.Module):
 
 
 class QNetwork(nn.Module):
-    """``Q(z_t, a_t)``: three layers to the discounted return of an action."""
+    """``Q(z_t, a_t)``: three layers to the discounted return of each action."""
 
     def __init__(self, latent: int, actions: int, hidden: int = 128) -> None:
         super().__init__()
@@ -249,6 +249,6 @@ class QNetwork(nn.Module):
         self.value = nn.Linear(hidden, 1)
 
     def forward(self, latent: Tensor) -> Tensor:
-        """Values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
+        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
         first = torch.relu(self.latent(latent)[..., None, :] + self.action.weight)
         return self.value(self.body(first)).squeeze(-1)

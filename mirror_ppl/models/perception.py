@@ -1,4 +1,4 @@
-"""What enters a belief at one step, given what somebody sees by themselves."""
+"""Builds the view of one step from what a person sees, hears, remembers and assumes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mirror_ppl.models.implants import ASSUMES
 from mirror_ppl.models.view import View
 
 Sees = Callable[[Observation], Visibility]
-"""Of an observation ``[..., K, F]`` what is seen of it, ``[..., K]``."""
+"""Maps an observation ``[..., K, F]`` to masks of its seen items, ``[..., K]``."""
 
 
 def perceived_by(
@@ -24,12 +24,12 @@ def perceived_by(
     observation: Observation,
     told: Visibility,
 ) -> tuple[View, Any]:
-    """What is seen, told, remembered and taken for granted at one step.
+    """Return what is seen, communicated, remembered and taken for granted at one step.
 
     Args:
-        sees: what is seen of an observation: of this one, and of others that are expected.
+        sees: masks of the items seen in an observation, this one or an expected one.
         domain: the world.
-        implants: what is taken for granted, ``[...]`` by site; and more.
+        implants: values ``[...]`` by site; those of the assumptions are read.
         knowledge: the domain's, of the step before.
         observation: everything that could be seen at this step, ``[..., K, F]``.
         told: what is communicated at this step, ``[..., K]``.
@@ -46,7 +46,7 @@ def perceived_by(
     taken = {name: torch.zeros_like(mask) for name, mask in visible.items()}
     for assumption, about in items.items():
         site = ASSUMES + assumption
-        if site not in implants:  # open to them, as it is to the robot
+        if site not in implants:  # the person does not assume it, like the robot
             continue
         makes = implants[site][..., None] == 1
         for name, mask in about.items():

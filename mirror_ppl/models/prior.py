@@ -1,4 +1,4 @@
-"""The prior of a human model: its sites, and draws of them without any recordings."""
+"""Sites and draws of the prior of a human model, without recordings."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def sample_sites(
     given: Mapping[str, Tensor] | None = None,
     handler: AbstractContextManager[Any] | None = None,
 ) -> dict[str, Any]:
-    """Nodes of all sites of ``prior`` and ``act``, in the order of the program.
+    """Return the nodes of all sites of ``prior``, in the order of the program.
 
     Args:
         human: the model of people.
         people: number of people P.
-        draws: number of draws S of each; without, values have no such dimension.
+        draws: number of draws S; if None, values have no such dimension.
         given: values ``[S, P, 1, ...]`` of sites that are not sampled.
         handler: an effect handler of Pyro's under which the program runs.
     """
@@ -56,7 +56,7 @@ def sample_sites(
 
 
 def values_of(nodes: Mapping[str, Any]) -> Draws:
-    """Values of sites, with dimensions of size one where Pyro spares them."""
+    """Return the values of sites, expanded to their full batch and event shapes."""
     return {
         name: node["value"].expand(node["fn"].batch_shape + node["fn"].event_shape)
         for name, node in nodes.items()
@@ -64,16 +64,16 @@ def values_of(nodes: Mapping[str, Any]) -> Draws:
 
 
 def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
-    """Draws ``[S, P, 1, ...]`` of the prior of all sites, in the order of the program.
+    """Draw ``[S, P, 1, ...]`` from the prior of all sites, in the order of the program.
 
     Args:
         human: the model of people.
         people: number of people P.
-        number: number of draws S of each.
+        number: number of draws S per person.
         seed: of everything random.
 
     Raises:
-        InputError: one of them is something else; there have to be a person and a draw.
+        InputError: an argument is of another kind, or there is no person or no draw.
     """
     require_kind(human, HumanModel, "human")
     people, number = whole_number(people, "people", 1), whole_number(number, "number", 1)
@@ -84,12 +84,12 @@ def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
 
 
 def draw_prior_of_each(human: HumanModel, people: range, number: int, seed: int) -> Draws:
-    """Draws ``[S, P, 1, ...]`` as `draw_prior`, of each person whoever else there is.
+    """Draw ``[S, P, 1, ...]`` like `draw_prior`, with a seed per person.
 
     Args:
         human: the model of people.
         people: numbers of the P people.
-        number: number of draws S of each.
+        number: number of draws S per person.
         seed: of everything random.
     """
     each = []
@@ -102,17 +102,17 @@ def draw_prior_of_each(human: HumanModel, people: range, number: int, seed: int)
 
 @torch.no_grad()
 def checked_draws(human: HumanModel, draws: Any, people: int) -> Draws:
-    """Draws as the human model samples them, on its device.
+    """Check draws against the sites of a human model and move them to its device.
 
     Args:
         human: the model of people.
         draws: tensors, numpy arrays or lists ``[S, P, 1, ...]`` by site.
-        people: number of people P that they have to be of.
+        people: expected number of people P.
 
     Raises:
-        InputError: they are no such arrays, of another number of people, or have values that the
-            human model rules out.
-        HumanModelError: there are none, or they are not those of the model's sites.
+        InputError: they are no such arrays, of another number of people, or have values outside
+            the support of the sites.
+        HumanModelError: there are no draws, or their sites are not the model's.
     """
     if not isinstance(draws, Mapping):
         raise InputError(f"draws must be a dict of arrays by site, not {shown(draws)}")
@@ -146,7 +146,7 @@ def checked_draws(human: HumanModel, draws: Any, people: int) -> Draws:
             )
     if number == 0:
         return own
-    # Under these draws, for what a site can be may depend on others.
+    # Run under these draws, because the support of a site may depend on other sites.
     nodes = sample_sites(human, people, number, own)
     for name, value in own.items():
         possible = _possible(nodes[name]["fn"].support, value)
@@ -161,7 +161,7 @@ def checked_draws(human: HumanModel, draws: Any, people: int) -> Draws:
 
 
 def _possible(support: Constraint, value: Tensor) -> Tensor:
-    """Whether values can be sampled, or are the limit of such, as a consistency of 0 is."""
+    """True where values are in the support or at its boundary, such as a consistency of 0."""
     possible = support.check(value)
     if value.is_floating_point():
         for limit in (torch.inf, -torch.inf):
@@ -170,7 +170,7 @@ def _possible(support: Constraint, value: Tensor) -> Tensor:
 
 
 def scalar_sites(human: HumanModel) -> dict[str, Any]:
-    """Continuous sites of one number a person, with the map from unconstrained space."""
+    """Return the continuous scalar sites, each with its transform from unconstrained space."""
     with torch.random.fork_rng(devices=[]):
         return {
             name: biject_to(node["fn"].support)
@@ -182,7 +182,7 @@ def scalar_sites(human: HumanModel) -> dict[str, Any]:
 def unconstrained(
     sites: Mapping[str, Any], policy: Mapping[str, Tensor], number: int = 0
 ) -> Tensor:
-    """The scalar sites of draws in unconstrained space, ``[S, D]``; S is given if D is 0."""
+    """Map scalar sites of draws to unconstrained space, ``[S, D]``; ``number`` is S if D is 0."""
     if not sites:
         return torch.zeros(number, 0)
     return torch.stack([site.inv(policy[name].flatten()) for name, site in sites.items()], -1)

@@ -1,7 +1,7 @@
-"""How the encoder reads a modality: lists of symbols, images, and speech.
+"""Readers, by which the encoder reads a modality: lists of symbols, images, and speech.
 
-Each reader has two halves. ``embed`` looks at every item by itself, so that the many views of one
-round share that work; ``join`` makes one vector of those items that a view has.
+Each reader has two halves. ``embed`` processes every item by itself, so that the many views of one
+round share that work; ``join`` combines the items of a view into one vector.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ KERNEL = 3
 
 
 class Source(NamedTuple):
-    """Items ``[..., K, H]`` as ``embed`` gave them, and which of them there are ``[..., K]``."""
+    """Embedded items ``[..., K, H]`` and a mask of those in the view ``[..., K]``."""
 
     embedded: Tensor
     mask: Tensor
 
 
 def layers(sizes: Sequence[int]) -> nn.Sequential:
-    """Fully connected layers of the given sizes, each followed by a rectifier."""
+    """Return fully connected layers of the given sizes, each followed by a ReLU."""
     blocks: list[nn.Module] = []
     for before, after in zip(sizes[:-1], sizes[1:], strict=True):
         blocks += [nn.Linear(before, after), nn.ReLU()]
@@ -34,10 +34,10 @@ def layers(sizes: Sequence[int]) -> nn.Sequential:
 
 
 class Reader(nn.Module):
-    """How one modality is read."""
+    """Base class: reads one modality."""
 
     def embed(self, symbols: Tensor) -> Tensor:
-        """Each item ``[..., K, H]`` by itself, of its symbols ``[..., K, D]``."""
+        """Embed each item by itself: symbols ``[..., K, D]`` to ``[..., K, H]``."""
         raise NotImplementedError
 
 
@@ -51,18 +51,18 @@ class ItemEmbedding(Reader):
         self.bias = nn.Parameter(torch.zeros(items, hidden))
 
     def embed(self, symbols: Tensor) -> Tensor:
-        """Of ``symbols`` ``[..., K, D]``; contributions ``[..., K, H]``."""
+        """Return contributions ``[..., K, H]`` of ``symbols`` ``[..., K, D]``."""
         return torch.einsum("...kd,kdh->...kh", symbols, self.weight) + self.bias
 
     @staticmethod
     def join(embedded: Tensor, mask: Tensor) -> Tensor:
-        """The sum ``[..., H]`` of what is there."""
+        """Return the sum ``[..., H]`` of the items in the view."""
         weights = mask.to(embedded.dtype)
         return (weights[..., None, :] @ embedded).squeeze(-2)
 
 
 class JoinedReader(Reader):
-    """A reader whose items enter side by side, with their masks, and not as a sum."""
+    """A reader that concatenates items and masks instead of summing them."""
 
     def __init__(self, items: int, each: int, hidden: Sequence[int], encoder: int) -> None:
         super().__init__()
@@ -70,10 +70,10 @@ class JoinedReader(Reader):
         self.head = nn.Linear(hidden[-1], encoder, bias=False)
 
     def join(self, sources: Sequence[Source]) -> Tensor:
-        """What is there, of any of the sources, as the encoder's first layer gets it ``[..., H]``.
+        """Return the contribution ``[..., H]`` to the encoder's first layer.
 
         Args:
-            sources: items and masks; no item is there in two of them.
+            sources: items and masks; no item is in two of them.
         """
         features = torch.as_tensor(0.0)
         there = torch.as_tensor(0.0)
@@ -97,12 +97,12 @@ class ImageReader(JoinedReader):
         self.register_buffer("patches", patches, persistent=False)
 
     def embed(self, symbols: Tensor) -> Tensor:
-        """Of pixels ``[..., K, D]``; channels of every place ``[..., K, places * channels]``."""
+        """Map pixels ``[..., K, D]`` to channels of every place ``[..., K, places * channels]``."""
         return torch.relu(self.convolution(symbols[..., self.patches])).flatten(-2)
 
 
 class SpeechReader(JoinedReader):
-    """Utterances: the code of what is said of each item, and one layer (supplement, section D).
+    """Utterances: the code of each item's utterance, and one layer (supplement, section D).
 
     Args:
         codes: of the U utterances about each of K items, ``[K, U, C]``; see
@@ -117,19 +117,19 @@ class SpeechReader(JoinedReader):
         self.register_buffer("codes", codes.clone())
 
     def embed(self, symbols: Tensor) -> Tensor:
-        """Of which utterance is true ``[..., K, U]``, one-hot; its code ``[..., K, C]``."""
+        """Map the one-hot true utterance ``[..., K, U]`` to its code ``[..., K, C]``."""
         return torch.einsum("...ku,kuc->...kc", symbols, self.codes)
 
 
 def image_patches(image: tuple[int, int, int], stride: int) -> tuple[Tensor, int]:
-    """Which pixels of an image a convolution's kernel covers at each place.
+    """Return the pixels of an image that a convolution's kernel covers at each place.
 
     Args:
         image: rows, columns and colours.
-        stride: how far the kernel moves.
+        stride: step of the kernel.
 
     Returns:
-        Numbers of pixels ``[places, 3 * 3 * colours]``, and how many a place has.
+        Indices of pixels ``[places, 3 * 3 * colours]``, and the number of pixels per place.
 
     Raises:
         ValueError: the kernel does not cover the image evenly.

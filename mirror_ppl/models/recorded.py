@@ -1,4 +1,4 @@
-"""What recordings have to be so that a human model can be fitted to them, or asked about them."""
+"""Checks that a human model can be fitted to recordings, or queried about them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from mirror_ppl.models.human import HumanModel
 
 
 def check_rounds(human: Any, rounds: Any, people: int | None = None) -> None:
-    """Make sure that a human model and recordings go together.
+    """Check that a human model and recordings match.
 
     Args:
         human: the model of people.
         rounds: `Demonstrations`.
-        people: number of people that they have to be of; any unless given.
+        people: required number of people; any unless given.
 
     Raises:
-        InputError: one of them is something else; the recordings are of another domain, or of
-            another number of people.
-        DemonstrationsError: an observation cannot be in the domain's world.
+        InputError: an argument is of another kind; the recordings are of another domain or number
+            of people.
+        DemonstrationsError: an observation is impossible in the domain.
     """
     require_kind(human, HumanModel, "human")
     require_kind(rounds, Demonstrations, "the rounds")

@@ -4,8 +4,8 @@ Implements section D of the supplement ("Gridworld Driving"):
 
     p(z_0) prod_t p(z_t | z_{t-1}, a_{t-1}) prod_m p(x^m_t | z_t) p(r_t | z_t, a_t)
 
-with the amortized guide ``q(z_t | z_{t-1}, v_t * x_t, v_t, a_{t-1})``, whose targets are unmasked
-observations, and a Q-network on ``z_t``.
+with the amortized guide ``q(z_t | z_{t-1}, v_t * x_t, v_t, a_{t-1})``, trained on unmasked targets,
+and a Q-network on ``z_t``.
 
 Departures, each with its reason in ``docs/decisions.md``:
 
@@ -45,8 +45,8 @@ class Rounds:
     """A batch of rounds as a self-model sees it.
 
     Attributes:
-        observation: what is true, ``[B, T + 1, ...]``: the target of the decoders.
-        visible: what is seen of it, ``[B, T + 1, K]`` for each modality.
+        observation: the full observation, ``[B, T + 1, ...]``: the target of the decoders.
+        visible: masks of its seen items, ``[B, T + 1, K]`` for each modality.
         actions: ``[B, T]``.
         rewards: ``[B, T]``, of the action and the state that it leads to.
     """
@@ -63,8 +63,8 @@ class SelfModel(nn.Module):
     Args:
         domain: the domain that the networks are for.
         sizes: of the networks; the domain's own unless given.
-        embedding: from utterances to vectors, which an autoencoder compresses to codes; None if
-            the codes are to come with weights.
+        embedding: maps utterances to vectors, which an autoencoder compresses to codes; None if
+            the codes are loaded with the weights.
     """
 
     def __init__(
@@ -98,11 +98,11 @@ class SelfModel(nn.Module):
         self.scales: dict[str, tuple[float, ...]] = {"ego": (1.0,) * len(domain.ego_features)} | {
             modality.name: modality.scales for modality in domain.modalities
         }
-        # How much more than once each number of a modality counts in the bound; for training.
+        # Weight of each modality's log density in the bound, 1 unless given; for training.
         self.emphasis: dict[str, float] = {}
 
     def model(self, rounds: Rounds) -> Tensor:
-        """The generative program, conditioned on what is true; returns ``z`` ``[B, T + 1, Z]``."""
+        """Run the program, conditioned on observations; returns ``z`` ``[B, T + 1, Z]``."""
         actions = rounds.actions
         with pyro.plate("self_model_round", actions.shape[0]):
             z = pyro.sample("z", self.dynamics(actions))
@@ -115,7 +115,7 @@ class SelfModel(nn.Module):
         return z
 
     def guide(self, rounds: Rounds) -> Tensor:
-        """The amortized guide: the encoder on what is visible; returns ``z`` ``[B, T + 1, Z]``."""
+        """Run the guide, the encoder on visible items; returns ``z`` ``[B, T + 1, Z]``."""
         evidence = self.evidence(rounds.observation, rounds.visible, rounds.actions)
         nothing = evidence.new_zeros(*evidence.shape[:-2], self.latent)
         with pyro.plate("self_model_round", evidence.shape[0]):
@@ -130,7 +130,7 @@ class SelfModel(nn.Module):
             )
 
     def elbo(self, rounds: Rounds) -> tuple[Tensor, Tensor]:
-        """One-particle evidence lower bound in nats, summed over rounds, and the ``z`` it is at."""
+        """Return the one-particle ELBO in nats, summed over rounds, and its sample of ``z``."""
         guide_trace = poutine.trace(self.guide).get_trace(rounds)
         replayed = poutine.replay(self.model, trace=guide_trace)
         model_trace = poutine.trace(replayed).get_trace(rounds)
@@ -138,16 +138,16 @@ class SelfModel(nn.Module):
         return torch.as_tensor(bound), latent_values(guide_trace)["z"]
 
     def dynamics(self, actions: Tensor) -> GaussianChain:
-        """``p(z_0) prod_t p(z_t | z_{t-1}, a_{t-1})`` of ``actions`` ``[B, T]``."""
+        """Return ``p(z_0) prod_t p(z_t | z_{t-1}, a_{t-1})`` for ``actions`` ``[B, T]``."""
         return GaussianChain(self.prior(actions.shape[:1]), self.transition, actions, 0)
 
     def prior(self, batch: torch.Size) -> Gaussian:
-        """``p(z_0)``: a standard Gaussian, ``[*batch, Z]``."""
+        """Return ``p(z_0)``, a standard Gaussian, ``[*batch, Z]``."""
         zero = next(self.parameters()).new_zeros(*batch, self.latent)
         return Gaussian(zero, torch.ones_like(zero))
 
     def targets(self, observation: Observation) -> Observation:
-        """Observations in units of the scales; ego as one item ``[..., 1, E]``."""
+        """Return observations in units of the scales; ego as one item ``[..., 1, E]``."""
         values = {name: value for name, value in observation.items() if name != "ego"}
         values["ego"] = observation["ego"][..., None, :]
         return {
@@ -156,11 +156,11 @@ class SelfModel(nn.Module):
         }
 
     def decode(self, latent: Tensor) -> Observation:
-        """Means of the observations of states ``[..., Z]``, in the domain's units."""
+        """Return means of the observations of states ``[..., Z]``, in the domain's units."""
         return self.in_units({name: decode(latent).mean for name, decode in self.decoders.items()})
 
     def in_units(self, values: Observation) -> Observation:
-        """Observations in the domain's units, the inverse of :meth:`targets`."""
+        """Return observations in the domain's units, the inverse of :meth:`targets`."""
         found = {
             name: value * torch.tensor(self.scales[name], dtype=value.dtype, device=value.device)
             for name, value in values.items()
@@ -169,17 +169,17 @@ class SelfModel(nn.Module):
         return found
 
     def evidence(self, observation: Observation, visible: Visibility, actions: Tensor) -> Tensor:
-        """What each step tells the encoder: ``x_t, v_t, a_{t-1}`` as ``[..., T + 1, H]``."""
+        """Return the encoder's evidence ``[..., T + 1, H]``, of ``x_t, v_t, a_{t-1}``."""
         embedded = self.encoder.embed(self.domain.symbols(observation))
         steps = self.encoder.previous_actions(actions)
         return self.encoder.combine(embedded, visible) + steps[..., : embedded["ego"].shape[-2], :]
 
     def believe(self, evidence: Tensor, still: Tensor | None = None) -> Tensor:
-        """Beliefs ``[..., T, Z]``: the encoder's means, each step starting from the last mean.
+        """Return beliefs ``[..., T, Z]``: the encoder's means, each step from the last mean.
 
         Args:
             evidence: ``[..., T, H]`` from :meth:`evidence`.
-            still: where the belief stays as it is ``[..., T]``; nowhere unless given.
+            still: where the belief does not change ``[..., T]``; nowhere unless given.
         """
         belief = evidence.new_zeros(*evidence.shape[:-2], self.latent)
         beliefs = []
@@ -190,5 +190,5 @@ class SelfModel(nn.Module):
         return torch.stack(beliefs, -2)
 
     def action_values(self, belief: Tensor) -> Tensor:
-        """``Q(z_t, .)`` ``[..., A]`` of beliefs ``[..., Z]``, in units of reward."""
+        """Return ``Q(z_t, .)`` ``[..., A]`` of beliefs ``[..., Z]``, in units of reward."""
         return self.q_network(belief)

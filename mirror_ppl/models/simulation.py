@@ -1,4 +1,4 @@
-"""The human model run forward: rounds as modelled people would play them in the domain's world."""
+"""Simulates rounds: runs the human model forward in the domain's world."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.version import __version__
 
 PRIOR_OF = "prior of "
-"""What the population of people begins with who are drawn from a human model's prior."""
+"""Prefix of the population's name in recordings of people drawn from a human model's prior."""
 
 
 @torch.no_grad()
@@ -41,19 +41,19 @@ def play_rounds(
     scenario: Tensor | None = None,
     told: float = 0.0,
 ) -> Demonstrations:
-    """Let people with given implants play rounds; every action is drawn from the program itself.
+    """Simulate rounds of people with given implants; actions are drawn from the program itself.
 
-    Rounds end when all is done, or after the domain's horizon.
+    Rounds end when the task is done, or after the domain's horizon.
 
     Args:
         human: the model of people.
         implants: values of sites ``[P, 1, ...]``; sites that are left out are drawn from the
             prior, once for all rounds.
-        rounds: number of rounds B of each.
-        setting: name under which the rounds are recorded; what people see is up to their implants.
-        generator: source of how rounds begin and of what people choose.
+        rounds: number of rounds B per person.
+        setting: name under which the rounds are recorded; sight depends on the implants alone.
+        generator: random numbers of initial states, messages and actions.
         scenario: of each round of each person, ``[P B]`` in that order; drawn unless given.
-        told: chance that an item that can be communicated is, at each step.
+        told: probability that a communicable item is communicated, at each step.
 
     Returns:
         The rounds, with the entropy of each action.
@@ -83,7 +83,7 @@ def play_rounds(
     varies = human.has_round_latents
     beliefs = BeliefState.initial(human, people * rounds)
     every = torch.arange(people * rounds, device=device)
-    # What the program itself draws comes from the generator, too, whatever else is drawn from it.
+    # Draws of the program are seeded by the generator, too, independently of its other draws.
     own = torch.Generator(device)
     own.set_state(generator.get_state())
     seed = int(torch.randint(2**31, (), generator=own, device=device))
@@ -145,7 +145,7 @@ def _told(
     chance: float,
     generator: torch.Generator,
 ) -> Visibility:
-    """Which items ``[P, B, K]`` are told at random; the generator is not used for none."""
+    """Draw which items ``[P, B, K]`` are communicated; a probability of 0 draws nothing."""
     can_be = domain.communicable(observation)
     if not chance:
         return {name: torch.zeros_like(mask) for name, mask in can_be.items()}
@@ -165,25 +165,25 @@ def simulate_from_prior(
     seed: int = 0,
     told: float = 0.0,
 ) -> Demonstrations:
-    """Record people who are as a human model has them, drawn from its prior.
+    """Simulate recordings of people drawn from the prior of a human model.
 
     Args:
         human: the model of people.
         people: number of people P.
-        rounds: number of rounds B of each.
-        setting: name under which the rounds are recorded; what people see is up to their implants.
+        rounds: number of rounds B per person.
+        setting: name under which the rounds are recorded; sight depends on the implants alone.
             The last of the domain unless given.
         seed: of everything random.
-        told: chance that an item that can be communicated is, at each step.
+        told: probability that a communicable item is communicated, at each step.
 
     Returns:
-        Their rounds, with the truth of each site that is one number a person, thresholds of sight
-        in the domain's unit of distance.
+        Their rounds, with the true value of each scalar site, sight thresholds in the domain's
+        unit of distance.
 
     Raises:
         InputError: fewer than one person or round, no seed, or ``told`` is no probability.
         UnknownNameError: there is no such setting.
-        HumanModelError: the model's program is its own.
+        HumanModelError: the model overrides the program itself.
     """
     domain, device = human.domain, next(human.parameters()).device
     setting = require_known(setting or domain.settings[-1], "setting", domain.settings, domain.name)
@@ -210,9 +210,9 @@ def simulate_from_prior(
 def _round_latents(
     human: HumanModel, implants: dict[str, Tensor], observed: list[Observation], seed: int
 ) -> dict[str, Tensor]:
-    """What differs from round to round ``[P, B]``, by the covariates of the rounds so far.
+    """Sample the round latents ``[P, B]``, given the covariates of the rounds so far.
 
-    Runs inside the person plate. One seed, so that what covariates leave alone stays the same.
+    Runs inside the person plate. The seed is fixed, so latents change only with covariates.
     """
     so_far = {name: torch.stack([one[name] for one in observed], 2) for name in observed[0]}
     torch.manual_seed(seed)

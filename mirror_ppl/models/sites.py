@@ -1,4 +1,4 @@
-"""Reading the sample sites of a run of a Pyro program."""
+"""Reads the sample sites of a trace of a Pyro program."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mirror_ppl.errors import HumanModelError
 
 
 def latent_sites(trace: Trace) -> dict[str, Any]:
-    """Nodes of the sites that were sampled: not observed or conditioned, and no plates."""
+    """Return the nodes that were sampled: neither observed, nor conditioned, nor plates."""
     return {
         name: site
         for name, site in trace.nodes.items()
@@ -22,7 +22,7 @@ def latent_sites(trace: Trace) -> dict[str, Any]:
 
 
 def sample_nodes(trace: Trace) -> dict[str, Any]:
-    """Nodes of all sites that are sampled, observed or factors; no plates."""
+    """Return the nodes that are sampled, observed or factors; no plates."""
     return {
         name: node
         for name, node in trace.nodes.items()
@@ -31,21 +31,21 @@ def sample_nodes(trace: Trace) -> dict[str, Any]:
 
 
 def latent_values(trace: Trace) -> dict[str, Tensor]:
-    """Values of the sites that were sampled."""
+    """Return the values of the sites that were sampled."""
     return {name: site["value"] for name, site in latent_sites(trace).items()}
 
 
 def discrete_names(trace: Trace) -> set[str]:
-    """Names of the sampled sites that can be enumerated."""
+    """Return the names of the sampled sites that can be enumerated."""
     return {name for name, site in latent_sites(trace).items() if site["fn"].has_enumerate_support}
 
 
 class Readable(Mapping[str, Tensor]):
-    """Implants for ``perceive``: notes which are read, and refuses those that are not discrete.
+    """Implants for ``perceive``: records which are read and refuses those that are not discrete.
 
     Args:
         known: values of discrete sites by name.
-        others: names of all else that ``prior`` returned.
+        others: names of all other values that ``prior`` returned.
     """
 
     def __init__(self, known: Mapping[str, Tensor], others: Collection[str] = ()) -> None:
@@ -63,7 +63,7 @@ class Readable(Mapping[str, Tensor]):
         return self.known[name]
 
     def __contains__(self, name: object) -> bool:
-        if name in self.known or name in self.others:  # whoever asks goes by the answer
+        if name in self.known or name in self.others:  # a membership test depends on the site
             return self[str(name)] is not None
         return False
 
@@ -75,7 +75,7 @@ class Readable(Mapping[str, Tensor]):
 
 
 class OnlyRead(dict[str, Tensor]):
-    """Implants for ``perceive`` where all but some were found never to be read: refuses those.
+    """Implants for ``perceive``: refuses sites that were found not to be read.
 
     Args:
         known: values by name.
@@ -98,5 +98,5 @@ class OnlyRead(dict[str, Tensor]):
         return super().__contains__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """See :meth:`dict.get`."""
+        """Return the value of a site, or a default; see :meth:`dict.get`."""
         return super().get(name, default) if name in self else default

@@ -1,4 +1,4 @@
-"""How large the networks of a self-model are, by domain (supplement, section D)."""
+"""Sizes of the networks of a self-model, by domain (supplement, section D)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mirror_ppl.domains.base import Domain
 
 @dataclass(frozen=True)
 class Sizes:
-    """Units of the networks; each has three layers of them unless said otherwise.
+    """Units per layer of the networks, three layers each unless said otherwise.
 
     Attributes:
         latent: dimensions Z of the latent state.
@@ -18,12 +18,12 @@ class Sizes:
         decoder: of ``p(x^m_t | z_t)`` where the modality is not an image.
         reward: of ``p(r_t | z_t, a_t)``.
         q_network: of ``Q(z_t, a_t)``.
-        image: of the layers between a convolution and the features, and of those before the
-            deconvolution of an image's decoder.
+        image: of the layers between a convolution and the features, and of those before an image
+            decoder's deconvolution.
         channels: of the one convolution, and of the deconvolution; the kernel is 3 by 3.
         stride: of both.
-        features: numbers that each of image and speech is reduced to before they are joined.
-        code: numbers that an utterance's embedding is compressed to.
+        features: dimensions of image and of speech features before they are joined.
+        code: dimensions that an utterance's embedding is compressed to.
     """
 
     latent: int = 48
@@ -40,11 +40,11 @@ class Sizes:
 
 
 def sizes_of(domain: Domain, paper: bool = False) -> Sizes:
-    """The sizes for a domain.
+    """Return the sizes for a domain.
 
     Args:
         domain: the world.
-        paper: the supplement's, whatever they cost: of bomb defusal a larger Q-network.
+        paper: use the supplement's sizes despite their cost: bomb defusal's larger Q-network.
     """
     record = domain.record
     return Sizes(**{**record.networks, **(record.paper_networks if paper else {})})

@@ -1,4 +1,4 @@
-"""At which steps of a round each of its latents is read."""
+"""Spans: the steps of a round at which each of its latents is read."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class Span:
     """The steps of a round at which a site of ``round_latents`` is read.
 
     Attributes:
-        first: the first of them.
-        last: the step after the last.
-        values: how many values of the site's support differ in what is seen there, from the first
-            on; all that follow see what the last of these does.
+        first: the first of these steps.
+        last: the step after the last of them.
+        values: number of leading values of the site's support that differ in what is seen there;
+            all later values see what the last of these sees.
     """
 
     first: int
@@ -25,7 +25,7 @@ class Span:
 
 
 def check_spans(spans: Mapping[str, Span], sizes: Mapping[str, int], steps: int) -> None:
-    """Make sure that spans are as `HumanModel.spans` says.
+    """Check that spans satisfy the contract of `HumanModel.spans`.
 
     Args:
         spans: by site.
@@ -33,7 +33,7 @@ def check_spans(spans: Mapping[str, Span], sizes: Mapping[str, int], steps: int)
         steps: of the round.
 
     Raises:
-        HumanModelError: they are not.
+        HumanModelError: they do not.
     """
     if set(spans) != set(sizes):
         raise HumanModelError(

@@ -1,10 +1,9 @@
-"""Utterances as numbers: embeddings of sentences, and the autoencoder that compresses them.
+"""Embeddings of utterances, and the autoencoder that compresses them.
 
-The supplement takes the 768 numbers that GPT-2 makes of an utterance and compresses them by an
-autoencoder (section D). Which embedding is taken is open here: any function from sentences to
-vectors. `hashed_words` needs nothing and is the default; `gpt2` needs the package ``transformers``
-and the model's weights. A self-model keeps the codes it was trained with in its weights, so that
-whoever uses it needs neither.
+The supplement compresses the 768 dimensions of a GPT-2 embedding by an autoencoder (section D).
+Here the embedding may be any function from sentences to vectors. `hashed_words` has no requirements
+and is the default; `gpt2` needs the package ``transformers`` and the model's weights. A trained
+self-model stores its codes in its weights, so using it needs neither.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from mirror_ppl.domains.base import Modality
 from mirror_ppl.errors import AssetError
 
 Embedding = Callable[[Sequence[str]], Tensor]
-"""From N sentences to vectors ``[N, D]``."""
+"""Maps N sentences to vectors ``[N, D]``."""
 
 HASHED = 64
-"""Numbers that `hashed_words` makes of a sentence."""
+"""Dimensions of the vectors of `hashed_words`."""
 COMPRESSION_STEPS = 500
 
 
 def hashed_words(sentences: Sequence[str]) -> Tensor:
-    """Words and pairs of neighbouring words, each a fixed random vector; of unit length.
+    """Embed sentences as normalized sums of fixed random vectors of words and word pairs.
 
-    Sentences that share words are alike, and no word has to be known before.
+    Sentences that share words are similar, and there is no fixed vocabulary.
 
     Args:
         sentences: N of them.
@@ -49,14 +48,14 @@ def hashed_words(sentences: Sequence[str]) -> Tensor:
 
 
 def _fixed(word: str) -> Tensor:
-    """Signs ``[64]`` that are the same for a word on every machine."""
+    """Return signs ``[64]`` for a word, the same on every machine."""
     digest = hashlib.blake2b(word.encode(), digest_size=HASHED // 8).digest()
     bits = [byte >> place & 1 for byte in digest for place in range(8)]
     return 2.0 * torch.tensor(bits, dtype=torch.get_default_dtype()) - 1
 
 
 def gpt2(sentences: Sequence[str]) -> Tensor:
-    """Means over tokens of the last hidden states of GPT-2, the supplement's embedding.
+    """Embed sentences as token means of GPT-2's last hidden states, as the supplement does.
 
     Args:
         sentences: N of them.
@@ -93,7 +92,7 @@ EMBEDDINGS: Mapping[str, Embedding] = {"words": hashed_words, "gpt2": gpt2}
 
 
 class Autoencoder(nn.Module):
-    """From an embedding ``[..., D]`` to a code ``[..., C]`` in -1 to 1, and back."""
+    """Maps an embedding ``[..., D]`` to a code ``[..., C]`` in -1 to 1, and back."""
 
     def __init__(self, embedding: int, code: int) -> None:
         super().__init__()
@@ -101,17 +100,17 @@ class Autoencoder(nn.Module):
         self.decoder = nn.Linear(code, embedding)
 
     def forward(self, vectors: Tensor) -> Tensor:
-        """The vectors ``[..., D]`` as they come back."""
+        """Return the reconstruction ``[..., D]``."""
         return self.decoder(self.encoder(vectors))
 
 
 def compress(vectors: Tensor, code: int, seed: int = 0) -> Autoencoder:
-    """An autoencoder trained on embeddings ``[N, D]``; they count as centred and of unit size.
+    """Train an autoencoder on embeddings ``[N, D]``, assumed centred and of unit size.
 
     Args:
-        vectors: what it has to tell apart.
-        code: numbers C of the code.
-        seed: of its first weights.
+        vectors: the embeddings ``[N, D]``.
+        code: dimensions C of the code.
+        seed: of its initial weights.
     """
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
         torch.manual_seed(seed)
@@ -129,12 +128,12 @@ def compress(vectors: Tensor, code: int, seed: int = 0) -> Autoencoder:
 def utterance_codes(
     modality: Modality, code: int, embedding: Embedding = hashed_words, seed: int = 0
 ) -> Tensor:
-    """Codes ``[K, U, C]`` of the U utterances about each of a modality's K items.
+    """Return codes ``[K, U, C]`` of the U utterances about each of a modality's K items.
 
     Args:
         modality: one with utterances.
-        code: numbers C of a code.
-        embedding: from sentences to vectors.
+        code: dimensions C of a code.
+        embedding: maps sentences to vectors.
         seed: of the autoencoder.
     """
     sentences = [sentence for about in modality.utterances for sentence in about]

@@ -1,4 +1,4 @@
-"""A toy person whose posterior is known in closed form: every guide is held against it.
+"""A toy human model with a posterior in closed form, to validate every engine.
 
 ::
 
@@ -6,8 +6,7 @@
     in_sight    ~ Beta(2, 2),  otherwise ~ Beta(1, 4)
     a_t         ~ Bernoulli(in_sight) if an item is within reach at t, else Bernoulli(otherwise)
 
-Given the reach, actions are throws of two coins, so both rates have Beta posteriors, and the reach
-has the evidence of a beta-binomial.
+Given the reach, both rates have Beta posteriors, and the evidence of the reach is beta-binomial.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ RATES = {"in_sight": (2.0, 2.0), "otherwise": (1.0, 4.0)}
 
 
 class ToyHuman(HumanModel):
-    """Somebody who takes the second action at one rate with an item in sight, else at another.
+    """A person who takes the second action at one rate with an item in sight, else at another.
 
-    For domains with two actions. It has a self-model only because every human model has one.
+    For domains with two actions. The networks of its self-model are not used.
     """
 
     def prior(self) -> dict[str, Tensor]:
-        """Sites ``reach``, an index into the domain's bins, and the two rates."""
+        """Sample ``reach``, an index into the domain's bins, and the two rates."""
         like = next(self.self_model.parameters())
         bins = like.new_ones(len(self.domain.reach_bins))
         implants = {"reach": pyro.sample("reach", dist.Categorical(bins / bins.sum()))}
@@ -53,14 +52,14 @@ class ToyHuman(HumanModel):
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """What is within reach; nothing is remembered."""
+        """Return the items within reach; nothing is remembered."""
         del told, step
         _, distance = self.domain.distance(observation)
         bins = torch.tensor(self.domain.reach_bins, device=distance.device)
         return View({"visual": distance <= bins[implants["reach"]][..., None]}), knowledge
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
-        """Whether anything is in sight, ``[..., 1]``."""
+        """Return 1 where an item is in sight, else 0, ``[..., 1]``."""
         del observation
         like = next(self.self_model.parameters())
         return view.visible["visual"].any(-1, keepdim=True).to(like)
@@ -68,12 +67,12 @@ class ToyHuman(HumanModel):
     def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
     ) -> Tensor:
-        """The same, in the first dimension ``[..., Z]``."""
+        """Return the evidence in the first dimension of the belief ``[..., Z]``."""
         del action, still
         return torch.nn.functional.pad(evidence, [0, belief.shape[-1] - 1])
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities ``[..., P, B, 2]``."""
+        """Return log-probabilities ``[..., P, B, 2]``."""
         del values
         rate = torch.where(belief[..., 0] > 0, implants["in_sight"], implants["otherwise"])
         return torch.stack([torch.log1p(-rate), torch.log(rate)], -1)
@@ -108,11 +107,11 @@ class ToyPosterior:
 
 @torch.no_grad()
 def toy_posterior(human: ToyHuman, demonstrations: Demonstrations) -> ToyPosterior:
-    """The exact posterior of recordings.
+    """Compute the exact posterior of recordings.
 
     Args:
-        human: the toy.
-        demonstrations: rounds of P people; what they were told does not matter to toys.
+        human: the toy model.
+        demonstrations: rounds of P people; messages are ignored.
     """
     domain, steps = human.domain, demonstrations.shape[2]
     observation = {n: value[:, :, :steps] for n, value in demonstrations.observation().items()}

@@ -1,4 +1,4 @@
-"""Variants of the human model: other families of sight, and parts left out to compare with.
+"""Variants of the human model: other families of sight, and ablations.
 
 Every command takes their names for ``--human-model``.
 """
@@ -32,11 +32,11 @@ class OneRadius(HumanModel):
         super().__init__(self_model)
         if len(self.domain.reach_bins) <= 1:
             raise HumanModelError(
-                f"one-radius: in {self.domain.name} it does not count how far away things are"
+                f"one-radius: in {self.domain.name} distance does not matter, so there is no radius"
             )
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the radius, what is taken for granted, and how people decide."""
+        """Sample the radius, the assumptions and the policy implants."""
         domain, like = self.domain, next(self.self_model.parameters())
         return (
             {self.RADIUS: implant_priors.reach_implant(self.RADIUS, domain, like)}
@@ -45,17 +45,17 @@ class OneRadius(HumanModel):
         )
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """The same reach in each direction."""
+        """Return what is within the radius."""
         radius = implants[self.RADIUS]
         reach = dict.fromkeys(implant_priors.sight_sites(self.domain), radius)
         return super().sees(reach, observation, step)
 
 
 class PerItem(HumanModel):
-    """Notices each item sooner or later: the family of bomb defusal (supplement, section C).
+    """Notices each item after a random delay, as in bomb defusal (supplement, section C).
 
-    At every step of a round somebody notices an item ``k`` that they have not noticed with their
-    own probability ``notices_k``, and from there on they see it, wherever it is::
+    At every step of a round a person notices each unnoticed item ``k`` with probability
+    ``notices_k``. From then on they see it, wherever it is::
 
         notices_k   ~ Beta(1, 1)                          probability at a step
         noticed_k,b ~ Geometric(notices_k), from step 0   in each round b; the horizon for never
@@ -63,7 +63,7 @@ class PerItem(HumanModel):
     """
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the probabilities, what is taken for granted, and how people decide."""
+        """Sample the probabilities, the assumptions and the policy implants."""
         domain, like = self.domain, next(self.self_model.parameters())
         return (
             implant_priors.notice_implants(domain, like)
@@ -72,11 +72,11 @@ class PerItem(HumanModel):
         )
 
     def round_latents(self, implants: Implants) -> dict[str, Tensor]:
-        """Sample when each item is noticed."""
+        """Sample the step at which each item is noticed."""
         return implant_priors.notice_times(self.domain, implants)
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """What was noticed at this step or before."""
+        """Return what was noticed at this step or before."""
         times = [implants[site] for site in implant_priors.noticed_sites(self.domain)]
         noticed = torch.stack(torch.broadcast_tensors(*times), -1) <= step
         direction, _ = self.domain.distance(observation)
@@ -85,10 +85,10 @@ class PerItem(HumanModel):
 
 
 class PerceptualOnly(HumanModel):
-    """Differs from the robot in what they see, not in their policy: no residual."""
+    """Differs from the robot in perception, not in policy: no residual."""
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample what people see and how strictly they choose."""
+        """Sample the perceptual implants and the parameters of choices."""
         like = next(self.self_model.parameters())
         return implant_priors.perceptual_implants(
             self.domain, like
@@ -96,23 +96,23 @@ class PerceptualOnly(HumanModel):
 
 
 class NoImplants(HumanModel):
-    """The robot itself, but for how strictly it chooses: sees everything, no residual."""
+    """The robot itself, except for the parameters of choices: sees everything, no residual."""
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample how strictly people choose."""
+        """Sample the parameters of choices."""
         return implant_priors.choice_implants(next(self.self_model.parameters()))
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """Everything that could be seen."""
+        """Return everything that could be seen."""
         direction, _ = self.domain.distance(observation)
         return by_eye(self.domain, torch.ones_like(direction, dtype=torch.bool))
 
 
 class PolicyOnly(NoImplants):
-    """Differs from the robot in their policy, not in what they see."""
+    """Differs from the robot in policy, not in perception."""
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample how people decide."""
+        """Sample the policy implants."""
         like = next(self.self_model.parameters())
         return implant_priors.policy_implants(self.domain, self.self_model.latent, like)
 

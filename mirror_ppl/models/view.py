@@ -1,4 +1,4 @@
-"""What enters a person's belief at each step: what they see, know and take for granted."""
+"""The view: what a person sees, hears, remembers and assumes at each step."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from mirror_ppl.row_hashing import as_whole_numbers, random_keys
 
 @dataclass(frozen=True)
 class View:
-    """What enters a person's belief: masks ``[..., K]`` for each modality, and what they imagine.
+    """The inputs of a belief: masks ``[..., K]`` and imagined items for each modality.
 
     Attributes:
-        visible: seen, told or remembered.
-        taken: neither, but taken for granted; empty if nothing is.
-        imagined: the observation ``[..., K, F]`` in which the taken items are as they take them,
-            of the modalities of which any are.
-        still: where nothing came up since the step before ``[...]``, so that the belief stays as
-            it is; ``None`` if something always does.
+        visible: items that are seen, communicated or remembered.
+        taken: items that are not, but are taken for granted; empty if there are none.
+        imagined: the observation ``[..., K, F]`` in which the taken items are as the person assumes
+            them, for modalities with such items.
+        still: where nothing is new since the step before ``[...]``, so that the belief does not
+            change; ``None`` if it always may.
     """
 
     visible: Visibility
@@ -31,7 +31,7 @@ class View:
     still: Tensor | None = None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> View:
-        """A view of each mask and each imagined item changed alike, along leading dimensions."""
+        """Return a view with a function applied to each mask and imagined item."""
         return View(
             {name: function(mask) for name, mask in self.visible.items()},
             {name: function(mask) for name, mask in self.taken.items()},
@@ -41,7 +41,7 @@ class View:
 
     @classmethod
     def stack(cls, steps: Sequence[View]) -> View:
-        """A view of a round ``[..., T, K]`` of those of its steps."""
+        """Stack the views of the steps of a round into one view ``[..., T, K]``."""
 
         def joined(parts: Sequence[Tensor], place: int) -> Tensor:
             if len(parts) == 1:
@@ -66,11 +66,11 @@ class View:
         )
 
     def numbers(self) -> Tensor:
-        """Everything that counts as one whole number ``[...]``, equal where views are equal."""
+        """Return a hash of the view ``[...]``, equal where views are equal."""
         masks = {**self.visible, **{f"{name}, taken": mask for name, mask in self.taken.items()}}
         if self.still is not None:
             masks["still"] = self.still[..., None]
-        if not masks:  # of a model that looks at nothing
+        if not masks:  # the model looks at nothing
             return torch.zeros((), dtype=torch.long)
         sizes = [mask.shape[-1] for mask in masks.values()]
         taken = {name: mask for name, mask in self.taken.items() if name in self.imagined}
@@ -84,7 +84,7 @@ class View:
         for name, mask in taken.items():
             imagined = self.imagined[name]
             key = keys.pop(0).view(imagined.shape[-2:])
-            # Few items are taken for granted, and only those count.
+            # Few items are taken for granted; the others are skipped.
             place = mask.nonzero(as_tuple=True)
             value = as_whole_numbers(imagined.expand(*mask.shape, -1)[place])
             value = (value * key[place[-1]]).sum(-1)

@@ -1,4 +1,4 @@
-"""Weights of self-models as files: safetensors, with a card in the file's own metadata."""
+"""Saves and loads weights of self-models: safetensors files, with a card in their metadata."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from mirror_ppl.models.sizes import Sizes
 
 FORMAT = "mirror_ppl self-model 1"
 CHECKSUM = "checksum"
-"""Of everything else in a file, in its metadata."""
+"""Key in a file's metadata of the checksum of everything else in the file."""
 HEADER = 8
-"""Bytes at the beginning of a safetensors file that say how long its header is."""
+"""Bytes at the beginning of a safetensors file that hold the length of its header."""
 
 
 def shipped_weights(domain: str) -> Path:
-    """Path of the weights that ship for a domain, or that `train` writes for one of somebody's own.
+    """Return the path of a domain's shipped weights, or of those `train` wrote for a user's domain.
 
     Raises:
         AssetError: there are none.
@@ -48,7 +48,7 @@ def shipped_weights(domain: str) -> Path:
 
 
 def fingerprint(network: nn.Module) -> str:
-    """What tells a network's weights from others: the beginning of a hash of them."""
+    """Return a fingerprint of a network's weights: the beginning of their hash."""
     digest = hashlib.sha256()
     for name, value in sorted(network.state_dict().items()):
         digest.update(name.encode())
@@ -57,7 +57,7 @@ def fingerprint(network: nn.Module) -> str:
 
 
 def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) -> None:
-    """Write weights and their card: how they were made, and how good they are.
+    """Write weights and their card, with training settings and accuracy.
 
     Raises:
         OutputError: the file cannot be written.
@@ -74,7 +74,7 @@ def save_self_model(self_model: SelfModel, path: Path, card: Mapping[str, Any]) 
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write a safetensors file with a checksum of all that is in it.
+    """Write a safetensors file with a checksum of its content.
 
     Raises:
         OutputError: the file cannot be written.
@@ -84,14 +84,14 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[st
 
 
 def read_tensors(path: Path, kinds: Mapping[str, str]) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a safetensors file.
+    """Read the metadata and tensors of a safetensors file.
 
     Args:
         path: the file.
-        kinds: by what its metadata may say under ``"format"``, what that is.
+        kinds: allowed values of ``"format"`` in the metadata, with a name for messages.
 
     Raises:
-        AssetError: the file is missing or damaged, or something else.
+        AssetError: the file is missing, damaged or of another format.
     """
     path = as_path(path)
     content = read_whole(path, AssetError)
@@ -99,7 +99,7 @@ def read_tensors(path: Path, kinds: Mapping[str, str]) -> tuple[dict[str, str], 
         tensors = load(content)
         header = content[HEADER : HEADER + int.from_bytes(content[:HEADER], "little")]
         metadata: dict[str, str] = json.loads(header).get("__metadata__", {})
-    # Nearly any exception can come of a damaged file, depending on where the damage is.
+    # A damaged file can raise nearly any exception.
     except Exception as error:
         raise AssetError(f"{path}: cannot be read as weights ({error})") from error
     if metadata.get("format") not in kinds:
@@ -126,7 +126,7 @@ def _checksum(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str
 
 
 def read_card(path: Path, kinds: Mapping[str, str]) -> dict[str, Any]:
-    """The card of a safetensors file; see :func:`read_tensors`."""
+    """Read the card of a safetensors file; see :func:`read_tensors`."""
     metadata, _ = read_tensors(path, kinds)
     try:
         return json.loads(metadata["card"])
@@ -135,11 +135,11 @@ def read_card(path: Path, kinds: Mapping[str, str]) -> dict[str, Any]:
 
 
 def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, dict[str, Any]]:
-    """Read a self-model, ready for use, and its card.
+    """Read a self-model, in evaluation mode, and its card.
 
     Args:
         path: a file of :func:`save_self_model`.
-        domain: name of the domain it has to be for; any unless given.
+        domain: name of the required domain; any unless given.
 
     Raises:
         AssetError: the file is missing or damaged, or is for another domain or version of it.

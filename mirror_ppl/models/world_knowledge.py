@@ -1,8 +1,8 @@
-"""What recordings tell of the world itself, and not of one person: an optional part of a model.
+"""Learning about the world itself from recordings: an optional part of a human model.
 
 A human model whose person knows what the robot does not, such as the rules of bomb defusal, derives
-from :class:`WorldKnowledge`, too. Everything else asks the functions below, which know what holds
-of human models without it.
+from :class:`WorldKnowledge`, too. All other code calls the functions below, which also accept human
+models without it.
 """
 
 from __future__ import annotations
@@ -22,44 +22,45 @@ class WorldKnowledge(ABC):
 
     Attributes:
         world_sites: sites of ``prior`` that are about the world, whose prior :meth:`fit_world`
-            changes. A population of people says nothing of them.
+            changes. Partial pooling over people leaves them out.
     """
 
     world_sites: tuple[str, ...] = ()
 
     def fit_world(self, demonstrations: Demonstrations) -> None:
-        """Learn about the world from recorded rounds, before anybody's implants are inferred.
+        """Learn about the world from recorded rounds, before any implants are inferred.
 
-        There is nothing to learn unless this is overridden.
+        Does nothing unless overridden.
         """
         del demonstrations
 
     @abstractmethod
     def planning_domain(self, draws: Mapping[str, Tensor]) -> Domain:
-        """The domain in which the robot plans, after what it learned.
+        """Return the domain in which the robot plans after :meth:`fit_world`.
 
         Args:
-            draws: of one person's implants ``[S, 1, 1, ...]``; implants of the reward change it.
+            draws: of one person's implants ``[S, 1, 1, ...]``; implants of the reward change the
+                domain.
         """
 
 
 def world_sites(human: HumanModel) -> tuple[str, ...]:
-    """Sites of a human model that are about the world; see :class:`WorldKnowledge`."""
+    """Return the sites of a human model that are about the world; see :class:`WorldKnowledge`."""
     return human.world_sites if isinstance(human, WorldKnowledge) else ()
 
 
 def fit_world(human: HumanModel, demonstrations: Demonstrations) -> None:
-    """Let a human model learn about the world, if it can; see :class:`WorldKnowledge`."""
+    """Call :meth:`WorldKnowledge.fit_world` if the human model has it."""
     if isinstance(human, WorldKnowledge):
         human.fit_world(demonstrations)
 
 
 def fit_shipped_world(human: HumanModel, setting: str) -> None:
-    """The same from the recordings that ship, for people who are drawn from what is left open."""
+    """Fit the world to the shipped recordings, before people are drawn from the prior."""
     if isinstance(human, WorldKnowledge):
         human.fit_world(load_demonstrations(asset_path(f"{human.domain.name}_{setting}_paper.nc")))
 
 
 def planning_domain(human: HumanModel, draws: Mapping[str, Tensor]) -> Domain:
-    """The domain in which the robot plans for a person of these draws ``[S, 1, 1, ...]``."""
+    """Return the domain in which the robot plans for a person with draws ``[S, 1, 1, ...]``."""
     return human.planning_domain(draws) if isinstance(human, WorldKnowledge) else human.domain

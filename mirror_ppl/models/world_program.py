@@ -3,7 +3,7 @@
 Given recordings, these sites do not depend on implants, so engines leave them out. Run forward they
 take the place of a simulator::
 
-    z_0 ~ q(z_0 | x_0)                      rounds begin with what there is to observe at first
+    z_0 ~ q(z_0 | x_0)                      rounds begin with the first observation
     z_t ~ p(z_t | z_{t-1}, a_{t-1}),   x^m_t ~ p(x^m_t | z_t),   r_t ~ p(r_t | z_t, a_t)
 """
 
@@ -21,7 +21,7 @@ from mirror_ppl.domains.base import Observation
 from mirror_ppl.models.self_model import SelfModel
 
 ACTION, OBSERVATION = "action_", "observation_"
-"""What the names of these sites begin with."""
+"""Prefixes of the names of these sites."""
 
 
 def first_state(self_model: SelfModel, observation: Observation) -> Tensor:
@@ -68,14 +68,14 @@ def reward(self_model: SelfModel, state: Tensor, action: Tensor, recorded: Tenso
 
 
 class TrueWorld(Messenger):
-    """The domain's own world in place of the self-model's, where the program is run forward.
+    """Replaces the self-model's observations by the domain's own when the program runs forward.
 
-    What there is to observe at a step follows from the actions drawn before it::
+    The observation at a step follows from the actions drawn before it::
 
         with TrueWorld(human.self_model, state):
             poutine.uncondition(human.model)(rounds, world=True)
 
-    States and rewards stay those of the self-model.
+    States and rewards are still those of the self-model.
 
     Args:
         self_model: the robot's.

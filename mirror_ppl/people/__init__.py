@@ -1,7 +1,7 @@
-"""Simulated people, and the recordings of them from which models of people are fitted.
+"""Simulated people, and recordings of them to which human models are fitted.
 
-A world's own people are in its folder, and named in its record; those of a world that has none are
-as the robot itself, of limited sight.
+The people of a world are in its folder and named in its record. In a world without its own people,
+they act like the robot, with limited sight.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mirror_ppl.progress import Progress
 
 
 def people_of(domain: str) -> DomainPeople | None:
-    """The people of a domain's own; None where they are as the robot itself, of limited sight.
+    """Return a domain's own people; None where they act like the robot, with limited sight.
 
     Raises:
         UnknownNameError: there is no such domain.
@@ -41,13 +41,13 @@ def simulated_people(
     device: torch.device | str = "cpu",
     self_model: Path | None = None,
 ) -> SimulatedPeople:
-    """The simulated people of a population, to be stepped by whoever wants to.
+    """Return the simulated people of a population, to be stepped by the caller.
 
-    The same seed gives the same people, those whom `simulate` records; see there for arguments.
+    A seed gives the people that `simulate` records with it; see there for arguments.
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
-        AssetError: people of a world of somebody's own need a self-model, and it is not there.
+        AssetError: the self-model that people of a user's world need is missing.
         InputError: fewer than one person, or no seed.
     """
     world = get_domain(domain)
@@ -60,7 +60,7 @@ def simulated_people(
 
 
 def populations_of(domain: str) -> tuple[str, ...]:
-    """Who the simulated people of a domain may be.
+    """Return the names of a domain's populations.
 
     Raises:
         UnknownNameError: there is no such domain.
@@ -70,9 +70,9 @@ def populations_of(domain: str) -> tuple[str, ...]:
 
 
 def has_oracle(domain: str, population: str) -> bool:
-    """Whether the best messages to such people can be found: not if a setting limits their sight.
+    """True if the oracle can compute the best messages to such people.
 
-    People of a world's own can be looked through exactly, and others if they are as modelled.
+    It can for a world's own people, and for others unless a setting limits their sight.
     """
     return people_of(domain) is not None or population == "diverse"
 
@@ -94,31 +94,31 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
     Args:
         domain: a domain's name.
         setting: one of its settings; the last, in which sight is worst, unless given.
-        population: who the people are: ``paper``, sight limited by the setting alone, or
-            ``diverse``, each person's own sight in whatever setting.
+        population: the kind of people: ``paper``, sight limited by the setting alone, or
+            ``diverse``, sight that differs between people and not between settings.
         people: number of people P.
-        rounds: number of rounds B of each.
-        seed: the same seed gives the same people in every setting, and the same call the same
-            recordings; each setting has rounds of its own.
-        device: where the work is done and the recordings lie. Another kind of device has other
-            random numbers, and so the same people in other rounds.
-        progress: is told of every step of the rounds.
-        told: chance that an item that can be communicated is told, at each step and whoever it
-            helps; nobody tells them anything unless given.
-        self_model: weights of the robot in a world of somebody's own, whose people infer and value
-            as it does (:mod:`mirror_ppl.people.robot_like`); those that `train` wrote, by default.
+        rounds: number of rounds B per person.
+        seed: a seed gives the same people in every setting, and equal calls equal recordings; each
+            setting has its own rounds.
+        device: device of the computation and of the recordings. Other kinds of device have other
+            random numbers, so the same people play other rounds.
+        progress: advanced at every step of the rounds.
+        told: probability that a communicable item is communicated, at each step and independent of
+            its use; no messages unless given.
+        self_model: weights of the robot in a user's world, whose people infer and value as it does
+            (:mod:`mirror_ppl.people.robot_like`); those that `train` wrote, by default.
 
     Returns:
-        P people with B rounds each, which end when all is done. Its truths are ``sight_...`` for
-        each of the domain's directions (how far the person sees, in the domain's unit of distance;
-        the last of ``reach_bins`` is everything), ``assumes_...`` for each of the domain's
-        assumptions (1: made), and of driving ``consistency`` (1 / units of reward), of search and
-        rescue ``lapse`` (probability of a step in any direction); of bomb defusal
+        P people with B rounds each, which end when the task is done. Their true values are
+        ``sight_...`` for each of the domain's directions (how far the person sees, in the domain's
+        unit of distance; the last of ``reach_bins`` is everything), ``assumes_...`` for each of the
+        domain's assumptions (1: made); in driving ``consistency`` (1 / units of reward), in search
+        and rescue ``lapse`` (probability of a step in a random direction), in bomb defusal
         ``notices_...`` for each terminal (probability of finding it at a step).
 
     Raises:
         UnknownNameError: there is no such domain, setting, population or device.
-        AssetError: there is no self-model of a world of somebody's own.
+        AssetError: a user's world has no self-model.
         InputError: fewer than one person or round, no seed, or ``told`` is no probability.
     """
     world = get_domain(domain)

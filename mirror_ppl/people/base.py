@@ -1,4 +1,4 @@
-"""What simulated people have in common: they look, listen, remember and choose."""
+"""Base classes of simulated people, who look, listen, remember and choose."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class DomainPeople:
     """The simulated people of a domain.
 
     Attributes:
-        populations: names of who they may be.
-        simulated: makes them, of setting, population, number, seed and device.
-        oracle: of one person and the states in which rounds begin, what says ``[R, items]`` what is
-            best after actions ``[R, t]``; unless given it is sought in every state that can be
-            reached (:mod:`mirror_ppl.evaluation.reachable_oracle`).
+        populations: names of the populations.
+        simulated: makes people from setting, population, number, seed and device.
+        oracle: maps one person and the initial states of rounds to a function from actions
+            ``[R, t]`` to the best messages ``[R, items]``; unless given, the oracle enumerates
+            reachable states (:mod:`mirror_ppl.evaluation.reachable_oracle`).
     """
 
     populations: tuple[str, ...]
@@ -38,13 +38,13 @@ class DomainPeople:
 class SimulatedPeople(ABC):
     """P people who act in a domain; step them with `step`.
 
-    Nothing is kept between calls: the memory goes in and comes out, so that one person can be led
-    through many courses of a round at once. A memory is a dataclass of tensors, all of which begin
-    with the dimensions of the rounds.
+    They have no state between calls: the memory is an argument and a result, so that one person can
+    be simulated along many histories at once. A memory is a dataclass of tensors, all of which
+    begin with the dimensions of the rounds.
 
     Attributes:
-        mind_noises: how many uniform numbers, drawn as a round begins, decide what is random in a
-            person's mind; choices of actions are not among them.
+        mind_noises: number of uniform numbers per round for random events in a person's mind, apart
+            from choices of actions.
     """
 
     mind_noises: ClassVar[int] = 0
@@ -52,24 +52,24 @@ class SimulatedPeople(ABC):
     @property
     @abstractmethod
     def domain(self) -> Domain:
-        """The world that they act in."""
+        """World in which they act."""
 
     @abstractmethod
     def start(self, *batch: int, mind_noise: Tensor | None = None) -> Any:
-        """Memory ``[P, *batch, ...]`` before a round begins.
+        """Return memories ``[P, *batch, ...]`` before a round begins.
 
         Args:
             batch: rounds.
             mind_noise: uniform numbers ``[P, *batch, mind_noises]``; unless given, the most
-                probable happens.
+                probable events happen.
         """
 
     @abstractmethod
     def sees(self, observation: Observation) -> Visibility:
-        """What each sees and hears by themselves, boolean ``[P, ..., K]`` for each modality.
+        """Return items each perceives without messages, boolean ``[P, ..., K]`` by modality.
 
         Args:
-            observation: ``[P, ...]``, everything there is to observe.
+            observation: full observation, ``[P, ...]``.
         """
 
     @abstractmethod
@@ -80,7 +80,7 @@ class SimulatedPeople(ABC):
 
         Args:
             memory: of the step before, ``[P, ...]``; `start` at the first step of a round.
-            observation: ``[P, ...]``, everything there is to observe.
+            observation: full observation, ``[P, ...]``.
             told: boolean ``[P, ..., K]`` for each modality, the items communicated at this step.
 
         Returns:
@@ -90,7 +90,7 @@ class SimulatedPeople(ABC):
     def branches(
         self, memory: Any, observation: Observation, told: Visibility
     ) -> tuple[Tensor, Any, Tensor]:
-        """Everything that a step can lead to in their minds, where that is chance.
+        """Return all memories that a step can lead to, where random events decide.
 
         Args:
             memory: as for `step`.
@@ -98,8 +98,8 @@ class SimulatedPeople(ABC):
             told: as for `step`.
 
         Returns:
-            Chances ``[P, ..., G]`` of G minds, these ``[P, ..., G, ...]``, and probabilities of the
-            actions of each ``[P, ..., G, A]``.
+            Probabilities ``[P, ..., G]`` of G memories, these memories ``[P, ..., G, ...]``, and
+            probabilities of the actions of each ``[P, ..., G, A]``.
         """
         probability, after = self.step(memory, observation, told)
         dimensions = probability.dim() - 1
@@ -110,47 +110,47 @@ class SimulatedPeople(ABC):
         )
 
     def acted(self, memory: Any, action: Tensor) -> Any:
-        """The memory once an action ``[P, ...]`` was chosen; people need not keep it in mind."""
+        """Return the memory after an action ``[P, ...]`` was chosen; unchanged by default."""
         del action
         return memory
 
     def kept(self, memory: Any) -> Any:
-        """Of a memory what is known and wanted, without the numbers that decide what is chance."""
+        """Return a memory without its random numbers: what is known and wanted."""
         return memory
 
     @abstractmethod
     def truth(self) -> dict[str, Tensor]:
-        """What is true of each ``[P]``, by the names of the sites that infer it."""
+        """Return true values ``[P]`` by the names of the sites that infer them."""
 
     def provenance(self) -> dict[str, str]:
-        """What recordings say of how these people were made, besides population and seed."""
+        """Return provenance for recordings, besides population and seed."""
         return {}
 
     def modelled(self) -> tuple[HumanModel, dict[str, Tensor]] | None:
-        """A human model, and values ``[1, P, 1, ...]`` of its sites with which it is these people.
+        """Return a human model and values ``[1, P, 1, ...]`` of its sites that equal these people.
 
-        ``None`` if they are of another kind.
+        ``None`` if no human model equals them.
         """
         return None
 
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
     ) -> Tensor:
-        """Probabilities ``[P, B, T, A]`` of actions given everything but the action noise.
+        """Return probabilities ``[P, B, T, A]`` of actions, given the history before each.
 
-        They differ from those of `step` where people have something in mind that cannot be seen.
+        They differ from those of `step` where memories have latent random parts.
 
         Args:
-            probabilities: of each step, given what they had in mind, ``[P, B, T, A]``.
-            observation: what there was to observe, ``[P, B, T + 1, ...]``.
-            actions: what was done, ``[P, B, T]``.
-            told: what was communicated, ``[P, B, T, K]``.
+            probabilities: of each step, given the memory, ``[P, B, T, A]``.
+            observation: full observations, ``[P, B, T + 1, ...]``.
+            actions: actions, ``[P, B, T]``.
+            told: communicated items, ``[P, B, T, K]``.
         """
         del observation, actions, told
         return probabilities
 
     def select(self, index: list[int]) -> Self:
-        """Some of these people, ``[len(index)]``."""
+        """Return some of these people, ``[len(index)]``."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
         return type(self)(
             **{
@@ -161,7 +161,7 @@ class SimulatedPeople(ABC):
 
 
 def act(probability: Tensor, action_noise: Tensor) -> Tensor:
-    """Actions ``[...]`` that uniform numbers ``[...]`` choose with probabilities ``[..., A]``.
+    """Choose actions ``[...]`` with probabilities ``[..., A]`` by uniform numbers ``[...]``.
 
     Small numbers choose late actions: of two, the second where the noise is below its probability.
     """
@@ -170,16 +170,16 @@ def act(probability: Tensor, action_noise: Tensor) -> Tensor:
 
 
 def each(value: Tensor, dimensions: int) -> Tensor:
-    """Insert dimensions behind the first, so that people broadcast over what follows."""
+    """Insert dimensions after the first, so that people broadcast over later dimensions."""
     return value.reshape(value.shape[0], *[1] * dimensions, *value.shape[1:])
 
 
 def derived_generator(
     seed: int, *purpose: str | int, device: torch.device | str = "cpu"
 ) -> torch.Generator:
-    """A generator of its own for each seed and purpose.
+    """Return a separate generator for each seed and purpose.
 
-    Hashed rather than added up, so that neighbouring seeds share nothing.
+    Seeds are hashed rather than added, so that neighbouring seeds are independent.
     """
     text = "/".join(map(str, (seed, *purpose)))
     digest = hashlib.blake2b(text.encode(), digest_size=8).digest()

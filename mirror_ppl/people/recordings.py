@@ -1,4 +1,4 @@
-"""Recordings of simulated people, of whatever domain."""
+"""Recordings of simulated people, in any domain."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ from mirror_ppl.version import __version__
 
 @dataclass(frozen=True)
 class Start:
-    """How rounds begin, and the random numbers by which people choose.
+    """Initial states of rounds, and random numbers for people's choices.
 
     Attributes:
         state: states ``[P, B]``.
         scenario: indices into the domain's scenarios ``[P, B]``.
         action_noise: uniform numbers ``[P, B, T]`` that choose actions, see
             `mirror_ppl.people.base.act`.
-        mind_noise: uniform numbers ``[P, B, L]`` that decide what is chance in a person's mind.
-        message_noise: uniform numbers ``[P, B, T, N]`` that decide which items are communicated,
-            if any are.
+        mind_noise: uniform numbers ``[P, B, L]`` for random events in a person's mind.
+        message_noise: uniform numbers ``[P, B, T, N]`` that choose the communicated items, if any.
     """
 
     state: Any
@@ -37,7 +36,7 @@ class Start:
     message_noise: Tensor | None = None
 
     def select(self, people: slice) -> Start:
-        """The rounds of some of the people."""
+        """Return the rounds of some of the people."""
         return Start(
             map_state(lambda part: part[people], self.state),
             self.scenario[people],
@@ -47,7 +46,7 @@ class Start:
         )
 
     def round(self, number: int) -> Start:
-        """One of the rounds alone."""
+        """Return one of the rounds."""
         own = slice(number, number + 1)
         return Start(
             map_state(lambda part: part[:, own], self.state),
@@ -60,16 +59,16 @@ class Start:
 
 @dataclass(frozen=True)
 class Recording:
-    """What happened in rounds.
+    """Observations, actions and memories of rounds.
 
     Attributes:
-        observation: everything there was to observe, ``[P, B, T + 1, ...]``.
+        observation: full observations, ``[P, B, T + 1, ...]``.
         actions: ``[P, B, T]``.
         rewards: of the task, ``[P, B, T]``.
-        probabilities: of the actions, given what people had in mind, ``[P, B, T, A]``.
-        memory: what they knew when they acted, ``[P, B, T, ...]``.
-        lengths: steps ``[P, B]`` until all was done, or all T.
-        told: which items were communicated before each action, ``[P, B, T, K]`` by modality.
+        probabilities: of the actions, given memories, ``[P, B, T, A]``.
+        memory: memories when they acted, ``[P, B, T, ...]``.
+        lengths: steps ``[P, B]`` until the task was done, or T.
+        told: items communicated before each action, ``[P, B, T, K]`` by modality.
     """
 
     observation: Observation
@@ -90,16 +89,16 @@ def draw_starts(
     domain: Domain | None = None,
     mind_noises: int = 0,
 ) -> Start:
-    """Draw how the rounds ``[P, B]`` begin, for each person from a generator of their own.
+    """Draw initial states and noise of rounds ``[P, B]``, with a separate generator per person.
 
     Args:
         people: number of people P.
-        rounds: number of rounds B of each.
+        rounds: number of rounds B per person.
         seed: with the purpose it determines the rounds.
-        purpose: what they are for; other words give other rounds.
-        device: where they are drawn and live.
+        purpose: words for the use of the rounds; other words give other rounds.
+        device: device of the generators and the result.
         domain: the world; driving unless given.
-        mind_noises: numbers L of a round that decide what is chance in a person's mind.
+        mind_noises: number L of uniform numbers per round for a person's mind.
     """
     domain = domain or get_domain("driving")
     scenarios, states, action_noise, mind_noise = [], [], [], []
@@ -123,13 +122,13 @@ def draw_starts(
 def record(
     people: SimulatedPeople, start: Start, progress: Progress | None = None, told: float = 0.0
 ) -> Recording:
-    """Let people play rounds to the end.
+    """Simulate rounds of people to the end.
 
     Args:
         people: P people.
-        start: how their rounds ``[P, B]`` begin.
-        progress: is told of every step.
-        told: chance that an item that can be communicated is, at each step; by chance alone.
+        start: initial states and noise of their rounds ``[P, B]``.
+        progress: advanced at every step.
+        told: probability that a communicable item is communicated, at each step.
     """
     domain = people.domain
     state, memory = (
@@ -178,7 +177,7 @@ def _told(
     under_way: Tensor,
     rate: float,
 ) -> Visibility:
-    """Which items ``[P, B, K]`` are told, by numbers ``[P, B, N]``; none without those."""
+    """Return communicated items ``[P, B, K]``, chosen by noise ``[P, B, N]``; none without."""
     can_be = domain.communicable(observation)
     if message_noise is None:
         return {name: torch.zeros_like(mask) for name, mask in can_be.items()}
@@ -199,7 +198,7 @@ def recorded(
     progress: Progress | None = None,
     told: float = 0.0,
 ) -> Demonstrations:
-    """Recordings of simulated people; see `mirror_ppl.people.simulate`."""
+    """Record simulated people; see `mirror_ppl.people.simulate`."""
     domain, truth = people.domain, people.truth()
     number = len(next(iter(truth.values())))
     start = draw_starts(
@@ -248,7 +247,7 @@ def _message_noise(
     domain: Domain,
     device: torch.device | str,
 ) -> Tensor:
-    """Numbers ``[P, B, T, N]`` that decide what is told, for each person from a generator."""
+    """Draw noise ``[P, B, T, N]`` that chooses messages, with a generator per person."""
     items = sum(len(part.items) for part in domain.modalities)
     drawn = []
     for person in range(people):

@@ -1,4 +1,4 @@
-"""People of any world: as the robot itself, but of limited sight and a consistency of their own."""
+"""People of any world who act like the robot, with their own limited sight and consistency."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.people.base import SimulatedPeople, derived_generator
 
 SELF_MODEL = "self_model"
-"""What recordings call the fingerprint of the robot that people are like."""
+"""Key in recordings' provenance of the fingerprint of the people's self-model."""
 POPULATIONS = ("diverse", "paper")
 
 
 @dataclass(frozen=True)
 class Mind:
-    """What somebody believes and knows, and what they did last.
+    """Beliefs, knowledge and last actions of people.
 
     Attributes:
         belief: the encoder's mean, ``[P, ..., Z]``.
         action: ``[P, ...]``; the number of actions before the first one.
-        knowledge: fields of the domain's knowledge, ``[P, ..., *]``, flat and one behind the other.
+        knowledge: fields of the domain's knowledge, ``[P, ..., *]``, flattened and concatenated.
     """
 
     belief: Tensor
@@ -54,7 +54,7 @@ class RobotLike(SimulatedPeople):
 
     Attributes:
         self_model: the robot's.
-        setting: what limits the sight of people who have no threshold of their own.
+        setting: setting that limits the sight of people without thresholds.
         reach: threshold of sight for each direction ``[P, D]``, or ``None``.
         consistency: inverse temperature of their choices per unit of reward, ``[P]``.
     """
@@ -66,11 +66,11 @@ class RobotLike(SimulatedPeople):
 
     @property
     def domain(self) -> Domain:
-        """The world that they act in."""
+        """World in which they act."""
         return self.self_model.domain
 
     def start(self, *batch: int, mind_noise: Tensor | None = None) -> Mind:
-        """Nothing was seen or done yet."""
+        """Return memories before a round begins."""
         del mind_noise
         shape, like = (len(self.consistency), *batch), self.consistency
         return Mind(
@@ -80,7 +80,7 @@ class RobotLike(SimulatedPeople):
         )
 
     def sees(self, observation: Observation) -> Visibility:
-        """What is within reach, or all that the setting lets people see."""
+        """Return items within reach, or those visible in the setting."""
         if self.reach is None:
             return self.domain.visibility(self.setting, observation)
         direction, distance = self.domain.distance(observation)
@@ -91,7 +91,7 @@ class RobotLike(SimulatedPeople):
     def step(
         self, memory: Mind, observation: Observation, told: Visibility | None = None
     ) -> tuple[Tensor, Mind]:
-        """Infer what is so by the robot's encoder, and choose by its values."""
+        """Update beliefs by the robot's encoder, and choose by its action values."""
         domain, encoder = self.domain, self.self_model.encoder
         visible = self.sees(observation)
         if told is not None:
@@ -110,11 +110,11 @@ class RobotLike(SimulatedPeople):
         return torch.softmax(scale * values, -1), mind
 
     def acted(self, memory: Mind, action: Tensor) -> Mind:
-        """They know what they did."""
+        """Return the memory with the chosen action."""
         return Mind(memory.belief, action, memory.knowledge)
 
     def truth(self) -> dict[str, Tensor]:
-        """Their consistency, and how far they see if it is up to them."""
+        """Return their consistency, and sight thresholds if they have them."""
         own = {"consistency": self.consistency}
         if self.reach is not None:
             own |= {
@@ -124,11 +124,11 @@ class RobotLike(SimulatedPeople):
         return own
 
     def provenance(self) -> dict[str, str]:
-        """The fingerprint of the robot whose networks they have."""
+        """Return the fingerprint of their self-model."""
         return {SELF_MODEL: fingerprint(self.self_model)}
 
     def modelled(self) -> tuple[HumanModel, dict[str, Tensor]] | None:
-        """The human model of the paper, which they are but for sight that a setting limits."""
+        """Return the paper's human model, or None if a setting limits their sight."""
         if self.reach is None:
             return None
         human = HumanModel(self.self_model)
@@ -145,7 +145,7 @@ class RobotLike(SimulatedPeople):
 def simulated_robot_like(
     self_model: SelfModel, setting: str, population: str, people: int, seed: int
 ) -> RobotLike:
-    """People of a population: ``diverse``, each of a reach of their own, or ``paper``.
+    """Make people of a population: ``diverse``, each with their own reach, or ``paper``.
 
     Raises:
         UnknownNameError: there is no such setting or population.
@@ -177,7 +177,7 @@ def _flat(knowledge: object, dimensions: int) -> Tensor:
 
 
 def _like(example: object, flat: Tensor) -> object:
-    """Knowledge of the example's shapes and types, the inverse of `_flat`."""
+    """Restore knowledge of the example's shapes and dtypes, the inverse of `_flat`."""
     parts = list(vars(example).values())
     dimensions = flat.dim() - 1
     pieces = iter(flat.split([part[(0,) * dimensions].numel() for part in parts], -1))

@@ -72,7 +72,9 @@ def test_a_fit_says_that_nothing_was_held_out(tmp_path, capsys):
 
 def test_one_radius_is_refused_where_distances_do_not_count():
     robot, _ = load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")
-    with pytest.raises(HumanModelError, match="one-radius: in bomb_defusal it does not count"):
+    with pytest.raises(
+        HumanModelError, match="one-radius: in bomb_defusal distance does not matter"
+    ):
         load_human_model("one-radius", robot)
 
 

@@ -158,8 +158,8 @@ def silent(decision):
     assert not decision.message
     assert decision.gain == Gain(0.0, 0.0, 0.0)
     return decision.why() in (
-        "silence: nothing that could be told is worth its cost",
-        "silence: there is nothing new that can be told now",
+        "silence: no message is worth its cost",
+        "silence: there is nothing new to communicate now",
         "silence: the round is over",
     )
 
@@ -330,7 +330,7 @@ def test_mirror_kl_plans_too():
     decision = Communicator(someone, Divergence(), Exhaustive()).plan(begun(*BLOCKED))
     assert decision.message
     assert decision.turning_point is None
-    assert decision.why().endswith(": brings what they believe closer to what is so")
+    assert decision.why().endswith(": brings their belief closer to the truth")
     assert not any(name.startswith("p(") for name in decision.alternatives)
 
 

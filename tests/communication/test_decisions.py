@@ -143,7 +143,7 @@ def test_a_decision_without_a_choice():
     assert one.cost == 0
     assert one.matters == {}
     assert one.turning_point is None
-    assert one.why() == "silence: there is nothing new that can be told now"
+    assert one.why() == "silence: there is nothing new to communicate now"
     (row,) = one.alternatives.to_dict("records")
     assert row == {
         "message": "silence",
@@ -195,11 +195,10 @@ def test_silence_turns_nothing():
 
 def test_why_silence():
     useless = decision(0, [plan(None), plan(SAID)], [[0.0, 0], [-1, 0]])
-    assert useless.why() == "silence: nothing that could be told is worth its cost"
+    assert useless.why() == "silence: no message is worth its cost"
     unsure = decision(0, [plan(None), plan(SAID)], [[0.0, 0], [3, -1]])
     assert unsure.why() == (
-        "silence: what could be told is not surely worth its cost "
-        "(the best gains +1.00 [-2.29, +4.29])"
+        "silence: no message is reliably worth its cost (the best gains +1.00 [-2.29, +4.29])"
     )
 
 
@@ -214,17 +213,25 @@ def test_why_waiting(wait, steps):
 @pytest.mark.parametrize(
     ("silent", "told", "what"),
     [
-        ([[0.9, 0.1]], [[0.2, 0.8]], "stay in its way with probability 0.90; told, 0.20"),
-        ([[0.25, 0.75]], [[0.5, 0.5]], "switch lanes with probability 0.75; told, 0.50"),
+        (
+            [[0.9, 0.1]],
+            [[0.2, 0.8]],
+            "stay in its way with probability 0.90; with the message, 0.20",
+        ),
+        (
+            [[0.25, 0.75]],
+            [[0.5, 0.5]],
+            "switch lanes with probability 0.75; with the message, 0.50",
+        ),
         (
             [[0.5, 0.5], [0.9, 0.1]],
             [[0.5, 0.5], [0.2, 0.8]],
-            "stay in their lane in 1 step with probability 0.90; told, 0.20",
+            "stay in their lane in 1 step with probability 0.90; with the message, 0.20",
         ),
         (
             [[0.5, 0.5], [0.5, 0.5], [0.9, 0.1]],
             [[0.5, 0.5], [0.5, 0.5], [0.2, 0.8]],
-            "stay in their lane in 2 steps with probability 0.90; told, 0.20",
+            "stay in their lane in 2 steps with probability 0.90; with the message, 0.20",
         ),
     ],
 )
@@ -234,7 +241,7 @@ def test_why_a_message(silent, told, what):
 
 def test_why_where_no_action_changes_much():
     assert turned([[0.9, 0.1]], [[0.87, 0.13]]).why() == (
-        f"{AHEAD}: changes a little of what they do in the steps ahead (gain +1.00)"
+        f"{AHEAD}: slightly changes what they do in the steps ahead (gain +1.00)"
     )
 
 
@@ -254,4 +261,4 @@ def test_a_car_is_named_once_though_it_is_shown_and_spoken_of():
 
 
 def test_why_where_the_objective_does_not_look_at_actions():
-    assert four(1).why() == f"{AHEAD}: brings what they believe closer to what is so"
+    assert four(1).why() == f"{AHEAD}: brings their belief closer to the truth"

@@ -1,4 +1,4 @@
-"""Bomb defusal: the world, and what the package knows of it in `record`."""
+"""Bomb defusal: the world, its people, human models and settings."""
 
 from mirror_ppl.domains.bomb_defusal.world import (
     WAIT,

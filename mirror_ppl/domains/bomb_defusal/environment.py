@@ -13,9 +13,9 @@ class BombDefusalEnv(DomainEnv):
     """A bomb with three stages, and what one person sees and hears of it.
 
     ## Description
-    A round of `mirror_ppl.domains.bomb_defusal.BombDefusal`, by the rules that are so, seen by an
+    A round of `mirror_ppl.domains.bomb_defusal.BombDefusal`, with the true rules, seen by an
     unaided person in one of the domain's settings. All mechanics are the domain's. All terminals
-    are in view: how long people take to find the one that counts is a matter of people.
+    are in view: how soon people find the lit one depends on the person.
 
     ## Action Space
     `Discrete(5)`: 0 wait, 1 red, 2 green, 3 blue, 4 yellow.
@@ -26,7 +26,7 @@ class BombDefusalEnv(DomainEnv):
     | key           | shape   | type    | feature                      | unit      | range   |
     |---------------|---------|---------|------------------------------|-----------|---------|
     | `ego`         | (2,)    | float32 | stage                        | count     | 0 to 3  |
-    |               |         |         | since when                   | steps     | 0 to 60 |
+    |               |         |         | steps since it began         | steps     | 0 to 60 |
     | `visual`      | (6, 75) | float32 | pixels of the terminal: row, | intensity | 0 to 1  |
     |               |         |         | column, red-green-blue       |           |         |
     | `visual_mask` | (6,)    | int8    | the terminal is in view      |           | 0 or 1  |
@@ -34,7 +34,7 @@ class BombDefusalEnv(DomainEnv):
     | `verbal_mask` | (1,)    | int8    | the type is known            |           | 0 or 1  |
 
     `info` holds the `scenario`'s name and, in `state`, the true `stage`, `since`, `kind` (0 for A),
-    `live` (the terminal that counts at each stage) and `symbols` (of all terminals at each stage);
+    `live` (the lit terminal of each stage) and `symbols` (of all terminals at each stage);
     after a step also the `rewards`, terms by name.
 
     ## Rewards

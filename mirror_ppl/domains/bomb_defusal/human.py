@@ -1,20 +1,20 @@
-"""People who search, and who know rules that the robot does not: the model of bomb defusal.
+"""The human model of bomb defusal: people search terminals and know rules the robot does not.
 
 Implements the implants of the supplement's section C for bomb defusal::
 
     m          ~ Beta(1, 9)                    notice_mean: of noticing a terminal at a step
-    c          ~ LogNormal(log 100, 1)         notice_concentration: how little terminals differ
+    c          ~ LogNormal(log 100, 1)         notice_concentration: high if terminals differ little
     notices_k  ~ Beta(c m, c (1 - m))          probability of noticing terminal k at a step
     reads      ~ Bernoulli                     whether they can read the type of the bomb
-    rule_j     ~ Categorical(permutations)     policy: which button they press for that of the robot
-    guess_b    ~ Bernoulli                     in each round: the type they take it for
-    found_b,s  ~ Geometric(notices_k)          in each round and stage s, k what one looks for in it
-    n_t        = what one looks for, from found_b,s on; the type, if they can read it
+    rule_j     ~ Categorical(permutations)     policy: the button they press for each of the robot's
+    guess_b    ~ Bernoulli                     in each round: the guessed type
+    found_b,s  ~ Geometric(notices_k)          in each round and stage s, with lit terminal k
+    n_t        = the lit terminal, from found_b,s on; the type, if they can read it
 
-and ``a_t`` is chosen by the robot's action values at ``zH_t`` as everywhere, with buttons exchanged
-by the rule of the type that ``zH_t`` is of. By the same rules the robot's own reward model is
-wrong. Recorded rewards tell which hold (:meth:`BombDefusalHuman.fit_world`), so they are an implant
-of the reward, too::
+and ``a_t`` is chosen by the robot's action values at ``zH_t`` as in other domains, with buttons
+permuted by the rule of the type in ``zH_t``. The robot's reward model has the same wrong rules.
+Recorded rewards identify the true rules (:meth:`BombDefusalHuman.fit_world`), so the rules are also
+an implant of the reward::
 
     r_t ~ Normal(r(s_t, rule^-1(a_t)), 1)    r the reward as the robot was taught it
 """
@@ -42,19 +42,19 @@ from mirror_ppl.models.world_knowledge import WorldKnowledge
 
 NOTICE_MEAN, NOTICE_CONCENTRATION = "notice_mean", "notice_concentration"
 READS, RULE, GUESS, FOUND, SOUGHT = "reads_type", "rule_", "guess", "found_", "sought_"
-"""Names of sites, and of the covariate: what is looked for at a stage."""
+"""Names of sites, and of the covariate: the lit terminal of a stage."""
 SEARCHING = (1.0, 9.0)
 """Prior of the mean probability of noticing a terminal at a step: a Beta density of mean 0.1."""
 CONCENTRATION = (100.0, 1.0)
-"""Prior of the concentration around that mean, in searches that would tell as much: its median, and
-the standard deviation of its logarithm."""
+"""Prior of the concentration around that mean, in equivalent searches: its median, and the standard
+deviation of its logarithm."""
 SAME = 0.5
 """Prior probability that the robot's rules for a type hold."""
 WAITS, MOST_WAITS, BLIND = 2.0, 8.0, 4.0
-"""In nats, what it takes to explain a wait although it was found, several of them at most, and a
-press although it was not."""
+"""Log weights of the proposal, in nats: for a wait although the terminal was found, for several
+such waits at most, and for a press although it was not found."""
 RULE_NAMES = [" ".join(pressed) for pressed in permutations(BUTTONS)]
-"""Of each rule: what they press where the robot would press each of the buttons in turn."""
+"""Names of rules: the buttons they press where the robot would press each button in turn."""
 RULE_NAMES[0] += " (as the robot)"
 EVEN_ODDS = 0.5
 REWARD_SCALE = 1.0
@@ -62,17 +62,16 @@ REWARD_SCALE = 1.0
 
 
 class BombDefusalHuman(HumanModel, WorldKnowledge):
-    """Finds what counts sooner or later, guesses what nobody says, and knows the rules.
+    """Finds the lit terminal after a random delay, guesses an unknown type, and knows the rules.
 
     Args:
         self_model: the robot's networks, of bomb defusal.
 
     Attributes:
-        kinds: types of bombs, as sites name them.
+        kinds: types of bombs, as in names of sites.
         rule_logits: of each permutation of buttons, by type, ``[2, 24]``; the prior until
-            :meth:`fit_world` was called.
-        exchanges: these permutations, ``[24, 4, 4]``: the button that somebody presses, and that
-            which the robot would.
+            :meth:`fit_world` is called.
+        exchanges: these permutations, ``[24, 4, 4]``: the person's button, and the robot's.
     """
 
     kinds = tuple(kind.lower().replace(" ", "_") for kind in KINDS)
@@ -92,7 +91,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
 
     @property
     def domain(self) -> BombDefusal:
-        """Bomb defusal."""
+        """Bomb defusal domain."""
         world = self.self_model.domain
         assert isinstance(world, BombDefusal)
         return world
@@ -104,7 +103,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         return prior.log()
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample how they notice terminals, whether they read the type, their rules and choices."""
+        """Sample the perceptual implants, the rules and the policy implants."""
         like = next(self.self_model.parameters())
         return (
             self.perceptual_implants()
@@ -113,7 +112,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         )
 
     def perceptual_implants(self) -> dict[str, Tensor]:
-        """Sample how probably they notice each terminal, and whether they read the type."""
+        """Sample probabilities of noticing each terminal, and whether they read the type."""
         like = next(self.self_model.parameters())
         success, failure = like.new_tensor(SEARCHING)
         notice_mean = pyro.sample(NOTICE_MEAN, dist.Beta(success, failure))
@@ -129,14 +128,14 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         )
 
     def rules(self) -> dict[str, Tensor]:
-        """Sample which button they press for that of the robot, by type."""
+        """Sample the permutation of the robot's buttons, by type."""
         return {
             RULE + kind: pyro.sample(RULE + kind, dist.Categorical(logits=logits))
             for kind, logits in zip(self.kinds, self.rule_logits, strict=True)
         }
 
     def round_latents(self, implants: Implants) -> dict[str, Tensor]:
-        """Sample the guess, and when they find what they look for at each stage."""
+        """Sample the guess, and the step at which the lit terminal of each stage is found."""
         one = next(iter(implants.values()))
         items = next(m.items for m in self.domain.modalities if m.name == "visual")
         each = [implants[implant_priors.NOTICES + item] for item in items]
@@ -152,9 +151,9 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         return sites
 
     def covariates(self, observation: Observation) -> dict[str, Tensor]:
-        """What was looked for at each stage; at those not reached, what was looked for last."""
+        """Return the lit terminal of each stage; the last one for stages not reached."""
         stage = observation["ego"][..., 0].long()
-        if not stage.shape[-1]:  # of nobody's round nothing was looked for
+        if not stage.shape[-1]:  # padding has no lit terminal
             nothing = stage.new_zeros(stage.shape[:-1])
             return {f"{SOUGHT}{number}": nothing for number in range(STAGES)}
         sought = self.domain.sought(observation).long().argmax(-1)
@@ -168,9 +167,9 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         return found
 
     def spans(self, observation: Observation) -> dict[str, Span]:
-        """The guess counts throughout; when something is found, at that stage.
+        """Return the spans: the guess throughout, each stage's ``found`` within that stage.
 
-        Whatever is found later than that is not found.
+        All values after the end of the stage are equivalent.
         """
         stage = observation["ego"][..., 0].long()
         spans = {GUESS: Span(0, len(stage), len(KINDS))}
@@ -181,7 +180,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         return spans
 
     def log_proposal(self, observation: Observation, actions: Tensor) -> dict[str, Tensor]:
-        """What was pressed for was found just before; what was waited for was not."""
+        """Return log weights: found just before a press, and not found before a wait."""
         steps = torch.arange(self.domain.horizon + 1, device=actions.device)
         stage, since = (part[: len(actions)] for part in observation["ego"].long().unbind(-1))
         found = {}
@@ -192,7 +191,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
             waited = since[here].max()
             pressed = bool((here & (actions != WAIT)).any())
             before = (waited - steps).clamp(min=0).float()
-            # Each step earlier is a wait that needs explaining, up to a few nats.
+            # Each step earlier implies one more unexplained wait, at a few nats in total at most.
             log = -(WAITS * before).clamp(max=MOST_WAITS)
             if pressed:
                 log = torch.where(steps > waited, -BLIND, log)
@@ -200,7 +199,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         return found
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """What one looks for, once it was found, and the type of those who read it."""
+        """Return the lit terminal once it was found, and the type for people who read it."""
         del step
         stage, since = observation["ego"].long().unbind(-1)
         times = [implants[f"{FOUND}{number}"] for number in range(STAGES)]
@@ -216,10 +215,10 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         }
 
     def perceive(self, implants, knowledge, observation, told, step):
-        """As everywhere; and who does not know the type takes it for what they guess.
+        """Return the view of :class:`HumanModel`, with the guess in place of an unknown type.
 
-        Bombs do nothing by themselves: at a step without news the belief stays as it is, however
-        long they search.
+        Bombs do not change by themselves: at a step without new items the belief does not change,
+        however long they search.
         """
         before = knowledge
         view, knowledge = super().perceive(implants, knowledge, observation, told, step)
@@ -237,7 +236,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         return View(view.visible, taken, imagined, still), knowledge
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Choose as the robot would, with buttons exchanged by the rules they know."""
+        """Return log-probabilities of actions by the robot's values, with buttons permuted."""
         presses = values[..., 1:]
         second = self.believed_kind(belief)[..., None]  # [..., P, B, 1]
         own = [self._exchanged(presses, implants[RULE + kind]) for kind in self.kinds]
@@ -246,28 +245,27 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         return super().act(implants, belief, torch.cat([wait, exchanged], -1))
 
     def believed_kind(self, belief: Tensor) -> Tensor:
-        """1 where somebody with a belief ``[..., Z]`` takes the bomb for the second type, else 0.
+        """Return 1 where a belief ``[..., Z]`` is of the second type of bomb, else 0.
 
-        They always take it for one of them: what is not known is guessed.
+        Beliefs are always of one type, because an unknown type is guessed.
         """
         return (self.self_model.decoders["verbal"](belief).mean[..., 0, 0] > EVEN_ODDS).to(belief)
 
     def _exchanged(self, presses: Tensor, rule: Tensor) -> Tensor:
-        """Values ``[..., P, B, 4]`` of buttons under a rule ``[..., P, 1]``."""
+        """Return values ``[..., P, B, 4]`` of buttons under a rule ``[..., P, 1]``."""
         order = self.exchanges.argmax(-1)[rule.long()]  # [..., P, 1, 4]
         shape = torch.broadcast_shapes(order.shape, presses.shape)
         return presses.expand(shape).gather(-1, order.expand(shape))
 
     @torch.no_grad()
     def fit_world(self, demonstrations: Demonstrations) -> None:
-        """Learn which rules hold from recorded rewards: the posterior becomes the prior.
+        """Learn the true rules from recorded rewards: their posterior becomes the prior.
 
-        What is right in the world is so for everybody, so all rounds of all people tell. The
-        posterior is exact: every rule is tried. The robot sees everything, and its rewards are
-        those of its simulator.
+        The rules are shared by all people, so all rounds are pooled. The posterior is exact: every
+        rule is enumerated. The robot sees everything, and its rewards are those of its simulator.
 
         Args:
-            demonstrations: rounds with rewards; without any nothing is learned.
+            demonstrations: rounds with rewards; without rewards nothing is learned.
         """
         if demonstrations.rewards is None:
             return
@@ -293,7 +291,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         self.rule_logits.copy_(logits - logits.logsumexp(-1, keepdim=True))
 
     def planning_domain(self, draws: Mapping[str, Tensor]) -> Domain:
-        """The bomb by the rules that are likeliest to hold."""
+        """Return the domain with the most probable rules."""
         rules = []
         for kind, logits, row in zip(
             self.kinds, self.rule_logits, self.domain.as_believed.rules, strict=True

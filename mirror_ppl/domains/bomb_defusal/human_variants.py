@@ -1,4 +1,4 @@
-"""Variants of the model of bomb defusal, with parts left out to compare with."""
+"""Variants of the human model of bomb defusal: ablations and other families."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from mirror_ppl.models.view import View
 
 
 class BombDefusalPerceptualOnly(BombDefusalHuman):
-    """Searches and guesses, but decides as the robot does: by its rules, without a residual."""
+    """Searches and guesses, but decides like the robot: by its rules, without a residual."""
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample how quick they are, whether they read the type, and how strictly they choose."""
+        """Sample the perceptual implants and the parameters of choices."""
         like = next(self.self_model.parameters())
         return self.perceptual_implants() | implant_priors.choice_implants(like)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Choose as the robot would."""
+        """Return log-probabilities of actions by the robot's values."""
         return HumanModel.act(self, implants, belief, values)
 
 
 class BombDefusalPolicyOnly(BombDefusalHuman):
-    """Knows the rules, and sees all that there is at once: nothing is left to be searched."""
+    """Knows the rules and sees everything at once, without a search."""
 
     round_latents = HumanModel.round_latents
     covariates = HumanModel.covariates
@@ -39,27 +39,27 @@ class BombDefusalPolicyOnly(BombDefusalHuman):
     spans = HumanModel.spans
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample their rules, and how they decide."""
+        """Sample the rules and the policy implants."""
         like = next(self.self_model.parameters())
         return self.rules() | implant_priors.policy_implants(
             self.domain, self.self_model.latent, like
         )
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """Everything, also the type."""
+        """Return everything, including the type."""
         del implants, step
         return _everything(observation)
 
     def perceive(self, implants, knowledge, observation, told, step) -> tuple[View, object]:
-        """As everywhere; there is nothing to guess."""
+        """Return the view of :class:`HumanModel`, without a guess."""
         return HumanModel.perceive(self, implants, knowledge, observation, told, step)
 
 
 class BombDefusalNoImplants(NoImplants):
-    """The robot itself, but for how strictly it chooses: sees everything, also the type."""
+    """The robot itself, except for choice parameters: sees everything, including the type."""
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
-        """Everything."""
+        """Return everything, including the type."""
         del implants, step
         return _everything(observation)
 
@@ -73,13 +73,13 @@ class BombDefusalPreferring(Preferring, BombDefusalHuman):
 
 
 class BombDefusalHardOfHearing(HardOfHearing, BombDefusalHuman):
-    """Searches and guesses; messages by some channels do not reach them."""
+    """Searches and guesses; messages through some channels do not reach them."""
 
     spans = BombDefusalHuman.spans
 
 
 class BombDefusalAnyKind(OneOfKinds, Late, Preferring, BombDefusalHuman):
-    """Searches and guesses; of which kind they are is open."""
+    """Searches and guesses; the kind of each person is inferred."""
 
     members = MappingProxyType(
         {
@@ -108,4 +108,4 @@ HUMAN_MODELS: Mapping[str, type[HumanModel]] = {
     "hard-of-hearing": BombDefusalHardOfHearing,
     "all": BombDefusalAnyKind,
 }
-"""What stands here for the human models of these names."""
+"""Classes that replace the human models of these names."""

@@ -1,7 +1,7 @@
-"""What somebody has learned of a bomb.
+"""A person's knowledge of a bomb.
 
-The type of the bomb stays, and so does what is known of it. Every stage has terminals of its own:
-what was seen of them is known until the next stage.
+The type of the bomb does not change and stays known. Every stage has its own terminals: those seen
+are known until the next stage.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from mirror_ppl.domains.bomb_defusal.panel import TERMINALS
 
 @dataclass(frozen=True)
 class BombKnowledge:
-    """At one step.
+    """Knowledge at one step.
 
     Attributes:
         stage: of that step ``[..., 1]``.
-        terminals: whether it is known what each shows ``[..., 6]``.
+        terminals: terminals with known symbols ``[..., 6]``.
         kind: whether the type of the bomb is known ``[..., 1]``.
     """
 
@@ -31,7 +31,7 @@ class BombKnowledge:
 
     @classmethod
     def nothing(cls, *batch: int, device: torch.device | None = None) -> BombKnowledge:
-        """Before anything was observed."""
+        """Return the knowledge before anything was observed."""
         return cls(
             torch.zeros(*batch, 1, dtype=torch.long, device=device),
             torch.zeros(*batch, TERMINALS, dtype=torch.bool, device=device),
@@ -39,12 +39,12 @@ class BombKnowledge:
         )
 
     def learn(self, observation: Observation, visible: Visibility) -> BombKnowledge:
-        """Knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
+        """Return the knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
         stage = observation["ego"][..., :1].round().long()
         kind = self.kind | visible["verbal"]
         terminals = (self.terminals & (stage == self.stage)) | visible["visual"]
         return BombKnowledge(stage.expand(kind.shape), terminals, kind)
 
     def items(self) -> Visibility:
-        """Terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
+        """Return terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
         return {"visual": self.terminals, "verbal": self.kind}

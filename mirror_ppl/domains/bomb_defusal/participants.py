@@ -1,8 +1,7 @@
-"""The people of bomb defusal, from the ground truth to those who are handed out.
+"""Makes the simulated people of bomb defusal, as in the supplement's section B.
 
-As the supplement's section B builds them: participants who are told the type play 36 rounds each,
-how long each takes to find a terminal is described by a geometric distribution whose probability is
-learned from that, and simulated people who take as long play the rounds that are handed out.
+Participants who know the type play 36 rounds each, the probability of a geometric distribution of
+their search times is estimated, and simulated people follow the estimated distributions.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from mirror_ppl.people.base import DomainPeople, derived_generator
 from mirror_ppl.people.recordings import Recording, draw_starts, record
 
 PARTICIPANT_ROUNDS = 36
-"""How many rounds a participant plays."""
+"""Number of rounds of a participant."""
 NOTICE_MEDIAN, NOTICE_SPREAD = 0.05, 0.35
-"""Median over people of how probably they find a terminal at a step, and standard deviation of its
-logarithm."""
+"""Median over people of the probability of finding a terminal at a step, and standard deviation of
+its logarithm."""
 PLACE_SPREAD = 0.5
-"""Standard deviation over terminals of the same, for one person of the population ``diverse``."""
+"""Standard deviation over terminals of this logarithm for a person of population ``diverse``."""
 DEFUSER_POPULATIONS = ("paper", "diverse")
-"""Who people may be: as quick at every terminal, or at some quicker than at others."""
+"""Populations: equally quick at every terminal, or quicker at some."""
 
 
 def participants(people: int, seed: int, by_place: bool = False) -> SimulatedDefusers:
-    """The ground truth: how quick each is, and everybody is told the type.
+    """Draw ground-truth people with their search probabilities; all of them know the type.
 
     Args:
         people: number of people P.
         seed: determines them.
-        by_place: whether some terminals are found sooner than others.
+        by_place: whether search probabilities differ between terminals.
     """
     drawn = []
     for person in range(people):
@@ -50,14 +49,14 @@ def participants(people: int, seed: int, by_place: bool = False) -> SimulatedDef
 
 
 def learn_notices(recording: Recording, by_place: bool = False) -> Tensor:
-    """How probably each of P people finds each terminal at a step, ``[P, 6]``.
+    """Estimate the probability of finding each terminal at a step for P people, ``[P, 6]``.
 
-    The likeliest: times found in steps searched. Of a terminal that somebody never found it is as
-    if they had found it at the next step.
+    The maximum-likelihood estimate is finds per step searched. A terminal that was never found
+    counts as found at the next step.
 
     Args:
         recording: of people who know the type.
-        by_place: learn it of each terminal by itself, and not of all together.
+        by_place: estimate each terminal separately, not all together.
     """
     now = {name: value[:, :, :-1] for name, value in recording.observation.items()}
     live, _ = read_panel(now["visual"])
@@ -73,7 +72,7 @@ def learn_notices(recording: Recording, by_place: bool = False) -> Tensor:
 
 @lru_cache(maxsize=8)
 def learned_notices(people: int, seed: int, by_place: bool) -> Tensor:
-    """How probably the participants find each terminal ``[P, 6]``, learned from their rounds."""
+    """Estimate the participants' search probabilities ``[P, 6]`` from their rounds."""
     start = draw_starts(
         people,
         PARTICIPANT_ROUNDS,
@@ -88,16 +87,16 @@ def learned_notices(people: int, seed: int, by_place: bool) -> Tensor:
 def simulated_defusers(
     setting: str, population: str, people: int, seed: int, device: torch.device | str = "cpu"
 ) -> SimulatedDefusers:
-    """The simulated people of a population, to be stepped by whoever wants to.
+    """Return the simulated people of a population, to be stepped by the caller.
 
-    Each is made for one participant. The same seed gives the same people.
+    Each is made from one participant. The same seed gives the same people.
 
     Args:
         setting: ``labelled``, in which they read the type, or ``unlabelled``.
-        population: ``paper``, as quick at every terminal; ``diverse``, quicker at some.
+        population: ``paper``, equally quick at every terminal; ``diverse``, quicker at some.
         people: number of people P.
-        seed: determines how quick they are.
-        device: where they live.
+        seed: determines their search probabilities.
+        device: device of their tensors.
 
     Raises:
         UnknownNameError: there is no such setting or population.
@@ -111,4 +110,4 @@ def simulated_defusers(
 
 
 DEFUSERS = DomainPeople(DEFUSER_POPULATIONS, simulated_defusers)
-"""What the rest of the package knows of them."""
+"""The people as registered in the domain's record."""

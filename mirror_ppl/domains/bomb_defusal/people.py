@@ -1,19 +1,19 @@
-"""People who defuse bombs: what they have in mind, and when they press (supplement, section B).
+"""Simulated people who defuse bombs: their memory and actions (supplement, section B).
 
-Who does not know the type of the bomb guesses, once a round. At every stage somebody looks for the
-terminal that counts and finds it at each step with a probability of their own; who has found it, or
-was shown it, presses the button that is right for the type they believe in, and until then waits:
+A person who does not know the type of the bomb guesses it once per round. At every stage they look
+for the lit terminal and find it at each step with their own probability. Once they found it, or
+were shown it, they press the button that is right for the believed type; until then they wait:
 
 ====================  ==========================================================================
 ``notices``           probability of finding each terminal at a step
-``k_t``               the type that they believe in: what they know, else their guess
-``f_t``               whether they have found the terminal that counts
+``k_t``               the type that they believe: the known type, else their guess
+``f_t``               whether they have found the lit terminal
 ====================  ==========================================================================
 
 ``p(f_t | not f_{t-1}) = notices[terminal]``, and ``a_t`` is the right button for ``k_t`` if
-``f_t``, else to wait. Penalties teach nothing about the type: who guessed wrong stays wrong.
+``f_t``, else to wait. They do not learn the type from penalties: a wrong guess stays wrong.
 
-Choices that the supplement leaves open, with their reasons, are in ``docs/people.md``.
+Choices that the supplement does not specify, and their reasons, are in ``docs/people.md``.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from mirror_ppl.domains.bomb_defusal.world import WAIT, BombDefusal
 from mirror_ppl.people.base import SimulatedPeople, each
 
 UNDECIDED = -1
-"""The guess of somebody who has not guessed yet."""
+"""The guess before a person has guessed."""
 
 
 @dataclass(frozen=True)
 class Mind:
-    """What somebody knows and has found.
+    """Knowledge and guesses of people.
 
     Attributes:
         informed: whether they know the type ``[...]``.
-        guess: what they take it for if they do not, ``[...]``.
-        found: whether they have found the terminal that counts ``[...]``, at ``stage`` ``[...]``.
+        guess: the guessed type, used if they do not ``[...]``.
+        found: whether they have found the lit terminal ``[...]``, at ``stage`` ``[...]``.
         step: number of the next step ``[...]``.
-        mind_noise: uniform numbers ``[..., 1 + T]``: of the guess, and of finding it at each step.
+        mind_noise: uniform numbers ``[..., 1 + T]``: for the guess, and the search at each step.
     """
 
     informed: Tensor
@@ -56,7 +56,7 @@ class Mind:
 
 @dataclass(frozen=True)
 class SimulatedDefusers(SimulatedPeople):
-    """P people who defuse bombs.
+    """P simulated people who defuse bombs.
 
     Attributes:
         notices: probability of finding each terminal at a step ``[P, 6]``.
@@ -70,16 +70,16 @@ class SimulatedDefusers(SimulatedPeople):
 
     @property
     def domain(self) -> BombDefusal:
-        """Bomb defusal, by the rules that are so."""
+        """Bomb defusal domain, with the true rules."""
         return BombDefusal()
 
     def truth(self) -> dict[str, Tensor]:
-        """How probably they find each terminal at a step."""
+        """Return the probabilities of finding each terminal at a step."""
         items = self.domain.modalities[0].items
         return {f"notices_{item}": self.notices[:, place] for place, item in enumerate(items)}
 
     def start(self, *batch: int, mind_noise: Tensor | None = None) -> Mind:
-        """Minds ``[P, *batch]`` before a round; see `SimulatedPeople.start`."""
+        """Return minds ``[P, *batch]`` before a round; see `SimulatedPeople.start`."""
         shape, device = (len(self.notices), *batch), self.notices.device
         if mind_noise is None:
             mind_noise = torch.full((*shape, self.mind_noises), 0.5, device=device)
@@ -88,7 +88,7 @@ class SimulatedDefusers(SimulatedPeople):
         return Mind(never, nothing + UNDECIDED, never, nothing, nothing, mind_noise)
 
     def sees(self, observation: Observation) -> Visibility:
-        """What they see at once: no terminal, and the type if they can read it."""
+        """Return what they see at once: no terminal, and the type if they can read it."""
         nothing = torch.zeros_like(observation["visual"][..., 0], dtype=torch.bool)
         verbal = observation["verbal"][..., 0]
         reads = each(self.reads, verbal.dim() - 1)
@@ -111,7 +111,7 @@ class SimulatedDefusers(SimulatedPeople):
     def branches(
         self, memory: Mind, observation: Observation, told: Visibility
     ) -> tuple[Tensor, Mind, Tensor]:
-        """Found or not with either guess, ``G`` = 4; see `SimulatedPeople.branches`."""
+        """Return found or not with either guess, ``G`` = 4; see `SimulatedPeople.branches`."""
         decided, chance = self._look(memory, observation, told)
         found = torch.stack([1 - chance, chance], -1)
         found = torch.where(decided.found[..., None], found.new_tensor([0.0, 1.0]), found)
@@ -142,7 +142,7 @@ class SimulatedDefusers(SimulatedPeople):
         return chances, minds, self._acts(minds, seen)
 
     def kept(self, memory: Mind) -> Mind:
-        """What they know, guess and have found."""
+        """Return knowledge, guess and found terminals; see `SimulatedPeople.kept`."""
         return replace(
             memory, step=torch.zeros_like(memory.step), mind_noise=memory.mind_noise[..., :0]
         )
@@ -150,9 +150,9 @@ class SimulatedDefusers(SimulatedPeople):
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
     ) -> Tensor:
-        """Of actions ``[P, B, T, A]``, given what was done before but not what they had in mind.
+        """Return probabilities of actions ``[P, B, T, A]``, given the actions before each.
 
-        Who has not pressed yet has not found it yet; what was pressed tells what they guess.
+        A wait implies that the lit terminal was not found; a press reveals the guess.
         """
         now = {name: value[:, :, :-1] for name, value in observation.items()}
         chance, symbol = self._counts(now)
@@ -166,7 +166,7 @@ class SimulatedDefusers(SimulatedPeople):
         heard = told["verbal"][..., 0].long().cumsum(2) > 0
         informed = (self.sees(now)["verbal"][..., 0] | heard)[..., None]
         pressed = actions[..., None] == 1 + buttons
-        # What was pressed before they knew it tells what they guessed.
+        # A press before they knew the type reveals their guess.
         silent = (actions == WAIT)[..., None] | informed
         telling = torch.where(silent, 1.0, pressed.to(chance.dtype))
         so_far = torch.cat([torch.ones_like(telling[:, :, :1]), telling[:, :, :-1]], 2).cumprod(2)
@@ -180,7 +180,7 @@ class SimulatedDefusers(SimulatedPeople):
         return torch.where(over[..., None], wait, found)
 
     def _counts(self, observation: Observation) -> tuple[Tensor, Tensor]:
-        """How probably the terminal that counts is found now ``[P, ...]``, and its symbol."""
+        """Return the probability of finding the lit terminal now ``[P, ...]``, and its symbol."""
         live, symbols = read_panel(observation["visual"])
         symbol = symbols.take_along_dim(live[..., None], -1).squeeze(-1)
         own = each(self.notices, live.dim() - 1)
@@ -189,7 +189,7 @@ class SimulatedDefusers(SimulatedPeople):
     def _look(
         self, memory: Mind, observation: Observation, told: Visibility | None
     ) -> tuple[Mind, Tensor]:
-        """Minds before chance decides, and how probably the terminal is found now."""
+        """Return minds before random events, and the probability of finding the terminal now."""
         chance, _ = self._counts(observation)
         stage = observation["ego"][..., 0].long()
         found = memory.found & (stage == memory.stage)
@@ -207,7 +207,7 @@ class SimulatedDefusers(SimulatedPeople):
         ), chance
 
     def _acts(self, mind: Mind, observation: Observation) -> Tensor:
-        """Probabilities of actions ``[P, ..., A]``: all but one are 0."""
+        """Return probabilities of actions ``[P, ..., A]``: all but one are 0."""
         _, symbol = self._counts(observation)
         kind = torch.where(mind.informed, observation["verbal"][..., 0, 0].long(), mind.guess)
         button = right_button(self.domain.rules, kind, symbol)

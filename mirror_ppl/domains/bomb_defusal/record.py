@@ -1,4 +1,4 @@
-"""What the package knows of bomb defusal besides its rules."""
+"""The record of bomb defusal: settings, people and human models."""
 
 from mirror_ppl.domains.record import Record
 
@@ -23,10 +23,10 @@ RECORD = Record(
         "difference_weight": 4.0,
         "exact": True,
     },
-    # Costs grow so fast that no third item is worth its own; the oracle looks at two, too. A bomb
-    # does nothing by itself, so what helps cannot wait; and where the next stage takes as long,
-    # steps that are looked at are used up all the same, whenever this one ends.
-    # A wrong button costs much more than a message: it is rash to be silent until a gain is sure.
+    # A third item costs more than it can gain; the oracle considers two as well. The bomb does not
+    # change by itself, so delaying a message never helps; and if the next stage takes as long, the
+    # planned steps are used up whenever the present stage ends.
+    # A wrong button costs much more than a message, so a gain need not be significant.
     planning={
         "horizon": 12,
         "terminal_value": True,
@@ -36,7 +36,7 @@ RECORD = Record(
         "min_standard_errors": 0.0,
     },
     baselines={
-        # People also do one thing, waiting, at most steps of long rounds.
+        # People wait at most steps of long rounds.
         "sqil": {
             "batch": 5,
             "sampled": 5,

@@ -1,16 +1,16 @@
-"""Bomb defusal: three stages, and rules that the robot has wrong (supplement, sections A and E).
+"""Bomb defusal: three stages, and rules that the robot got wrong (supplement, sections A and E).
 
 Description
     A bomb is defused in three stages; at each a button has to be pressed. Which of four it is
     depends on the type of the bomb, A or B, and on the symbol that one of six terminals shows::
 
-        type    cross    plus    frame    bars     and as the robot was taught it
+        type    cross    plus    frame    bars     as the robot was taught, instead
         A       red      green   yellow   blue     frame blue, bars yellow
         B       yellow   blue    green    red      cross green, frame yellow
 
-    That terminal is lit; the others show symbols too, which do not count. Every stage has new ones.
+    That terminal is lit; symbols of the others do not matter. Every stage has new terminals.
 
-    Rules of the robot and of the world are two instances of the same domain, see
+    The robot's rules and the true rules are two instances of this domain, see
     `BombDefusal.as_believed`.
 
 Actions
@@ -18,15 +18,15 @@ Actions
 
 Observations
     ========  ============  =======  ===============================================================
-    ego       stage         count    which stage it is, 0 to 2; 3 when all is done; always known
-    ego       since         steps    since when; always known
+    ego       stage         count    present stage, 0 to 2; 3 when all is done; always known
+    ego       since         steps    steps since it began; always known
     visual    75 numbers    0 to 1   pixels of each terminal: row, column, red-green-blue
-    verbal    kind          0 or 1   the type of the bomb, what the utterance says: 1 if it is B
+    verbal    kind          0 or 1   the type of the bomb in the utterance: 1 if it is B
     ========  ============  =======  ===============================================================
 
-    In the setting ``labelled`` the type is written on the bomb; in ``unlabelled`` nobody sees it.
-    All terminals are in view in both: that people do not find the right one at once is a matter of
-    people, not of the setting.
+    In the setting ``labelled`` the type is written on the bomb; in ``unlabelled`` it is hidden.
+    All terminals are in view in both: how soon people find the lit one depends on the person, not
+    on the setting.
 
 Rewards, of the action and the state that it leads to
     =====  ===  =====================================
@@ -83,10 +83,10 @@ class BombState:
 
     Attributes:
         stage: ``[...]``, 0 to 2; 3 when all is done.
-        since: steps since the stage began ``[...]``, as far as a round goes.
+        since: steps since the stage began ``[...]``, at most the horizon.
         kind: type of the bomb ``[...]``, 0 for A and 1 for B.
-        live: which terminal counts at each stage ``[..., 3]``.
-        symbols: what the terminals of each stage show ``[..., 3, 6]``, indices into ``SYMBOLS``.
+        live: the lit terminal of each stage ``[..., 3]``.
+        symbols: symbols of the terminals of each stage ``[..., 3, 6]``, indices into ``SYMBOLS``.
     """
 
     stage: Tensor
@@ -100,7 +100,7 @@ class BombDefusal(World):
     """The domain of bomb defusal; see the module's description.
 
     Args:
-        rules: which button is right.
+        rules: the right buttons.
     """
 
     name = "bomb_defusal"
@@ -142,10 +142,10 @@ class BombDefusal(World):
     mishap: tuple[str, str] = ("wrong", "wrong buttons")
     directions: tuple[str, ...] = ("panel",)
     reach_bins: tuple[float, ...] = (0.0,)
-    """Everybody reaches every terminal: they are all in front of them."""
+    """All people have the same reach: every terminal is in front of them."""
     reach_unit = "steps"
     told_practice = 0.5
-    # The robot takes people to be about as quick as they would have to be for waiting to pay.
+    # The robot assumes people to be about as quick as needed for waiting to pay.
     notice_practice = (0.25, 1.0)
     partial_views: Mapping[str, tuple[float, ...]] = {}
 
@@ -154,17 +154,17 @@ class BombDefusal(World):
 
     @property
     def as_believed(self) -> BombDefusal:
-        """The world as the robot was taught it: with the old rules."""
+        """World as the robot was taught it: with the old rules."""
         return BombDefusal(OLD_RULES)
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
     ) -> BombState:
-        """States ``[batch]`` at the first stage.
+        """Draw states ``[batch]`` at the first stage.
 
         Args:
             batch: number of rounds.
-            generator: source of randomness; its device is where the states live.
+            generator: source of randomness; its device is that of the states.
             scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
         """
         device = generator.device
@@ -183,13 +183,13 @@ class BombDefusal(World):
         )
 
     def anywhere(self, batch: int, generator: torch.Generator) -> BombState:
-        """States ``[batch]`` at the beginning of any stage."""
+        """Draw states ``[batch]`` at the beginning of any stage."""
         state = self.initial(batch, generator)
         stage = torch.randint(STAGES, (batch,), generator=generator, device=generator.device)
         return replace(state, stage=stage)
 
     def transition(self, state: BombState, action: Tensor) -> BombState:
-        """State at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
+        """Return the state at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
         presses = (action != WAIT) & ~self.over(state)
         waits = (action == WAIT) & ~self.over(state)
         return replace(
@@ -199,7 +199,7 @@ class BombDefusal(World):
         )
 
     def rewards(self, state: BombState, action: Tensor, following: BombState) -> dict[str, Tensor]:
-        """Reward terms ``[...]`` by name, in units of reward."""
+        """Return reward terms ``[...]`` by name, in units of reward."""
         del following
         _, symbol = self._shown(state)
         presses = (action != WAIT) & ~self.over(state)
@@ -212,23 +212,23 @@ class BombDefusal(World):
         }
 
     def _panel(self, state: BombState) -> tuple[Tensor, Tensor]:
-        """The terminal that counts ``[...]``, and symbols ``[..., 6]``, at the present stage."""
+        """Return the lit terminal ``[...]`` and all symbols ``[..., 6]`` of the present stage."""
         stage = state.stage.clamp(max=STAGES - 1)
         live = state.live.take_along_dim(stage[..., None], -1).squeeze(-1)
         symbols = state.symbols.take_along_dim(stage[..., None, None], -2).squeeze(-2)
         return live, symbols
 
     def _shown(self, state: BombState) -> tuple[Tensor, Tensor]:
-        """The terminal that counts ``[...]``, and its symbol."""
+        """Return the lit terminal ``[...]`` and its symbol."""
         live, symbols = self._panel(state)
         return live, symbols.take_along_dim(live[..., None], -1).squeeze(-1)
 
     def over(self, state: BombState) -> Tensor:
-        """Where the third button was pressed ``[...]``."""
+        """Return where the third button was pressed ``[...]``."""
         return state.stage >= STAGES
 
     def observe(self, state: BombState) -> Observation:
-        """Everything there is to observe: ego ``[..., 2]``, visual ``[..., 6, 75]`` and so on.
+        """Return ego ``[..., 2]``, visual ``[..., 6, 75]`` and verbal ``[..., 1, 1]``.
 
         When all is done no terminal is lit.
         """
@@ -242,7 +242,7 @@ class BombDefusal(World):
         }
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
-        """What the setting lets an unaided person see.
+        """Return what an unaided person sees in a setting.
 
         Raises:
             UnknownNameError: if the setting is neither ``labelled`` nor ``unlabelled``.
@@ -254,13 +254,13 @@ class BombDefusal(World):
         return {**everything, "verbal": torch.zeros_like(everything["verbal"])}
 
     def sought(self, observation: Observation) -> Tensor:
-        """The terminal that is lit ``[..., 6]``, if one is."""
+        """Return a mask of the lit terminal ``[..., 6]``, if there is one."""
         live, _ = read_panel(observation["visual"])
         lit = torch.arange(TERMINALS, device=live.device) == live[..., None]
         return lit & (observation["ego"][..., :1] < STAGES)
 
     def faults(self, observation: Observation) -> dict[str, Tensor]:
-        """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
+        """Return which observations ``[...]`` break each rule of recordings, by rule."""
         stage, since = observation["ego"].unbind(-1)
         kind = observation["verbal"][..., 0, 0]
         possible = (stage == stage.round()) & (stage >= 0) & (stage <= STAGES)
@@ -277,7 +277,7 @@ class BombDefusal(World):
         }
 
     def nothing_known(self, *batch: int, device: torch.device | None = None) -> BombKnowledge:
-        """Knowledge ``[*batch]`` before anything was observed."""
+        """Return knowledge ``[*batch]`` before anything was observed."""
         return BombKnowledge.nothing(*batch, device=device)
 
     def learn(
@@ -287,16 +287,16 @@ class BombDefusal(World):
         visible: Visibility,
         sees: Callable[[Observation], Visibility],
     ) -> BombKnowledge:
-        """The type stays known, and what terminals show until the next stage."""
+        """Return knowledge after a step: the type stays known, terminals until the next stage."""
         del sees
         return knowledge.learn(observation, visible)
 
     def known(self, knowledge: BombKnowledge) -> Visibility:
-        """Terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
+        """Return terminals ``[..., 6]`` and utterances ``[..., 1]`` whose content is known."""
         return knowledge.items()
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
-        """Observations in the form in which networks read them.
+        """Encode observations for networks.
 
         Returns:
             ego ``[..., 4]``, one-hot stage; visual ``[..., 6, 75]``, raw pixels; verbal
@@ -307,14 +307,14 @@ class BombDefusal(World):
         return {"ego": ego, "visual": observation["visual"], "verbal": said}
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
-        """There is one direction, and all terminals are at hand: zeros ``[..., 6]``."""
+        """Return zeros ``[..., 6]``: there is one direction, and all terminals are at hand."""
         distance = torch.zeros_like(observation["visual"][..., 0])
         return distance.long(), distance
 
     def state_behind(self, observation: Observation) -> BombState:
-        """The state ``[...]`` that gives this observation of everything.
+        """Return the state ``[...]`` with this full observation.
 
-        Of other stages nothing can be observed: their terminals are taken to be like those now.
+        Other stages cannot be observed: their terminals are set to the present ones.
         """
         stage, since = observation["ego"].round().long().unbind(-1)
         live, symbols = read_panel(observation["visual"])
@@ -327,7 +327,7 @@ class BombDefusal(World):
         )
 
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
-        """What there is to observe after an action ``[...]``; NaN for terminals of a new stage."""
+        """Return the observation after an action ``[...]``; NaN for terminals of a new stage."""
         state = self.state_behind(observation)
         following = self.transition(state, action)
         expected = self.observe(following)
@@ -336,7 +336,7 @@ class BombDefusal(World):
         return {**expected, "visual": visual}
 
     def nearest(self, observation: Observation) -> Observation:
-        """The observation that can be and is nearest to decoded values."""
+        """Return the possible observation nearest to decoded values."""
         stage, since = observation["ego"].round().unbind(-1)
         live, symbols = read_panel(observation["visual"])
         stage = stage.clamp(0, STAGES)
@@ -348,11 +348,11 @@ class BombDefusal(World):
         }
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
-        """The terminal that counts, and the type (supplement, section F)."""
+        """Return the lit terminal and the type (supplement, section F)."""
         return {"terminal_and_type": self.decisive(observation)}
 
     def decisive(self, observation: Observation) -> Visibility:
-        """The terminal that is lit, and the type, until all is done."""
+        """Return the lit terminal and the type, until all is done."""
         under_way = observation["ego"][..., :1] < STAGES
         return {
             "visual": self.sought(observation),
@@ -360,7 +360,7 @@ class BombDefusal(World):
         }
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:
-        """Such as "Type A bomb", or "terminal 2 (lit, cross)"."""
+        """Describe an item, such as "Type A bomb", or "terminal 2 (lit, cross)"."""
         if modality == "verbal":
             return f"{KINDS[int(observation['verbal'][0, 0])]} bomb"
         live, symbols = read_panel(observation["visual"])
@@ -369,12 +369,12 @@ class BombDefusal(World):
         return f"{item} ({'lit, ' if number == int(live) else ''}{shows})"
 
     def deed(self, observation: Observation, item: str | None, action: int) -> str:
-        """What they would do."""
+        """Describe an action, such as "press red"."""
         del observation, item
         return "wait" if action == WAIT else f"press {self.actions[action]}"
 
     def reference_values(self, state: BombState, discount: float) -> Tensor:
-        """Exact action values ``[..., 5]`` with everything known, for as long as it takes."""
+        """Return exact action values ``[..., 5]`` of known states, without a horizon."""
         _, symbol = self._shown(state)
         right = right_button(self.rules, state.kind, symbol)
         presses = torch.arange(len(BUTTONS), device=right.device) == right[..., None]
@@ -387,7 +387,7 @@ class BombDefusal(World):
         return torch.where(self.over(state)[..., None], 0.0, values)
 
     def render(self, state: BombState) -> np.ndarray:
-        """Picture ``uint8 [height, width, 3]`` of one state: the terminals, the type, the stage."""
+        """Draw ``uint8 [height, width, 3]`` of one state: the terminals, the type, the stage."""
         cell, gap = 6, 6
         side = PICTURE[0] * cell
         columns = TERMINALS // 2

@@ -1,4 +1,4 @@
-"""Driving among four cars: the world, and what the package knows of it in `record`."""
+"""Driving among four cars: the world, its people, pictures and settings."""
 
 from mirror_ppl.domains.driving.world import (
     CAR_LANES,

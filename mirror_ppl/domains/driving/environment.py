@@ -32,9 +32,9 @@ class DrivingEnv(DomainEnv):
     | `verbal`      | (4, 3) | float32 | distance ahead    | cells      | -12 to 12 |
     |               |        |         | lane offset       | lanes      | -1 to 1   |
     |               |        |         | relative speed    | cells/step | -1 to 1   |
-    | `verbal_mask` | (4,)   | int8    | the car is told   |            | 0 or 1    |
+    | `verbal_mask` | (4,)   | int8    | car communicated  |            | 0 or 1    |
 
-    Nobody speaks in this environment, so that the verbal part is always masked; it is there to have
+    This environment has no messages, so the verbal part is always masked; it is included to keep
     the layout of the domain's observations.
 
     `info` holds the `scenario`'s name and, in `state`, the true `lane`, `position` (cells ahead,

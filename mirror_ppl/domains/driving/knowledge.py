@@ -1,10 +1,9 @@
-"""What an observer has learned of each car, and what they take for granted about the others.
+"""An observer's knowledge of each car, and assumptions about the others.
 
-One sight of a car tells where it is; a second one, or an utterance, tells how it moves, and as cars
-keep their speed that is known for the rest of the round. So it is if a car that was seen once would
-be in sight by now had it come closer, and is not: there are two speeds, and it has the other one.
-Until then the observer may assume that it comes closer, and of cars never observed that there are
-none.
+One sight of a car reveals its position; a second sight or an utterance reveals its speed, which is
+then known for the rest of the round because cars keep their speed. A car seen once has one of two
+speeds; if it would be in sight had it come closer and is not, it has the other speed. Until then
+the observer may assume that it comes closer, and that cars never observed are absent.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from mirror_ppl.domains.base import Observation, Visibility
 ROAD_END = 12
 """Distance in cells at which the visible road ends, ahead and behind."""
 ASSUMPTIONS = ("clear", "closing")
-"""Cars never observed are absent; cars of which only the place is known come closer."""
+"""Cars never observed are absent; cars with known position and unknown speed come closer."""
 
 
 @dataclass(frozen=True)
 class CarKnowledge:
-    """Of each car ``[..., 4]``, at one step.
+    """Knowledge of each car ``[..., 4]`` at one step.
 
     Attributes:
         placed: observed at this step or before.
-        known: place and speed follow from what was observed.
-        position: of a car placed but not known, cells ahead if it has come closer since; else 0.
-        speed: the speed at which such a car would come closer, cells a step; else 0.
+        known: position and speed follow from observations.
+        position: for cars placed but not known, cells ahead if they came closer since; else 0.
+        speed: the speed at which such cars would come closer, cells a step; else 0.
     """
 
     placed: Tensor
@@ -41,14 +40,14 @@ class CarKnowledge:
 
     @classmethod
     def nothing(cls, *batch: int, device: torch.device | None = None) -> CarKnowledge:
-        """Before anything was observed."""
+        """Return the knowledge before anything was observed."""
         never = torch.zeros(*batch, 4, dtype=torch.bool, device=device)
         zero = torch.zeros(*batch, 4, device=device)
         return cls(never, never, zero, zero)
 
     @property
     def unsure(self) -> Tensor:
-        """Cars ``[..., 4]`` of which the place was observed and the speed is not known."""
+        """Cars ``[..., 4]`` with an observed position and an unknown speed."""
         return self.placed & ~self.known
 
     def learn(
@@ -57,9 +56,9 @@ class CarKnowledge:
         visible: Visibility,
         sees: Callable[[Observation], Visibility],
     ) -> CarKnowledge:
-        """Knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
+        """Return the knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
         ahead = observation["visual"][..., 0]
-        # Off the road there is nothing to observe, however far somebody sees.
+        # Off the road there is nothing to observe, whatever the reach.
         here = ahead.abs() < ROAD_END
         shown, spoken = visible["visual"] & here, visible["verbal"] & here
         position = self.position + self.speed
@@ -68,7 +67,7 @@ class CarKnowledge:
         known = self.known | spoken | (self.placed & shown) | (self.unsure & missed)
         placed = self.placed | shown | spoken
         first = placed & ~self.placed
-        # One that came from ahead would have been ahead before: a car abreast came from behind.
+        # A car abreast came from behind: from ahead it would have been observed there before.
         closing = torch.where(ahead > 0, -1.0, 1.0).to(position.dtype)
         unsure = placed & ~known
         return CarKnowledge(
@@ -80,7 +79,7 @@ class CarKnowledge:
 
 
 def assumed_cars(position: Tensor, speed: Tensor, observation: Observation) -> Observation:
-    """What there would be to observe now of cars at assumed places ``[..., 4]``."""
+    """Return the full observation with cars at assumed positions ``[..., 4]``."""
     offset = observation["visual"][..., 1]
     position, speed, offset = torch.broadcast_tensors(position, speed, offset)
     seen = position.clamp(-ROAD_END, ROAD_END)

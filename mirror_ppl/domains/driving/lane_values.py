@@ -1,7 +1,7 @@
 """Exact action values on two lanes by backward induction.
 
-Cars never react to the ego, so the only part of the state that an action changes is the lane. With
-the reward of being in each lane at each future step known, two numbers a step solve the problem.
+Cars never react to the ego, so an action changes only the lane. Given the reward of being in each
+lane at each future step, two values per step solve the problem.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def action_values(
     discount: float,
     temperature: Tensor | float | None = None,
 ) -> Tensor:
-    """Action values ``[..., 2]`` (stay, switch) at the present step.
+    """Return action values ``[..., 2]`` (stay, switch) at the present step.
 
     Args:
         lane_rewards: ``[..., H, 2]``, reward of being in each lane at the next H steps.

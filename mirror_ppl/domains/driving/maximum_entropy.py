@@ -1,23 +1,23 @@
-"""Maximum-entropy inverse reinforcement learning of what drivers want (supplement, section B).
+"""Maximum-entropy inverse reinforcement learning of drivers' rewards (supplement, section B).
 
-Finds the reward under which recorded actions are likely, for people who decide by the policy of
-maximum causal entropy. With features ``f`` of what a step leads to and weights ``w``:
+Finds the posterior mode of the reward, given the actions of people who follow the policy of maximum
+causal entropy. With features ``f`` of what a step leads to and weights ``w``:
 
 - ``r(s, a) = w . f(s, a)``
 - ``Q(a, m_t)``: soft action values, the maximum over actions replaced by ``log sum exp``, over the
-  next H steps and the cars of which the driver knew at t, planned anew at each step
+  next H steps and the cars that the driver knew at t, planned anew at each step
 - ``p(a_t | m_t) = softmax(Q(., m_t))``
 - ``p(w) = Normal(0, prior_scale)``, weak
 
 Features (supplement): distance to the centre of the road, distance to the cars (indicators of a car
 of the ego's lane at 0 to 4 cells, one weight for all cars), and the action (1 for switching lanes).
 Both lanes are equally far from the centre and no action leaves them, so the first feature is
-constant: the recordings say nothing of its weight, which stays at its prior mean of 0.
+constant: its weight is not identified by the data and stays at its prior mean of 0.
 
-Departures: the size of a reward and the consistency of those who follow it are not separately
-identified (only their product is), so weights are reported on the scale on which switching costs 1,
-as in the task; indicators in place of distances, because a reward that is linear in distance could
-not express the task's.
+Departures: the scale of the reward and the consistency of drivers are not separately identified
+(only their product is), so weights are reported on the scale on which switching costs 1, as in the
+task; features are indicators instead of distances, because a reward that is linear in distance
+cannot express the task's.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mirror_ppl.errors import DemonstrationsError
 
 CENTRE, SWITCH = "centre_distance", "switch"
 CAR_DISTANCES = 5
-"""Cars of the ego's lane have a weight at 0, 1, ... up to this many cells, exclusive."""
+"""Number of weights of cars of the ego's lane, at 0, 1, ... cells."""
 FEATURES = (CENTRE, *(f"car_at_{cells}" for cells in range(CAR_DISTANCES)), SWITCH)
 CENTRE_DISTANCE = 0.5
 """Distance in lanes of either lane's middle to the centre of the road."""
@@ -42,14 +42,14 @@ CENTRE_DISTANCE = 0.5
 
 @dataclass(frozen=True)
 class Decisions:
-    """N decisions of drivers, and what each was based on.
+    """N decisions of drivers, with the knowledge that each was based on.
 
     Attributes:
         lane: the driver's lane ``[N]``.
-        known: boolean ``[N, K]``, the cars of which they knew.
-        position: where they believed them to be ``[N, K]``, cells ahead.
-        speed: how they believed them to move ``[N, K]``, cells per step.
-        action: what they did ``[N]``, 0 stay, 1 switch.
+        known: boolean ``[N, K]``, the cars they knew.
+        position: believed positions ``[N, K]``, cells ahead.
+        speed: believed relative speeds ``[N, K]``, cells per step.
+        action: their action ``[N]``, 0 stay, 1 switch.
     """
 
     lane: Tensor
@@ -65,10 +65,10 @@ class LearnedReward:
 
     Attributes:
         weights: by name (``FEATURES``), in units of the task's reward.
-        standard_errors: of the weights, by name: from the curvature of the posterior, carried
+        standard_errors: of the weights, by name: from the curvature of the posterior, propagated
             through the scaling. That of the weight which sets the scale is 0.
-        scale: by how much the weights were divided, an estimate of the drivers' mean consistency
-            in 1 / units of reward.
+        scale: divisor of the weights, an estimate of the drivers' mean consistency in 1 / units
+            of reward.
         scale_error: its standard error.
     """
 
@@ -88,12 +88,12 @@ class LearnedReward:
 
 
 def log_policy(weights: Tensor, decisions: Decisions, horizon: int, discount: float) -> Tensor:
-    """Log-probability ``[N, A]`` of each action under the policy of maximum causal entropy.
+    """Return log-probabilities ``[N, A]`` of actions under the maximum causal entropy policy.
 
     Args:
         weights: ``[len(FEATURES)]``, differentiable.
-        decisions: what they were based on; the actions are not used.
-        horizon: steps looked ahead.
+        decisions: states and knowledge; the actions are not used.
+        horizon: number of steps planned ahead.
         discount: per step.
     """
     rewards = lane_rewards(
@@ -110,18 +110,18 @@ def learn_reward(
     prior_scale: float = 30.0,
     iterations: int = 100,
 ) -> LearnedReward:
-    """Learn the reward that decisions were made for; deterministic.
+    """Learn the reward that explains decisions; deterministic.
 
     Args:
         decisions: pooled over people, rounds and steps.
-        horizon: steps that the drivers looked ahead.
+        horizon: number of steps that the drivers planned ahead.
         discount: per step.
         prior_scale: standard deviation of the prior of each weight, before they are scaled.
         iterations: of L-BFGS, at most.
 
     Raises:
-        DemonstrationsError: in these decisions switching lanes costs nothing, so there is nothing
-            to measure the other weights by.
+        DemonstrationsError: the learned cost of switching lanes is not positive, so the weights
+            cannot be scaled by it.
     """
 
     def loss(weights: Tensor) -> Tensor:

@@ -1,10 +1,10 @@
-"""The oracle: the best that could be said to a person who is known exactly, in a known world.
+"""The oracle: optimal messages to a person who is known exactly, in a known world.
 
-Knowing how somebody sees, remembers and decides, and how the world moves, makes the choice of
-messages a Markov decision problem: its state is the world and what the person knows, an action of
-it is a message, and chance is what the person then does. It is solved exactly, by backward
-induction over every state that can be reached under any messages. Nobody can do better on average;
-it is the ceiling for communicators that have to infer the person and to predict.
+If the person and the world are known exactly, the choice of messages is a Markov decision process:
+its state is the world and the person's knowledge, its actions are messages, and its transitions are
+random through the person's actions. It is solved exactly, by backward induction over every state
+that can be reached under any messages. Its expected return is an upper bound for communicators that
+have to infer the person.
 """
 
 from __future__ import annotations
@@ -21,22 +21,21 @@ from mirror_ppl.domains.driving.world import Driving, DrivingState
 from mirror_ppl.row_hashing import distinct_rows
 
 CHUNK = 2000
-"""Decisions of the person that are worked out at once; bounds memory."""
+"""Number of the person's decisions that are computed at once; bounds memory."""
 
 
 @dataclass(frozen=True)
 class _Step:
-    """Everything that can happen at one time of R rounds.
+    """All choices and outcomes at one step of R rounds.
 
     Attributes:
-        state: which of this step's states a choice belongs to ``[N]``; a choice is a state with a
-            message.
+        state: index of the state of each choice ``[N]``; a choice is a state with a message.
         message: flags ``[N, items]``.
-        outcome: what a choice leads the person to know, ``[N]``, an index into the outcomes.
+        outcome: index of the outcome of each choice ``[N]``, the person's knowledge after it.
         probability: of actions ``[outcomes, A]``.
         reward: of actions ``[outcomes, A]``.
         following: state at the next step ``[outcomes, A]``.
-        states: how many states there are.
+        states: number of states.
     """
 
     state: Tensor
@@ -52,11 +51,11 @@ class Oracle:
     """The best messages for one driver in given rounds.
 
     Args:
-        driver: one person, exactly as they are.
+        driver: one person.
         start: states ``[R]`` in which the rounds begin.
 
     Attributes:
-        value: expected return of each round, costs of messages taken off, ``[R]``.
+        value: expected return of each round, net of costs of messages, ``[R]``.
     """
 
     def __init__(self, driver: SimulatedDrivers, start: DrivingState) -> None:
@@ -81,9 +80,9 @@ class Oracle:
         self.value = value
 
     def messages(self, actions: Tensor) -> Tensor:
-        """Flags ``[R, items]`` of what to say after ``actions`` ``[R, t]``.
+        """Return flags ``[R, items]`` of the best messages after ``actions`` ``[R, t]``.
 
-        The rounds have to have gone as the oracle wanted them: with its own messages.
+        The oracle's own messages have to have been sent at all earlier steps.
         """
         state = torch.arange(len(actions))
         for time, action in enumerate(actions.unbind(1)):
@@ -94,15 +93,15 @@ class Oracle:
         return self._steps[time].message[self._best[time][state]]
 
     def losses(self, flags: Tensor, actions: Tensor) -> Tensor:
-        """What each message of somebody else lost against the best one then, ``[R, T]``.
+        """Return the loss of each of a communicator's messages, ``[R, T]``.
 
-        Expected net reward of the rest of the round with the best message now, less that with the
-        given one, each followed by the best messages: the losses of a round add up to what its
-        messages lose on the whole, in expectation.
+        The loss is the expected net reward of the rest of the round with the best message now,
+        minus that with the given one, each followed by the best messages. The losses of a round
+        add up to its expected total loss.
 
         Args:
-            flags: messages ``[R, T, items]``, each of them possible then.
-            actions: what the person did after each, ``[R, T]``.
+            flags: messages ``[R, T, items]``, each of them allowed.
+            actions: the person's action after each, ``[R, T]``.
         """
         state = torch.arange(len(actions))
         places = 2 ** torch.arange(flags.shape[-1])
@@ -174,7 +173,7 @@ def _everything(driver: SimulatedDrivers, start: DrivingState) -> list[_Step]:
 
 
 def _at(world: DrivingState, rounds: Tensor, lane: Tensor) -> DrivingState:
-    """The states of some rounds with the ego in given lanes."""
+    """Return the states of some rounds with the ego in given lanes."""
     return DrivingState(lane, world.position[rounds], world.speed[rounds])
 
 
@@ -187,7 +186,7 @@ def _memory(memory: Memory, rows: Tensor) -> Memory:
 
 
 def _choices(driver: SimulatedDrivers, known: Memory, lane: Tensor) -> Tensor:
-    """Probabilities ``[M, A]`` of what the driver does, worked out once for equal knowledge."""
+    """Return action probabilities ``[M, A]``, computed once for equal knowledge."""
     first, which = distinct_rows(torch.cat([lane[:, None], known.rows()], -1))
     parts = [
         (driver.consistency * driver.values(_memory(known, rows), lane[rows])).softmax(-1)

@@ -1,7 +1,7 @@
-"""The people of the driving domain, from the ground truth to those who are handed out.
+"""Makes the simulated drivers, as in the supplement's section B.
 
-As the supplement's section B builds them: ten people play 24 rounds in each setting, a reward is
-learned from all that they did, and simulated people plan on it. ``docs/people.md`` tells the steps.
+Ten ground-truth people play 24 rounds in each setting, a reward is learned from their actions, and
+simulated people plan with it. ``docs/people.md`` explains the steps.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from mirror_ppl.people.base import DomainPeople, derived_generator
 from mirror_ppl.people.recordings import Recording, draw_starts, record
 
 PARTICIPANTS = 10
-"""How many ground-truth people the reward is learned from."""
+"""Number of ground-truth people from whom the reward is learned."""
 PARTICIPANT_ROUNDS = 24
-"""How many rounds each of them plays in each setting."""
+"""Number of rounds of each of them in each setting."""
 
 
 def decisions(recording: Recording) -> Decisions:
-    """Every choice and what it was based on, people and rounds pooled."""
+    """Return all decisions with the knowledge they were based on, pooled over people and rounds."""
     memory = recording.memory
     return Decisions(
         lane=recording.observation["ego"][:, :, :-1, 0].long().flatten(),
@@ -37,7 +37,7 @@ def decisions(recording: Recording) -> Decisions:
 
 
 def record_participants(setting: str, seed: int) -> Recording:
-    """The ground-truth people's rounds in a setting, limited in sight by the setting alone.
+    """Record ground-truth people in a setting, their sight limited by the setting alone.
 
     Raises:
         UnknownNameError: there is no such setting.
@@ -52,7 +52,7 @@ def record_participants(setting: str, seed: int) -> Recording:
 
 @lru_cache(maxsize=8)
 def learned_reward(seed: int) -> LearnedReward:
-    """The reward learned from the rounds of the ground-truth people in every setting, pooled."""
+    """Learn the reward from the rounds of ground-truth people, pooled over settings."""
     parts = [decisions(record_participants(setting, seed)) for setting in Driving.settings]
     names = Decisions.__dataclass_fields__
     pooled = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
@@ -62,16 +62,16 @@ def learned_reward(seed: int) -> LearnedReward:
 def simulated_drivers(
     setting: str, population: str, people: int, seed: int, device: torch.device | str = "cpu"
 ) -> PlanningDrivers:
-    """The simulated people of a population, to be stepped by whoever wants to.
+    """Return the simulated people of a population, to be stepped by the caller.
 
-    The same seed gives the same people, those that `mirror_ppl.people.simulate` records.
+    A seed gives the people that `mirror_ppl.people.simulate` records with it.
 
     Args:
         setting: a setting of the driving domain.
         population: ``paper`` or ``diverse``, see `mirror_ppl.domains.driving.populations.reaches`.
         people: number of people P.
         seed: determines their sight, consistency and reward.
-        device: where they live.
+        device: device of their tensors.
 
     Raises:
         UnknownNameError: there is no such setting or population.
@@ -85,4 +85,4 @@ def simulated_drivers(
 DRIVERS = DomainPeople(
     tuple(POPULATIONS), simulated_drivers, lambda driver, start: Oracle(driver, start).messages
 )
-"""What the rest of the package knows of them."""
+"""The drivers as registered in the domain's record."""

@@ -1,23 +1,23 @@
-"""People who drive: what they remember, and how they decide (supplement, section B).
+"""Simulated drivers: their memory and decisions (supplement, section B).
 
-A person sees the cars within reach, remembers every car they have ever seen or been told of, plans
-on what they know, and is consistent to some degree:
+A person sees the cars within reach, remembers every car that was seen or communicated, plans with
+this knowledge, and chooses more or less consistently:
 
 ===================  ===========================================================================
 ``reach_d``          how far they see in direction d, in cells; the directions are those of
                      `mirror_ppl.domains.driving.Driving.directions`
 ``m_t``              what they know at step t: `Memory`
-``Q(a, m_t)``        value of each action to somebody for whom the cars in ``m_t`` are all there are
+``Q(a, m_t)``        value of each action if there are no other cars than those in ``m_t``
 ``consistency``      how strongly values decide, in 1 / units of reward
 ===================  ===========================================================================
 
 ``p(a_t | m_t) = softmax(consistency * Q(., m_t))``
 
 There are two kinds. `TaskDrivers` value actions exactly, by the task's own reward; they stand in
-for the participants of the study. `PlanningDrivers` are the simulated agents that the supplement
-makes from recordings: a reward learned from them, and the cross-entropy method to plan on it.
+for the participants of the study. `PlanningDrivers` are the supplement's simulated agents: they
+plan by the cross-entropy method on a reward learned from recordings.
 
-Choices that the supplement leaves open, with their reasons, are in ``docs/people.md``.
+Choices that the supplement does not specify, and their reasons, are in ``docs/people.md``.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ from mirror_ppl.domains.driving.world import (
 from mirror_ppl.people.base import SimulatedPeople, each
 
 HORIZON = 10
-"""How many steps people look ahead."""
+"""Number of steps that people plan ahead."""
 DISCOUNT = 0.9
 """Discount per step of people's planning."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What a driver knows of each car; K = 4 cars in the order of ``CARS``.
+    """A driver's knowledge of each car; K = 4 cars in the order of ``CARS``.
 
     Attributes:
-        known: boolean ``[..., K]``: ever seen or told of. Other cars do not exist for the driver,
-            and what the other fields say of them means nothing.
-        position: cells ahead ``[..., K]``, negative behind, reckoned on from when last observed.
+        known: boolean ``[..., K]``: ever seen or communicated. Other cars do not exist for the
+            driver, and their other fields are meaningless.
+        position: cells ahead ``[..., K]``, negative behind, extrapolated since last observed.
         speed: relative speed ``[..., K]`` in cells per step.
-        assumed: boolean ``[..., K]``: the speed is an assumption, neither seen nor told.
+        assumed: boolean ``[..., K]``: the speed is an assumption, neither seen nor communicated.
         age: steps ``[..., K]`` since the car was last observed.
     """
 
@@ -70,7 +70,7 @@ class Memory:
 
     @classmethod
     def empty(cls, batch: tuple[int, ...], device: torch.device | None = None) -> Memory:
-        """Memory ``[*batch, K]`` at the start of a round, before anything is observed."""
+        """Return memory ``[*batch, K]`` at the start of a round, before any observation."""
         shape = (*batch, len(CARS))
         nothing = torch.zeros(shape, device=device)
         never = torch.zeros(shape, dtype=torch.bool, device=device)
@@ -78,7 +78,7 @@ class Memory:
 
     @classmethod
     def stack(cls, memories: list[Memory], dim: int) -> Memory:
-        """One memory of several, stacked along a new dimension."""
+        """Stack several memories along a new dimension."""
         parts = {
             field.name: torch.stack([getattr(memory, field.name) for memory in memories], dim)
             for field in fields(cls)
@@ -86,10 +86,10 @@ class Memory:
         return cls(**parts)
 
     def canonical(self) -> Memory:
-        """The same knowledge in one form: what means nothing is zero.
+        """Return the memory with meaningless fields set to zero.
 
-        A speed that is not an assumption came from two sights or from speech and is right, so how
-        long ago that was no longer matters.
+        A speed that is not an assumption came from two sights or an utterance and is correct, so
+        its age is irrelevant.
         """
         assumed = self.known & self.assumed
         return Memory(
@@ -101,17 +101,17 @@ class Memory:
         )
 
     def rows(self) -> Tensor:
-        """Everything as whole numbers ``[..., 5 K]``, equal where knowledge is equal."""
+        """Return all fields as whole numbers ``[..., 5 K]``, equal where knowledge is equal."""
         parts = (self.known, self.position, self.speed, self.assumed, self.age)
         return torch.cat([part.long() for part in parts], -1)
 
 
 def in_sight(reach: Tensor, position: Tensor, lane: Tensor) -> Tensor:
-    """Which cars at given places are within reach, boolean ``[..., K]``.
+    """Return which cars at given positions are within reach, boolean ``[..., K]``.
 
     Args:
         reach: cells ``[..., 4]`` for each of ``Driving.directions``; a car is seen at that distance
-            and below, abreast counts as ahead, and 0 behind is to see nothing there.
+            and below, abreast counts as ahead, and 0 behind means no sight there.
         position: cells ahead ``[..., K]``.
         lane: the driver's lane ``[...]``.
     """
@@ -128,26 +128,25 @@ def remember(
     told: Visibility | None = None,
     reach: Tensor | None = None,
 ) -> Memory:
-    """What a driver knows after one more step; everything is digested, nothing is forgotten.
+    """Update a driver's memory by one step; nothing is forgotten.
 
-    - A car that is seen, or shown as a visual message, gives its position. Observed before, its
-      speed follows from the two positions. Otherwise it is assumed to come closer: -1 cell a step
-      for a car ahead, +1 for one behind or abreast (one that came from ahead would have been seen
-      there before).
-    - A car that is spoken of gives its position and speed.
-    - Any other known car is reckoned on with its speed. Where that was an assumption and the car
-      should be in sight now but is not, the assumption was wrong: the car moves the other way.
+    - For a car that is seen, or shown as a visual message, the position is known. If the car was
+      observed before, its speed follows from the two positions. Otherwise it is assumed to come
+      closer: -1 cell a step for a car ahead, +1 for a car behind or abreast (from ahead it would
+      have been seen there before).
+    - For a car in a verbal message, position and speed are known.
+    - The position of any other known car is extrapolated with its speed. If that was an assumption
+      and the car should be in sight but is not, the car moves the other way.
     - A car beyond the visible road (at +-``ROAD_END`` cells) cannot be observed.
 
     Args:
         memory: of the step before, ``[..., K]``.
-        observation: everything there is to observe now; items that are neither seen nor told are
-            not used.
+        observation: full observation; items that are neither seen nor communicated are not used.
         seen: boolean ``[..., K]``, the cars that the driver sees.
         told: boolean ``[..., K]`` for each modality, the items that are communicated; none unless
             given.
-        reach: how far the driver sees ``[..., 4]`` (see `in_sight`); without it, no assumption is
-            ever found wrong.
+        reach: how far the driver sees ``[..., 4]`` (see `in_sight`); without it, assumptions are
+            never corrected.
 
     Returns:
         The memory ``[..., K]`` at this step.
@@ -187,7 +186,7 @@ def remember(
 
 @dataclass(frozen=True)
 class SimulatedDrivers(SimulatedPeople):
-    """P people who drive, each with their own sight and consistency; step them with `step`.
+    """P simulated drivers, each with their own sight and consistency; step them with `step`.
 
     Attributes:
         reach: how far each sees, in cells, ``[P, 4]`` for each of ``Driving.directions``.
@@ -199,11 +198,11 @@ class SimulatedDrivers(SimulatedPeople):
 
     @property
     def domain(self) -> Driving:
-        """Driving."""
+        """Driving domain."""
         return Driving()
 
     def truth(self) -> dict[str, Tensor]:
-        """Their sight in each direction, what they take for granted, and their consistency."""
+        """Return their sight in each direction, assumptions and consistency."""
         sight = zip(Driving.directions, self.reach.unbind(-1), strict=True)
         return {
             **{f"sight_{direction}": reach for direction, reach in sight},
@@ -212,15 +211,15 @@ class SimulatedDrivers(SimulatedPeople):
         }
 
     def start(self, *batch: int, mind_noise: Tensor | None = None) -> Memory:
-        """Memory ``[P, *batch, K]`` before a round begins; nothing in it is chance."""
+        """Return memories ``[P, *batch, K]`` before a round begins; they are deterministic."""
         del mind_noise
         return Memory.empty((len(self.reach), *batch), self.reach.device)
 
     def sees(self, observation: Observation) -> Visibility:
-        """What each sees by themselves, boolean ``[P, ..., K]`` for each modality.
+        """Return items each sees without messages, boolean ``[P, ..., K]`` by modality.
 
         Args:
-            observation: ``[P, ...]``, everything there is to observe.
+            observation: full observation, ``[P, ...]``.
         """
         ahead = observation["visual"][..., 0]
         lane = observation["ego"][..., 0].long()
@@ -234,7 +233,7 @@ class SimulatedDrivers(SimulatedPeople):
 
         Args:
             memory: of the step before, ``[P, ..., K]``; `start` at the first step of a round.
-            observation: ``[P, ...]``, everything there is to observe.
+            observation: full observation, ``[P, ...]``.
             told: boolean ``[P, ..., K]`` for each modality, the items communicated at this step.
 
         Returns:
@@ -249,34 +248,34 @@ class SimulatedDrivers(SimulatedPeople):
 
     @abstractmethod
     def values(self, memory: Memory, lane: Tensor) -> Tensor:
-        """Value ``[..., A]`` of each action, in units of reward.
+        """Return values ``[..., A]`` of actions, in units of reward.
 
         Args:
-            memory: what is known, ``[..., K]``.
+            memory: knowledge of cars, ``[..., K]``.
             lane: the driver's lane ``[...]``.
         """
 
 
 @dataclass(frozen=True)
 class TaskDrivers(SimulatedDrivers):
-    """The ground truth: people who value actions exactly, by the reward of the task."""
+    """Ground-truth drivers, who value actions exactly, by the reward of the task."""
 
     def values(self, memory: Memory, lane: Tensor) -> Tensor:
-        """Exact values ``[..., A]`` of the task for somebody who knows these cars only."""
+        """Return exact values ``[..., A]`` of the task if there are only the known cars."""
         state = DrivingState(lane=lane, position=memory.position, speed=memory.speed)
         return known_car_values(state, memory.known, HORIZON, DISCOUNT)
 
 
 @dataclass(frozen=True)
 class PlanningDrivers(SimulatedDrivers):
-    """The simulated people: the cross-entropy method on a learned reward.
+    """Simulated drivers, who plan by the cross-entropy method on a learned reward.
 
-    The value of an action is that of the best plan found which begins with it. Plans are searched
-    with the same random numbers each time, so probabilities are a function of what is known.
+    The value of an action is that of the best plan found that begins with it. Plans are searched
+    with the same random numbers each time, so probabilities are a function of knowledge.
 
     Attributes:
-        reward: what they plan on.
-        options: how hard they search.
+        reward: the learned reward.
+        options: of the cross-entropy method.
         planning_seed: seed of the random numbers of the search.
     """
 
@@ -285,14 +284,14 @@ class PlanningDrivers(SimulatedDrivers):
     planning_seed: int = 0
 
     def values(self, memory: Memory, lane: Tensor) -> Tensor:
-        """Values ``[..., A]`` of the best plans found, over the cars that are known."""
+        """Return values ``[..., A]`` of the best plans found, given the known cars."""
         device = lane.device
         rewards = lane_rewards(
             memory.position, memory.speed, memory.known, HORIZON, self.reward.car_weights(device)
         )
         discounts = DISCOUNT ** torch.arange(HORIZON, device=device)
-        # A plan's value, taken apart into terms that one product with each plan gives: the road
-        # travelled in the present lane, the gain of being in the other, and the switches.
+        # A plan's value is linear in three terms: the return of the present lane, the gain of
+        # being in the other lane, and the switches.
         both = rewards * discounts[:, None]
         index = lane[..., None, None].expand(*both.shape[:-1], 1)
         here, there = both.gather(-1, index), both.gather(-1, 1 - index)

@@ -1,4 +1,4 @@
-"""The pictures of drivers that a fit has."""
+"""The pictures of a fit to drivers."""
 
 from mirror_ppl.domains.driving import road, rounds, samples
 from mirror_ppl.plots.notices import NOTICES_PICTURE
@@ -11,13 +11,13 @@ PICTURES = {
     "samples.png": SightPicture(
         samples.has_sight,
         samples.samples_picture,
-        "the same in samples, beside what they really see",
+        "posterior samples of that road, beside what they really see",
     ),
     "notices.png": NOTICES_PICTURE,
 }
-"""Of what each person sees, by file name."""
+"""Pictures of each person's sight, by file name."""
 ROUNDS = {
     "round": rounds.plot_round,
     "predictive_check": rounds.plot_predictive_check,
 }
-"""Of rounds, by the method of :class:`mirror_ppl.plots.fit.FitPlots` that draws them."""
+"""Pictures of rounds, by method of :class:`mirror_ppl.plots.fit.FitPlots`."""

@@ -1,7 +1,7 @@
-"""Who the drivers of a population are: how far each sees and how consistent each is.
+"""Populations of drivers: the sight and consistency of each person.
 
 Every draw comes from a generator derived from the seed, its purpose and the person's number. So
-person 3 of a seed is the same in every setting and however many other people there are.
+person 3 of a seed is the same in every setting and for any number of people.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ SETTING_REACH = {
     "clear": (ROAD_END, ROAD_END, ROAD_END, ROAD_END),
     "fog": (FOG_REACH, FOG_REACH, 0, 0),
 }
-"""How far a setting lets see, in cells, for each of ``Driving.directions``."""
+"""Reach in each setting, in cells, for each of ``Driving.directions``."""
 REACHES_AHEAD = (1, 2, 3, 4, 6)
-"""What reaches ahead there are in the population ``diverse``, in cells."""
+"""Possible reaches ahead in the population ``diverse``, in cells."""
 REACHES_BEHIND = (0, 1, 2, 3, 4)
-"""The same behind; 0 sees nothing there."""
+"""Possible reaches behind in the population ``diverse``, in cells; 0 is no sight."""
 
 
 def consistencies(people: int, seed: int) -> Tensor:
-    """Each person's consistency ``[P]`` in 1 / units of reward, log-normal."""
+    """Draw each person's consistency ``[P]`` in 1 / units of reward, log-normal."""
     noise = [
         torch.randn((), generator=derived_generator(seed, "consistency", person))
         for person in range(people)
@@ -42,12 +42,12 @@ def consistencies(people: int, seed: int) -> Tensor:
 
 
 def reaches(population: str, setting: str, people: int, seed: int) -> Tensor:
-    """How far each person sees, in cells, ``[P, 4]`` for each of ``Driving.directions``.
+    """Return each person's reach in cells, ``[P, 4]`` for each of ``Driving.directions``.
 
     Args:
         population: a name in ``POPULATIONS``: ``paper``, sight limited by the setting alone;
-            ``diverse``, each person's own reach ahead and behind, the same in both lanes and in
-            every setting.
+            ``diverse``, each person's own reach ahead and behind, equal in both lanes and all
+            settings.
         setting: a setting of the driving domain.
         people: number of people P.
         seed: the same seed gives the same people.
@@ -81,4 +81,4 @@ POPULATIONS: dict[str, Callable[[str, int, int], Tensor]] = {
     "paper": _by_setting,
     "diverse": _by_person,
 }
-"""Populations of drivers: how far each person sees, given setting, number of people and seed."""
+"""Populations of drivers: reach of each person, given setting, number of people and seed."""

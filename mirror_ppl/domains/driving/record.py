@@ -1,4 +1,4 @@
-"""What the package knows of driving besides its rules; settings are the defaults, made for it."""
+"""The record of driving; its settings are the package's defaults."""
 
 from mirror_ppl.domains.record import Record
 

@@ -1,4 +1,4 @@
-"""Rounds of driving replayed: the road as it is, and what the person knows of it."""
+"""Figures of replayed rounds of driving: the true road, and what the person knows of it."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from mirror_ppl.plots.reading import BLACK, BLUE, TRUE
 VERMILLION, GREEN, YELLOW = "#D55E00", "#009E73", "#F0E442"
 ROAD = "#e4e6e9"
 MIDDLES = (1.5, 0.5)
-"""Height of the middle of each lane: people drive to the right, so the left lane is above."""
+"""Vertical middle of each lane: people drive to the right, so the left lane is above."""
 WHOLE, LOW, APART = 0.44, 0.22, 0.23
-"""Height of a car, that of each of two cars in one cell, and how far these are from its middle."""
+"""Height of a car, of each of two cars in one cell, and offset of these from its middle."""
 
 
 # --- what a person knows ----------------------------------------------------------------------
 
 
 def share_known(person: Person, past: RoundSoFar) -> Tensor:
-    """Share of posterior draws in which a person has seen or been told of each item so far.
+    """Return the share of posterior draws in which each item was seen or communicated so far.
 
     Args:
         person: posterior draws of the human model.
-        past: a round of t actions, and of what was told before each.
+        past: a round of t actions, with the messages before each.
 
     Returns:
-        ``[t + 1, K]``; at the last step, before the next action, nothing is told yet.
+        ``[t + 1, K]``; at the last step, before the next action, there is no message yet.
     """
     nothing = {
         name: value.new_zeros(value.shape[1], dtype=torch.bool)
         for name, value in past.observation.items()
         if name in past.told
     }
-    whole = past.then(nothing, 0, past.now)  # nothing is told at the present step
+    whole = past.then(nothing, 0, past.now)  # no message at the present step
     state = BeliefState.initial(person.human, person.percept_count)
     view, _ = state.perceive(transitions(person, whole))
     visible = view.visible
@@ -61,11 +61,11 @@ def share_known(person: Person, past: RoundSoFar) -> Tensor:
 
 
 def share_seen(person: Person, lane: int) -> Tensor:
-    """Share of posterior draws in which a person would see a car, by where it is.
+    """Return the share of posterior draws in which a car would be seen, by position.
 
     Args:
         person: posterior draws of the human model, of driving.
-        lane: the lane that the person is in.
+        lane: the person's lane.
 
     Returns:
         ``[2, 25]``: lane of the car (left, right) and distance (-12 to 12 cells).
@@ -76,7 +76,7 @@ def share_seen(person: Person, lane: int) -> Tensor:
         places
     )
     rows = torch.arange(len(percepts), device=percepts.device)
-    # One look for each distance, with all cars there.
+    # One observation for each distance, with all cars there.
     position = torch.as_tensor(DISTANCES, device=percepts.device).repeat(person.percept_count)
     position = position[:, None].expand(-1, len(CARS))
     lanes = torch.full_like(position[..., 0], lane)
@@ -100,19 +100,19 @@ def plot_frames(
     knowledge: Mapping[str, Memory] | None = None,
     cells: int = ROAD_END,
 ) -> Picture:
-    """Draw moments of rounds of driving: the road as it is, and below what the person knows.
+    """Draw moments of rounds of driving: the true road, and below it what the person knows.
 
-    What the model says that they know is drawn as shares of posterior draws: of those in which
-    they have seen or been told of a car so far (the number on the car), and of those in which they
-    would see a car in a cell (the shade of the road). The latent belief itself is not drawn: its
-    decoders are off by cells. What a simulated person really thinks is known, and outlined.
+    Inferred knowledge is drawn as shares of posterior draws in which a car was seen or communicated
+    so far (the number on the car), and in which a car in a cell would be seen (the shade of the
+    road). The latent belief is not drawn, because its decoders are off by cells. The true knowledge
+    of a simulated person is outlined.
 
     Args:
         person: posterior draws of the human model.
         rounds: rounds by title, one column each.
         steps: the moments, one row each: before the action of that number, counted from 0.
-        knowledge: by title what a simulated person knew at each step, ``[T, K]``.
-        cells: how far the road is drawn, ahead and behind.
+        knowledge: by title the true knowledge of a simulated person at each step, ``[T, K]``.
+        cells: number of cells drawn ahead and behind.
 
     Raises:
         ValueError: there are no rounds or steps, or a round does not have all of these steps.
@@ -125,7 +125,7 @@ def plot_frames(
                 raise ValueError(f'there is no step {step} in "{title}", which has {past.time}')
     size = (0.5 + 4.75 * len(rounds), 1.85 * len(steps) + 1.6)
     figure = Picture(figsize=size, layout="constrained")
-    # Roads are as large as minds; above and below the first there is room for what is said.
+    # Roads and knowledge have equal size; around the roads there is room for messages.
     grid = figure.subplots(
         2 * len(steps), len(rounds), squeeze=False, sharex=True, height_ratios=[1.6, 1] * len(steps)
     )
@@ -150,7 +150,7 @@ def plot_frames(
 
 
 def _label_column(column: Sequence[Axes], title: str, cells: int, first: bool) -> None:
-    """Title and axes of the moments of one round: roads, and below each what they know."""
+    """Set title and axes of one column: roads, and below each what the person knows."""
     for number, ax in enumerate(column):
         ax.set_xlim(-cells - 0.5, cells + 0.5)
         ax.set_yticks([])
@@ -175,7 +175,7 @@ def _label_column(column: Sequence[Axes], title: str, cells: int, first: bool) -
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a car is drawn: the middle of its block, and how high the block is."""
+    """The middle and height of a car's block."""
 
     x: float
     y: float
@@ -183,7 +183,7 @@ class _Place:
 
 
 def _places(past: RoundSoFar, step: int, cells: int) -> dict[int, _Place]:
-    """The cars that are drawn, by number; those of one cell above each other."""
+    """Return the places of drawn cars by number; two cars in a cell are above each other."""
     ahead = past.observation["visual"][step, :, 0].tolist()
     cell = {
         car: (x, CAR_LANES[car])
@@ -192,7 +192,7 @@ def _places(past: RoundSoFar, step: int, cells: int) -> dict[int, _Place]:
     }
     places = {}
     for car, (x, lane) in cell.items():
-        # No lane has more than two cars, so no cell has.
+        # No lane, and so no cell, has more than two cars.
         same = [other for other in cell if cell[other] == cell[car]]
         alone = len(same) == 1
         up = 0.0 if alone else APART if car == same[0] else -APART
@@ -201,7 +201,7 @@ def _places(past: RoundSoFar, step: int, cells: int) -> dict[int, _Place]:
 
 
 def _collided(domain: Domain, past: RoundSoFar, step: int) -> bool:
-    """Whether the action before this step led into a car."""
+    """True if the action before this step led into a car."""
     if step == 0:
         return False
     before, after = (
@@ -212,7 +212,7 @@ def _collided(domain: Domain, past: RoundSoFar, step: int) -> bool:
 
 
 def _headline(domain: Domain, past: RoundSoFar, step: int) -> str:
-    """What happens at this moment, such as "step 3:  said rear-left, then they switch"."""
+    """Return the title of a moment, such as "step 3:  said rear-left, then they switch"."""
     when = f"step {step}" + (" (collision)" if _collided(domain, past, step) else "")
     if step == past.time:
         return f"{when}:  the end"
@@ -223,7 +223,7 @@ def _headline(domain: Domain, past: RoundSoFar, step: int) -> str:
 
 
 def _draw_road(ax: Axes, past: RoundSoFar, step: int, cells: int) -> None:
-    """The road as it is: cars, which way each moves past the person, and what is told of them."""
+    """Draw the true road: cars, their relative motion, and messages about them."""
     draw_road(ax)
     ax.add_patch(Rectangle((-ROAD_END - 0.5, 0), 2 * ROAD_END + 1, 2, fc=ROAD, zorder=0))
     ego = int(past.observation["ego"][step, 0])
@@ -252,11 +252,11 @@ def _draw_road(ax: Axes, past: RoundSoFar, step: int, cells: int) -> None:
             )
         if x == 0 and CAR_LANES[car] == ego:
             ax.plot([x], [y], marker=(9, 1, 0), ms=21, color=YELLOW, mec=BLACK, zorder=7)
-    ax.set_ylim(-0.6, 2.6)  # room for what is said
+    ax.set_ylim(-0.6, 2.6)  # room for messages
 
 
 def _draw_mind(ax: Axes, seen: Tensor) -> None:
-    """The road, shaded by where a car would be seen, ``[2, 25]``."""
+    """Draw the road, shaded by where a car would be seen, ``[2, 25]``."""
     draw_road(ax)
     end = ROAD_END + 0.5
     ax.imshow(
@@ -271,13 +271,13 @@ def _draw_mind(ax: Axes, seen: Tensor) -> None:
 
 
 def _draw_known(ax: Axes, place: _Place, share: float, cells: int) -> None:
-    """A car, as light as it is known, with the share in percent."""
+    """Draw a car, shaded by the share of draws in which it is known, in percent."""
     _block(ax, place, fc=DARK_TO_LIGHT(share), ec="white", lw=0.8, zorder=6)
     ax.text(
         place.x,
         place.y,
         f"{100 * share:.0f}",
-        color="white" if share < 0.6 else BLACK,  # noqa: PLR2004 - where both can be read
+        color="white" if share < 0.6 else BLACK,  # noqa: PLR2004 - both are legible
         fontsize=min(9, 80 / cells) if place.height == WHOLE else 6,
         ha="center",
         va="center_baseline",
@@ -288,7 +288,7 @@ def _draw_known(ax: Axes, place: _Place, share: float, cells: int) -> None:
 def _draw_thoughts(
     ax: Axes, memory: Memory, step: int, places: Mapping[int, _Place], cells: int
 ) -> None:
-    """Where a simulated person thinks that the cars are."""
+    """Outline where a simulated person believes that the cars are."""
     known, position = memory.known[step].tolist(), memory.position[step].tolist()
     for car, (thinks, x) in enumerate(zip(known, position, strict=True)):
         if not thinks or abs(x) > cells:
@@ -304,7 +304,7 @@ def _draw_thoughts(
 
 
 def _block(ax: Axes, place: _Place, wider: float = 0.0, **style) -> None:
-    """A car as a block."""
+    """Draw a car as a block."""
     corner = (place.x - 0.36 - wider, place.y - place.height / 2 - wider)
     size = (0.72 + 2 * wider, place.height + 2 * wider)
     shape = "round,pad=0.06,rounding_size=0.14"
@@ -312,7 +312,7 @@ def _block(ax: Axes, place: _Place, wider: float = 0.0, **style) -> None:
 
 
 def _explain(figure: Picture, axes: list[Axes], truth_known: bool) -> None:
-    """Colour bar and legend below the frames."""
+    """Draw a colour bar and a legend below the frames."""
     bar = figure.colorbar(
         ScalarMappable(Normalize(0, 1), DARK_TO_LIGHT),
         ax=axes,
@@ -336,7 +336,7 @@ def _explain(figure: Picture, axes: list[Axes], truth_known: bool) -> None:
     labels = [
         "the person, driving to the right",
         "other cars; arrow: motion relative to the person",
-        "what they are told of",
+        "communicated to the person",
         "where the simulated person thinks a car is",
     ]
     number = len(handles) if truth_known else len(handles) - 1

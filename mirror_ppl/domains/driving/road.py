@@ -1,4 +1,4 @@
-"""The road as people see it: posteriors over sight, drawn from above (supplement, Fig. 11)."""
+"""Figures of the posterior over sight, as a road from above (supplement, Fig. 11)."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ DISTANCES = np.arange(-ROAD_END, ROAD_END + 1)
 ASPHALT, STONE, HEADLIGHT = "#14181f", "#5c6066", "#fbf3d5"
 DARK_TO_LIGHT = LinearSegmentedColormap.from_list("sight", (ASPHALT, STONE, HEADLIGHT))
 MOST_PEOPLE = 40
-"""More people than this do not fit on one picture."""
+"""Maximum number of people on one picture."""
 
 
 def has_sight(data: az.InferenceData) -> bool:
-    """Whether the human model has the four sight thresholds that the road is shaded by."""
+    """True if the posterior has the four sight thresholds that shade the road."""
     return all(site in data["posterior"] for site in _sites())
 
 
 def sight_probability(data: az.InferenceData, person: str) -> xr.DataArray:
-    """Posterior probability that a person sees a car, by where it is.
+    """Return the posterior probability that a person sees a car, by position of the car.
 
-    Whoever reaches r sees cars up to r cells away; a car abreast counts as ahead.
+    A person with threshold r sees cars up to r cells away; a car abreast counts as ahead.
 
     Args:
         data: with the sites ``sight_front_own``, ``sight_front_other``, ``sight_back_own`` and
@@ -54,15 +54,15 @@ def sight_probability(data: az.InferenceData, person: str) -> xr.DataArray:
         ``[2, 25]``: dimensions ``lane`` (own, other) and ``distance`` (-12 to 12 cells).
 
     Raises:
-        UnknownNameError: there is nobody of that id.
-        KeyError: the human model has other implants; see :func:`has_sight`.
+        UnknownNameError: no person has that id.
+        KeyError: the posterior has no such sites; see :func:`has_sight`.
     """
     probability = seen_of_draws(data, person).mean("sample")
     return probability.rename("sight_probability")
 
 
 def seen_of_draws(data: az.InferenceData, person: str) -> xr.DataArray:
-    """Where a person sees a car in each posterior draw, 0 or 1.
+    """Return where a person sees a car in each posterior draw, 0 or 1.
 
     Args:
         data: as for :func:`sight_probability`.
@@ -72,20 +72,20 @@ def seen_of_draws(data: az.InferenceData, person: str) -> xr.DataArray:
         ``[S, 2, 25]``: dimensions ``sample``, ``lane`` and ``distance``.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     posterior = of_person(data, "posterior", person)
     return _seen({site: draws(posterior[site]) for site in _sites()})
 
 
 def true_sight(data: az.InferenceData, person: str) -> xr.DataArray | None:
-    """What a simulated person really sees, shaped as :func:`sight_probability`, 0 or 1.
+    """Return a simulated person's true sight, shaped as :func:`sight_probability`, 0 or 1.
 
     Returns:
-        ``None`` where the truth is not known.
+        ``None`` if the true values are not known.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     reach = {site: truth(data, site, person) for site in _sites()}
     known = {site: np.array([value]) for site, value in reach.items() if value is not None}
@@ -95,18 +95,18 @@ def true_sight(data: az.InferenceData, person: str) -> xr.DataArray | None:
 def plot_sight(data: az.InferenceData, person: str, ax: Axes | None = None) -> Axes:
     """Draw the road from above, light where a person sees a car and dark where they do not.
 
-    The person's car drives to the right in the lower lane. The truth is outlined where it is known.
+    The person's car drives to the right in the lower lane. True sight is outlined if known.
 
     Args:
         data: as for :func:`sight_probability`.
         person: id of the person.
-        ax: where to draw; on a figure of its own, with an explanation, unless given.
+        ax: where to draw; a new figure with a legend unless given.
 
     Returns:
         The axes; ``.figure`` is the figure.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     probability = sight_probability(data, person)
     real = true_sight(data, person)
@@ -135,7 +135,7 @@ def plot_sight(data: az.InferenceData, person: str, ax: Axes | None = None) -> A
 
 
 def sight_picture(data: az.InferenceData) -> Picture:
-    """The roads of all people (the first 40 of more) on one figure, with one explanation.
+    """Draw the roads of all people (at most the first 40) on one figure, with one legend.
 
     Args:
         data: as for :func:`sight_probability`.
@@ -145,7 +145,7 @@ def sight_picture(data: az.InferenceData) -> Picture:
     # A road is about seven times as wide as it is high, with its title.
     columns = 1 if len(shown) < 4 else max(2, round(math.sqrt(len(shown) / 3)))  # noqa: PLR2004
     rows = -(-len(shown) // columns)
-    # The explanation below them needs some width too.
+    # The legend below them needs some width too.
     width, height = (6.2, 0.95) if columns > 1 else (10, 1.3)
     size = (width * columns + 0.4, height * rows + 1.9)
     figure = Picture(figsize=size, layout="constrained")
@@ -176,7 +176,7 @@ def sight_picture(data: az.InferenceData) -> Picture:
 
 
 def outline(seen: xr.DataArray) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Edges, as pairs of points, between the cells that are seen and those that are not.
+    """Return edges, as pairs of points, between seen and unseen cells.
 
     Args:
         seen: ``[2, 25]`` as from :func:`true_sight`. Cell (lane, distance) lies between
@@ -194,7 +194,7 @@ def outline(seen: xr.DataArray) -> list[tuple[tuple[float, float], tuple[float, 
 
 
 def draw_road(ax: Axes) -> None:
-    """The edges of a road of two lanes that runs to the right, its cells, and lane markings."""
+    """Draw the edges, cells and lane markings of a two-lane road that runs to the right."""
     end = ROAD_END + 0.5
     ax.vlines(DISTANCES[1:] - 0.5, 0, 2, color="#9aa0a6", lw=0.5, alpha=0.45, zorder=1)
     for y in (0, 2):
@@ -209,9 +209,9 @@ def draw_road(ax: Axes) -> None:
 
 
 def draw_car(ax: Axes, x: float = 0.0, y: float = 0.5, colour: str = BLUE) -> None:
-    """A car that drives to the right, an arrow before it, its middle at (x, y).
+    """Draw a car that drives to the right, with an arrow in front and its middle at (x, y).
 
-    Within the limits of the axes, which take no part in finding any: that is slow.
+    It does not take part in autoscaling of the axes, which is slow.
     """
     for wheel_x in (x - 0.32, x + 0.13):
         for wheel_y in (y - 0.34, y + 0.25):
@@ -240,7 +240,7 @@ def _sites() -> tuple[str, ...]:
 
 
 def _seen(reach: Mapping[str, np.ndarray]) -> xr.DataArray:
-    """Where a car is seen at each of the reaches ``[S]``, ``[S, 2, 25]``."""
+    """Return where a car is seen, ``[S, 2, 25]``, for reaches ``[S]`` by site."""
     rows = []
     for lane in LANES:
         ahead, behind = (reach[f"{SIGHT}{side}_{lane}"][:, None] for side in ("front", "back"))
@@ -253,7 +253,7 @@ def _seen(reach: Mapping[str, np.ndarray]) -> xr.DataArray:
 
 
 def _explain(figure: Figure, axes: list[Axes], truth_known: bool) -> None:
-    """Colour bar and legend below the roads."""
+    """Draw a colour bar and a legend below the roads."""
     bar = figure.colorbar(
         ScalarMappable(Normalize(0, 1), DARK_TO_LIGHT),
         ax=axes,
@@ -281,7 +281,7 @@ def _explain(figure: Figure, axes: list[Axes], truth_known: bool) -> None:
 
 
 def _car_handle(legend, orig_handle, xdescent, ydescent, width, height, fontsize) -> Polygon:
-    """A car that points to the right, for the legend."""
+    """Return a car that points to the right, for the legend."""
     left, right, nose = width * 0.15, width * 0.68, width * 0.98
     points = [(left, 0), (right, 0), (nose, height / 2), (right, height), (left, height)]
     return Polygon([(x - xdescent, y - ydescent) for x, y in points], closed=True)

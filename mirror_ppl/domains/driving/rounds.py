@@ -1,4 +1,4 @@
-"""Recorded rounds of driving beside what the posterior predicts."""
+"""Figures of recorded rounds of driving beside posterior predictions."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ if TYPE_CHECKING:
     import arviz as az
 
 RANGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
-"""Ends of the ranges of probabilities that are taken together."""
+"""Bin edges of predicted probabilities."""
 LANE_NAMES = ("left lane", "right lane")
 LEVELS = (0.05, 0.5, 0.95)
-"""Quantiles of which intervals are drawn: the median and the ends of 90%."""
+"""Quantiles of drawn intervals: the median and the ends of 90%."""
 
 
 def plot_round(
     data: az.InferenceData, person: str, round: int, *, held_out: bool = False
 ) -> Picture:
-    """Draw one round over time: the cars, what the person sees of them, and what they did.
+    """Draw one round over time: the cars, what the person sees of them, and their actions.
 
-    Each lane is drawn with distances upwards and time to the right, shaded as the road is by
-    :func:`mirror_ppl.domains.driving.road.plot_sight`. Below stands the posterior
-    predictive probability of switching lanes, and what the person did.
+    Each lane is drawn with distances upwards and time to the right, shaded as the road in
+    :func:`mirror_ppl.domains.driving.road.plot_sight`. Below are the posterior predictive
+    probability of switching lanes and the person's actions.
 
     Args:
         data: with the groups of :mod:`mirror_ppl.inference.results.export`.
         person: id of the person.
         round: number of the round, counted from 0.
-        held_out: count the held-out rounds, not those that were learned from.
+        held_out: use the held-out rounds, not those of the fit.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
         DemonstrationsError: the person has no such round.
     """
     if held_out and "predictions" not in data.groups():
@@ -75,7 +75,7 @@ def plot_round(
     bar.set_label("posterior probability that the person sees a car there")
     bar.set_ticks([0, 0.5, 1], labels=["0: unseen", ".5", "1: seen"])
     _draw_actions(below, action[:steps], probability)
-    # Cars of either lane look alike, and one label of each kind is enough.
+    # Cars of both lanes look alike, so one label of each kind is enough.
     entries = {}
     for ax in (*lanes, below):
         entries |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
@@ -86,15 +86,15 @@ def plot_round(
 
 
 def switching(data: az.InferenceData, person: str, *, held_out: bool = False) -> xr.DataArray:
-    """Posterior predictive probability of switching lanes, ``[B, T]``.
+    """Return the posterior predictive probability of switching lanes, ``[B, T]``.
 
     Args:
         data: with ``posterior_predictive``, or ``predictions``.
         person: id of the person.
-        held_out: of the held-out rounds, not of those that were learned from.
+        held_out: use the held-out rounds, not those of the fit.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     if held_out:
         predicted = of_person(data, "predictions", person)["action_probability"]
@@ -103,7 +103,7 @@ def switching(data: az.InferenceData, person: str, *, held_out: bool = False) ->
 
 
 def lane_changes(data: az.InferenceData, group: str) -> xr.DataArray:
-    """Lane changes of each recorded round; NaN in rounds that are padding.
+    """Count lane changes in each recorded round; NaN in padding.
 
     Args:
         data: with that group and ``observed_data``.
@@ -118,16 +118,16 @@ def lane_changes(data: az.InferenceData, group: str) -> xr.DataArray:
 
 
 def calibration(data: az.InferenceData, group: str) -> pd.DataFrame:
-    """How often people switch lanes, by how probable that was said to be.
+    """Compare frequencies of lane switches with predicted probabilities, by bin.
 
     Args:
         data: with that group and ``observed_data``.
         group: ``"posterior_predictive"`` or ``"prior_predictive"``.
 
     Returns:
-        One row for each of the ranges of ``RANGES`` that occurs: ``steps``, how many there are;
-        ``predicted``, their mean probability; ``observed``, the share that are switches; ``low``
-        and ``high``, its 90% interval (Jeffreys).
+        One row for each bin of ``RANGES`` that occurs: ``steps``, the number of steps;
+        ``predicted``, their mean probability; ``observed``, the share of switches; ``low`` and
+        ``high``, its 90% interval (Jeffreys).
     """
     action = data["observed_data"]["action"].values
     predicted = (data[group]["action"] == SWITCH).mean(SAMPLE).values[action >= 0]
@@ -143,16 +143,15 @@ def calibration(data: az.InferenceData, group: str) -> pd.DataFrame:
 
 
 def plot_predictive_check(data: az.InferenceData) -> Picture:
-    """Draw how often people change lanes beside how often the model says that they do.
+    """Draw observed and predicted lane changes.
 
-    Left, for each person: lane changes a round, on average over the rounds that were learned from;
-    90% intervals and medians of what the prior and the posterior predict. Right: how often people
-    switch, of the steps at which a switch has about the same predicted probability.
+    Left, for each person: lane changes per round, averaged over the rounds of the fit; medians and
+    90% intervals of prior and posterior predictions. Right: share of steps with a switch, by
+    predicted probability.
 
-    Each action is predicted from what happened before it, as recorded. So averages and
-    probabilities can be compared with what people did, while spreads within a round cannot:
-    somebody who changes lanes once, sooner or later, does not do it again, but a prediction starts
-    anew at each step.
+    Each action is predicted from the recorded history before it. So averages and probabilities can
+    be compared with observed actions, but not the number of changes within a round: a person who
+    has changed lanes once rarely does so again, while predictions start anew at each step.
 
     Args:
         data: with ``observed_data``, ``posterior_predictive`` and ``prior_predictive``.
@@ -190,7 +189,7 @@ def plot_predictive_check(data: az.InferenceData) -> Picture:
 
 
 def _draw_lane(ax: Axes, lane: int, recorded: xr.Dataset, sight: xr.DataArray, steps: int) -> None:
-    """One lane over time: what is seen of it, the cars, and the person while they are in it."""
+    """Draw one lane over time: what is seen of it, the cars, and the person while in it."""
     own = recorded["ego"].values[: steps + 1, 0].astype(int) == lane
     shade = np.where(own[:, None], sight.sel(lane="own").values, sight.sel(lane="other").values)
     end = ROAD_END + 0.5
@@ -220,7 +219,7 @@ def _draw_lane(ax: Axes, lane: int, recorded: xr.Dataset, sight: xr.DataArray, s
 
 
 def _draw_actions(ax: Axes, action: np.ndarray, probability: np.ndarray) -> None:
-    """Probability of switching at each step, and whether the person did."""
+    """Draw the probability of switching at each step, and the person's actions."""
     times = np.arange(len(action))
     ax.bar(
         times,

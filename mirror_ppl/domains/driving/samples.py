@@ -1,7 +1,7 @@
-"""The road in samples of the posterior, beside what is really seen (supplement, Fig. 11).
+"""Figures of posterior samples of sight on the road, beside true sight (supplement, Fig. 11).
 
-Where `mirror_ppl.domains.driving.road` draws how probably a car is seen, this draws who might sit
-there: each sample is one way for the person to see.
+`mirror_ppl.domains.driving.road` draws probabilities of seeing a car; here each panel is one
+posterior sample of the person's sight.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ __all__ = ["has_sight", "samples_picture"]
 
 SAMPLES = 4
 MOST_PEOPLE = 12
-"""More people than this do not fit on one picture."""
+"""Maximum number of people on one picture."""
 CARS = ((2, 1), (6, 0), (-3, 1), (-5, 0))
-"""Cells ahead and lane of four cars that stand for any."""
+"""Cells ahead and lane of four example cars."""
 RED, DARK = "#c0392b", "#000000"
 
 
 def samples_picture(data: az.InferenceData) -> Picture:
-    """What people see of a road with four cars, one row each: truth, and posterior samples.
+    """Draw a road with four cars as each person sees it, one row each: truth and samples.
 
-    Black is what they do not see. Of more than 12 people the first 12 are shown.
+    Black is what they do not see. At most the first 12 people are shown.
 
     Args:
         data: with the four sites of sight, see :func:`has_sight`.
@@ -81,7 +81,7 @@ def samples_picture(data: az.InferenceData) -> Picture:
 
 
 def _draw(ax: Axes, seen: xr.DataArray) -> None:
-    """A road with four cars, black where ``seen`` ``[2, 25]`` is 0."""
+    """Draw a road with four cars, black where ``seen`` ``[2, 25]`` is 0."""
     end = ROAD_END + 0.5
     ax.add_patch(Rectangle((-end, 0), 2 * end, 2, fc=HEADLIGHT, ec="none"))
     for distance, lane in CARS:

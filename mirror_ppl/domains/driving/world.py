@@ -3,7 +3,7 @@
 Description
     The person drives at constant speed; everything is measured in cells relative to their car.
     Two cars start ahead (one in each lane) and two behind, at random distances. A scenario says
-    which of them speed up and which slow down; nobody makes room for the person.
+    which of them speed up and which slow down; no car makes room for the person.
 
 Actions
     ===  ========  ==============================================
@@ -23,7 +23,7 @@ Observations
 
     A distance of +-12 means that the car is off the visible road. In clear weather all cars are
     visible; in fog those up to two cells ahead (abreast included), in both lanes, and none behind.
-    Nothing is said unless somebody says it.
+    Verbal items are observed only if they are communicated.
 
 Rewards, of the action and the state that it leads to
     ===========  ======  ============================================================
@@ -64,9 +64,9 @@ from mirror_ppl.domains.world import World
 
 STAY, SWITCH = 0, 1
 NEAR = 2
-"""Cars of the ego's lane at most this many cells away are too near."""
+"""Cars of the ego's lane at most this many cells away incur the proximity penalty."""
 FOG_REACH = 2
-"""How many cells ahead a person sees in dense fog."""
+"""Number of cells ahead that a person sees in dense fog."""
 PROXIMITY, COLLISION, OFF_ROAD, LANE_CHANGE = -2.0, -5.0, -5.0, -1.0
 
 CARS = ("front-left", "front-right", "rear-left", "rear-right")
@@ -138,10 +138,10 @@ class Driving(World):
     counterparts: tuple[int | None, ...] = (0, 1, 2, 3)
     directions: tuple[str, ...] = ("front_own", "front_other", "back_own", "back_other")
     direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
-    """Directions in which most people see equally far: both lanes ahead, both behind."""
+    """Groups of directions with equal reach for most people: both lanes ahead, both behind."""
     reach_bins: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, float(ROAD_END))
-    """Lower edges in cells of the bins of a sight threshold: whoever reaches r sees cars up to r
-    cells away and none at the next edge. The last bin is the whole road."""
+    """Lower edges in cells of the bins of a sight threshold: a person with threshold r sees cars up
+    to r cells away and none at the next edge. The last bin is the whole road."""
     reach_unit = "cells"
     told_practice = 0.5
     partial_views: Mapping[str, tuple[float, ...]] = {
@@ -154,11 +154,11 @@ class Driving(World):
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
     ) -> DrivingState:
-        """States ``[batch]`` at the start of a round.
+        """Draw states ``[batch]`` at the start of a round.
 
         Args:
             batch: number of rounds.
-            generator: source of randomness; its device is where the states live.
+            generator: source of randomness; its device is that of the states.
             scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
         """
         device = generator.device
@@ -174,14 +174,14 @@ class Driving(World):
         )
 
     def transition(self, state: DrivingState, action: Tensor) -> DrivingState:
-        """State at t + 1; ``action`` ``[...]`` is 0 (stay) or 1 (switch)."""
+        """Return the state at t + 1; ``action`` ``[...]`` is 0 (stay) or 1 (switch)."""
         lane = torch.where(action == SWITCH, 1 - state.lane, state.lane)
         return replace(state, lane=lane, position=state.position + state.speed)
 
     def rewards(
         self, state: DrivingState, action: Tensor, following: DrivingState
     ) -> dict[str, Tensor]:
-        """Reward terms ``[...]`` by name, in units of reward."""
+        """Return reward terms ``[...]`` by name, in units of reward."""
         lanes = torch.tensor(CAR_LANES, device=state.lane.device)
         own = lanes == following.lane[..., None]
         gap = following.position.abs()
@@ -195,11 +195,11 @@ class Driving(World):
         }
 
     def over(self, state: DrivingState) -> Tensor:
-        """Nowhere ``[...]``: driving goes on to the end of a round."""
+        """Return False everywhere ``[...]``: driving goes on to the end of a round."""
         return torch.zeros_like(state.lane, dtype=torch.bool)
 
     def observe(self, state: DrivingState) -> Observation:
-        """Everything there is to observe: ego ``[..., 1]``, visual and verbal ``[..., 4, F]``."""
+        """Return the full observation: ego ``[..., 1]``, visual and verbal ``[..., 4, F]``."""
         dtype = torch.get_default_dtype()
         lanes = torch.tensor(CAR_LANES, device=state.lane.device)
         position = state.position.clamp(-ROAD_END, ROAD_END).to(dtype)
@@ -212,7 +212,7 @@ class Driving(World):
         }
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
-        """What the setting lets an unaided person see.
+        """Return what an unaided person sees in a setting.
 
         Raises:
             UnknownNameError: if the setting is neither ``clear`` nor ``fog``.
@@ -226,13 +226,13 @@ class Driving(World):
         return {"visual": seen, "verbal": torch.zeros_like(seen)}
 
     def communicable(self, observation: Observation) -> Visibility:
-        """Only cars in front on the visible road may be shown; any car on it may be spoken of."""
+        """Return communicable items: cars ahead can be shown, cars on the road spoken of."""
         ahead = observation["visual"][..., 0]
         on_road = ahead.abs() < ROAD_END
         return {"visual": on_road & (ahead >= 0), "verbal": on_road}
 
     def faults(self, observation: Observation) -> dict[str, Tensor]:
-        """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
+        """Return which observations ``[...]`` break each rule of recordings, by rule."""
         lane, visual = observation["ego"], observation["visual"]
         lanes = torch.tensor(CAR_LANES, device=lane.device)
         ahead, offset = visual.unbind(-1)
@@ -253,7 +253,7 @@ class Driving(World):
         }
 
     def nothing_known(self, *batch: int, device: torch.device | None = None) -> CarKnowledge:
-        """Knowledge ``[*batch]`` before anything was observed."""
+        """Return knowledge ``[*batch]`` before anything was observed."""
         return CarKnowledge.nothing(*batch, device=device)
 
     def learn(
@@ -263,20 +263,20 @@ class Driving(World):
         visible: Visibility,
         sees: Callable[[Observation], Visibility],
     ) -> CarKnowledge:
-        """Two sights of a car, one utterance, or its absence where it was assumed, make it known.
+        """Return knowledge after a step; see `mirror_ppl.domains.driving.knowledge`.
 
-        See `mirror_ppl.domains.driving.knowledge`.
+        Two sights of a car, one utterance, or its absence where it was assumed make it known.
         """
         return knowledge.learn(observation, visible, sees)
 
     def known(self, knowledge: CarKnowledge) -> Visibility:
-        """Of a known car both items ``[..., 4]``: place and speed."""
+        """Return both items ``[..., 4]``, visual and verbal, of known cars."""
         return {"visual": knowledge.known, "verbal": knowledge.known}
 
     def assume(
         self, knowledge: CarKnowledge, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """``clear``: cars never observed are off the road. ``closing``: unsure ones come closer."""
+        """Return assumed items: ``clear``, no unobserved cars; ``closing``, others come closer."""
         absent = ~knowledge.placed
         position = torch.where(absent, float(ROAD_END), knowledge.position)
         items = {
@@ -288,7 +288,7 @@ class Driving(World):
     def supposed(
         self, state: DrivingState, knowledge: CarKnowledge, assumes: Mapping[str, Tensor]
     ) -> DrivingState:
-        """The state as somebody with such knowledge and assumptions ``[...]`` believes it to be."""
+        """Return the state as believed by a person with such knowledge and assumptions."""
         gone = ~knowledge.placed & assumes["clear"][..., None]
         closing = knowledge.unsure & assumes["closing"][..., None]
         position = torch.where(closing, knowledge.position.to(state.position.dtype), state.position)
@@ -299,11 +299,11 @@ class Driving(World):
         )
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
-        """Observations as discrete symbols, the form in which networks read them.
+        """Encode observations as discrete symbols for networks.
 
         Returns:
             ego ``[..., 2]``, one-hot lane; visual ``[..., 4, 50]``, one-hot over distance and
-            own/other lane; verbal ``[..., 4, 53]``, the same and one-hot speed.
+            own/other lane; verbal ``[..., 4, 53]``, with one-hot speed in addition.
         """
         dtype = observation["ego"].dtype
 
@@ -321,15 +321,15 @@ class Driving(World):
         }
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
-        """Direction (index into ``directions``) and distance in cells of each car, ``[..., 4]``."""
+        """Return direction (index into ``directions``) and distance in cells, ``[..., 4]``."""
         ahead, offset = observation["visual"].unbind(-1)
         return 2 * (ahead < 0).long() + (offset != 0).long(), ahead.abs()
 
     def state_behind(self, observation: Observation) -> DrivingState:
-        """The state ``[...]`` behind an observation; a car off the road stays there.
+        """Return the state ``[...]`` behind an observation; a car off the road stays there.
 
-        Where such a car is and how fast it moves cannot be observed, and no longer matters: none
-        that has left comes back.
+        Its position and speed cannot be observed and no longer matter, because cars that left the
+        road do not come back.
         """
         position = observation["visual"][..., 0].round().long()
         away = position.abs() >= ROAD_END
@@ -341,22 +341,22 @@ class Driving(World):
         )
 
     def nearest(self, observation: Observation) -> Observation:
-        """The observation that can be and is nearest to decoded values.
+        """Return the possible observation nearest to decoded values.
 
-        Positions are taken from the verbal and visual modality alike, their mean rounded.
+        Positions are rounded means of the verbal and visual positions.
         """
         lane = observation["ego"][..., 0].round().clamp(0, 1)
         decoded = (observation["visual"][..., 0] + observation["verbal"][..., 0]) / 2
         position = decoded.round().clamp(-ROAD_END, ROAD_END).long()
-        # A known car is faster or slower than the ego, never as fast.
+        # A car on the road is faster or slower than the ego, never as fast.
         speed = torch.where(observation["verbal"][..., 2] < 0, -1, 1)
         return self.observe(DrivingState(lane.long(), position, speed))
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
-        """Cars on a collision course: abreast or closing in, in the ego's lane.
+        """Return cars on a collision course: abreast or closing in, in the ego's lane.
 
-        And cars that are abreast or closing in, in either lane: a change of lanes brings those of
-        the other lane on a collision course.
+        The second definition includes cars of both lanes, because a change of lanes brings those
+        of the other lane on a collision course.
         """
         position, offset, speed = observation["verbal"].unbind(-1)
         closing = (position * speed < 0) | (position == 0)
@@ -367,7 +367,7 @@ class Driving(World):
         }
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:
-        """Such as "rear car in the right lane, 3 cells behind, closing"."""
+        """Describe a car, such as "rear car in the right lane, 3 cells behind, closing"."""
         index = CARS.index(item)
         position, _, speed = observation["verbal"][index].tolist()
         lane = ("left", "right")[CAR_LANES[index]]
@@ -380,7 +380,7 @@ class Driving(World):
         return f"{which} car in the {lane} lane, {cells} {where}, {motion}"
 
     def deed(self, observation: Observation, item: str | None, action: int) -> str:
-        """Whether they would switch into a car's lane, out of it, or stay in one of them."""
+        """Describe an action relative to a car's lane, such as "switch into that lane"."""
         if item is None:
             return "switch lanes" if action == SWITCH else "stay in their lane"
         own = observation["visual"][CARS.index(item), 1] == 0
@@ -389,12 +389,12 @@ class Driving(World):
         return "stay in its way" if own else "stay where they are"
 
     def reference_values(self, state: DrivingState, discount: float) -> Tensor:
-        """Exact action values ``[..., 2]`` with everything known, to the end of the encounter."""
+        """Return exact action values ``[..., 2]`` of known states, to the end of the encounter."""
         known = torch.ones_like(state.position, dtype=torch.bool)
         return known_car_values(state, known, self.horizon, discount)
 
     def render(self, state: DrivingState) -> np.ndarray:
-        """Picture ``uint8 [height, width, 3]`` of one state, the road running to the right."""
+        """Draw ``uint8 [height, width, 3]`` of one state, the road running to the right."""
         cell, lanes, length = 16, 2, 2 * ROAD_END + 1
         picture = np.full((lanes * cell, length * cell, 3), 235, dtype=np.uint8)
         picture[cell - 1 : cell + 1, :: cell // 2] = 255
@@ -413,12 +413,12 @@ class Driving(World):
 def lane_rewards(
     position: Tensor, speed: Tensor, known: Tensor, horizon: int, weights: Tensor
 ) -> Tensor:
-    """Reward of being in each lane at each of the next steps, given the cars that are known.
+    """Return rewards of being in each lane at the next steps, given the known cars.
 
     Args:
         position: cells ahead ``[..., 4]``.
         speed: relative speed ``[..., 4]`` in cells per step.
-        known: which cars are known ``[..., 4]``; the others are taken to be absent.
+        known: known cars ``[..., 4]``; the others are assumed absent.
         horizon: number of steps H.
         weights: reward of a car of the same lane by its distance in cells, ``[D]`` or
             ``[..., D]``; cars at D cells and beyond do not matter.
@@ -438,19 +438,19 @@ def lane_rewards(
 
 
 def task_weights(device: torch.device | None = None) -> Tensor:
-    """Reward of a car of the ego's lane at 0, 1, ..., ``NEAR`` cells, ``[NEAR + 1]``."""
+    """Return rewards of a car of the ego's lane at 0, 1, ..., ``NEAR`` cells, ``[NEAR + 1]``."""
     weights = torch.full((NEAR + 1,), PROXIMITY, device=device)
     weights[0] += COLLISION
     return weights
 
 
 def known_car_values(state: DrivingState, known: Tensor, horizon: int, discount: float) -> Tensor:
-    """Action values ``[..., 2]`` of the task for a planner that knows only some of the cars.
+    """Return action values ``[..., 2]`` of the task for a planner that knows some of the cars.
 
     Args:
-        state: where those cars are and how fast they move; what it says of others is not used.
-        known: ``[..., 4]``; unknown cars are taken to be absent.
-        horizon: number of steps looked ahead.
+        state: positions and speeds of these cars; those of others are not used.
+        known: ``[..., 4]``; unknown cars are assumed absent.
+        horizon: number of steps planned ahead.
         discount: discount per step.
     """
     rewards = lane_rewards(

@@ -1,4 +1,4 @@
-"""Search and rescue: the world, and what the package knows of it in `record`."""
+"""Search and rescue: the world, its people, pictures and settings."""
 
 from mirror_ppl.domains.search_rescue.world import (
     MOVES,

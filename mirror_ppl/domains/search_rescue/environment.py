@@ -31,7 +31,7 @@ class SearchRescueEnv(DomainEnv):
     |               |         |         | column, red-green-blue       |           |        |
     | `visual_mask` | (9,)    | int8    | the portion is seen          |           | 0 or 1 |
     | `verbal`      | (5, 1)  | float32 | corridor blocked, victim here| truth     | 0 or 1 |
-    | `verbal_mask` | (5,)    | int8    | that is heard                |           | 0 or 1 |
+    | `verbal_mask` | (5,)    | int8    | the utterance is heard       |           | 0 or 1 |
 
     `info` holds the `scenario`'s name and, in `state`, the true `place` (row and column), `found`,
     `home`, `blocked` (0 none, 1 left, 2 right) and `victim` (index of the room); after a step also

@@ -25,12 +25,12 @@ HOUSE = (
 )
 ENTRANCE = (8, 4)
 ROOMS = {"top-left": (1, 1), "top-middle": (1, 4), "top-right": (1, 7)}
-"""Where the victim may be, by room."""
+"""Possible places of the victim, by room."""
 CORRIDORS = {"left": (4, 1), "right": (4, 7)}
-"""Where an obstacle may be, by corridor."""
+"""Possible places of an obstacle, by corridor."""
 FLOOR, WALL, DOOR, VICTIM = (0.9, 0.9, 0.9), (0.2, 0.2, 0.2), (0.9, 0.8, 0.2), (0.1, 0.7, 0.2)
 OBSTACLES = ((0.8, 0.2, 0.2), (0.6, 0.2, 0.7))
-"""Colours of pixels; of obstacles in the left and the right corridor."""
+"""Colours of obstacles in the left and the right corridor."""
 
 PORTIONS = tuple(
     f"{row}-{column}"
@@ -40,19 +40,19 @@ PORTIONS = tuple(
 
 
 def as_image(portions: Tensor) -> Tensor:
-    """The map ``[..., 9, 9, 3]``, rows, columns and colours, of its portions ``[..., 9, 27]``."""
+    """Assemble portions ``[..., 9, 27]`` into a map ``[..., 9, 9, 3]``: rows, columns, colours."""
     blocks = portions.unflatten(-1, (PORTION, PORTION, 3)).unflatten(-4, (PORTION, PORTION))
     return blocks.transpose(-4, -3).flatten(-5, -4).flatten(-3, -2)
 
 
 def as_portions(image: Tensor) -> Tensor:
-    """Portions ``[..., 9, 27]`` of a map ``[..., 9, 9, 3]``."""
+    """Split a map ``[..., 9, 9, 3]`` into portions ``[..., 9, 27]``."""
     blocks = image.unflatten(-2, (PORTION, PORTION)).unflatten(-4, (PORTION, PORTION))
     return blocks.transpose(-4, -3).flatten(-5, -4).flatten(-3, -1)
 
 
 def portion_pixels(holds: Tensor) -> Tensor:
-    """Pixels ``[..., 9, 27]`` of what is so ``[..., 5]``: obstacles, and victims in rooms."""
+    """Return pixels ``[..., 9, 27]`` given ``holds`` ``[..., 5]``: obstacles, victims in rooms."""
     empty, with_all = (portions.to(holds.device) for portions in _house())
     shown = torch.zeros(*holds.shape[:-1], len(PORTIONS), dtype=torch.bool, device=holds.device)
     shown[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = holds
@@ -61,7 +61,7 @@ def portion_pixels(holds: Tensor) -> Tensor:
 
 @cache
 def _house() -> tuple[Tensor, Tensor]:
-    """Portions ``[9, 27]`` with nothing in them, and with everything that may be in them."""
+    """Return empty portions ``[9, 27]``, and portions with all possible obstacles and victims."""
     image = torch.tensor([[WALL if cell == "#" else FLOOR for cell in row] for row in HOUSE])
     image[ENTRANCE] = torch.tensor(DOOR)
     full = image.clone()
@@ -73,13 +73,13 @@ def _house() -> tuple[Tensor, Tensor]:
 
 
 def portion_centres() -> Tensor:
-    """Row and column of the centre of each portion, ``[9, 2]``."""
+    """Return row and column of the centre of each portion, ``[9, 2]``."""
     middle = torch.arange(PORTION) * PORTION + PORTION // 2
     return torch.cartesian_prod(middle, middle)
 
 
 def walkable(place: Tensor) -> Tensor:
-    """Whether there is floor at rows and columns ``[..., 2]``."""
+    """Return where there is floor at rows and columns ``[..., 2]``."""
     floor = torch.tensor([[cell != "#" for cell in row] for row in HOUSE], device=place.device)
     inside = ((place >= 0) & (place < SIDE)).all(-1)
     row, column = place.clamp(0, SIDE - 1).unbind(-1)
@@ -87,16 +87,16 @@ def walkable(place: Tensor) -> Tensor:
 
 
 def at_entrance(place: Tensor) -> Tensor:
-    """Whether places ``[..., 2]`` are the entrance."""
+    """Return where places ``[..., 2]`` are the entrance."""
     return (place == torch.tensor(ENTRANCE, device=place.device)).all(-1)
 
 
 @cache
 def reach_distances() -> tuple[float, ...]:
-    """Radii in cells, one of each set of those with which one sees the same from every place.
+    """Return radii in cells, one for each set of radii with equal sight from every place.
 
-    What matters is how far places where somebody can be are from what they may want to see there.
-    Of the radii from one such distance to the next the roundest stands for all.
+    Only distances from floor cells to informative portions matter. Each interval between
+    successive distances is represented by its number with fewest decimals.
     """
     cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
     cells = cells[walkable(cells)]
@@ -107,7 +107,7 @@ def reach_distances() -> tuple[float, ...]:
 
 
 def _roundest(least: float, beyond: float) -> float:
-    """The least number with fewest decimals from ``least`` on and below ``beyond``."""
+    """Return the least number with fewest decimals in ``[least, beyond)``."""
     for scale in (1, 10, 100, 1000):
         number = math.ceil(least * scale - 1e-9) / scale
         if least <= number < beyond:

@@ -1,9 +1,9 @@
-"""What a firefighter has learned of the house.
+"""A firefighter's knowledge of the house.
 
-Nothing in the house moves but the firefighter, and the victim once they are found. So what a
-portion of the map showed, or somebody said, is known for the rest of the round, and so is what
-follows from it: at most one corridor is blocked, and there is one victim. The house itself is
-known from the beginning: portions that look the same in every scenario have nothing to tell.
+Nothing in the house moves but the firefighter, and the victim once found. So what a portion of the
+map or a message showed is known for the rest of the round, with its implications: at most one
+corridor is blocked, and there is one victim. The house itself is known from the beginning: portions
+that look the same in every scenario carry no information.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CORRIDOR_PORTIONS, ROOM_PORTIONS = (3, 5), (0, 1, 2)
 
 @dataclass(frozen=True)
 class HouseKnowledge:
-    """Of each corridor ``[..., 2]`` and each room ``[..., 3]``, at one step.
+    """Knowledge of each corridor ``[..., 2]`` and room ``[..., 3]`` at one step.
 
     Attributes:
         corridors: whether it is known if they are blocked.
@@ -34,20 +34,20 @@ class HouseKnowledge:
 
     @classmethod
     def nothing(cls, *batch: int, device: torch.device | None = None) -> HouseKnowledge:
-        """Before anything was observed."""
+        """Return the knowledge before anything was observed."""
         return cls(
             torch.zeros(*batch, len(CORRIDOR_PORTIONS), dtype=torch.bool, device=device),
             torch.zeros(*batch, len(ROOM_PORTIONS), dtype=torch.bool, device=device),
         )
 
     def learn(self, observation: Observation, visible: Visibility) -> HouseKnowledge:
-        """Knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
+        """Return the knowledge one step later; see `mirror_ppl.domains.base.Domain.learn`."""
         number = len(CORRIDOR_PORTIONS)
         shown, spoken = visible["visual"], visible["verbal"]
         holds = observation["verbal"][..., 0] == 1
         corridors = self.corridors | spoken[..., :number] | shown[..., list(CORRIDOR_PORTIONS)]
         rooms = self.rooms | spoken[..., number:] | shown[..., list(ROOM_PORTIONS)]
-        # One that is blocked tells that the other is not.
+        # If one corridor is blocked, the other is not.
         blocked = (corridors & holds[..., :number]).any(-1, keepdim=True)
         # The victim is known to be in one room, to be in none of the others, or is carried.
         there = (rooms & holds[..., number:]).any(-1, keepdim=True)
@@ -56,7 +56,7 @@ class HouseKnowledge:
         return HouseKnowledge(corridors | blocked, rooms | there | carried | left)
 
     def items(self) -> Visibility:
-        """Portions ``[..., 9]`` and utterances ``[..., 5]`` whose content is known."""
+        """Return portions ``[..., 9]`` and utterances ``[..., 5]`` whose content is known."""
         both = torch.cat([self.corridors, self.rooms], -1)
         portions = torch.ones(*both.shape[:-1], PORTION_COUNT, dtype=torch.bool, device=both.device)
         portions[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = both

@@ -1,8 +1,8 @@
-"""The people of search and rescue, from the ground truth to those who are handed out.
+"""Makes the simulated firefighters, as in the supplement's section B.
 
-As the supplement's section B builds them: participants play 36 rounds in each setting, how each of
-them goes on from one subgoal to the next is learned from what they did, and simulated people who do
-so play the rounds that are handed out. ``docs/people.md`` tells the steps.
+Participants play 36 rounds in each setting, their transitions between subgoals are learned from
+their actions, and simulated people follow the learned transitions. ``docs/people.md`` explains the
+steps.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from mirror_ppl.people.base import DomainPeople, derived_generator
 from mirror_ppl.people.recordings import Recording, draw_starts, record
 
 PARTICIPANT_ROUNDS = 36
-"""How many rounds a participant plays in each setting."""
+"""Number of rounds of a participant in each setting."""
 HABIT_SPREAD = 0.7
-"""Standard deviation over people and choices of how much somebody likes one, as a logarithm."""
+"""Standard deviation over people and choices of the log preference for a choice."""
 PATIENCE_MEDIAN, PATIENCE_SPREAD = 1.0, 0.3
-"""Median over people of the steps by which a way may be longer to be chosen e times more seldom,
-and standard deviation of its logarithm."""
+"""Median over people of the extra steps that make a path e times less probable, and standard
+deviation of its logarithm."""
 LAPSE_MEDIAN, LAPSE_SPREAD = 0.03, 0.5
-"""Median over people of how often they step anywhere, and standard deviation of its logarithm."""
+"""Median over people of the lapse probability, and standard deviation of its logarithm."""
 LEARNING_STEPS = 200
 RADII = (SMOKE_REACH, 2.3, 3.2, 4.2, 5.7)
-"""What radii there are in the population ``diverse``, in cells."""
+"""Possible radii in the population ``diverse``, in cells."""
 
 
 def _by_setting(setting: str, people: int, seed: int) -> Tensor:
@@ -61,11 +61,11 @@ RESCUE_POPULATIONS: dict[str, Callable[[str, int, int], Tensor]] = {
     "paper": _by_setting,
     "diverse": _by_person,
 }
-"""Populations: how far each person sees, given setting, number of people and seed."""
+"""Populations: radius of each person, given setting, number of people and seed."""
 
 
 def participants(setting: str, people: int, seed: int) -> SimulatedFirefighters:
-    """The ground truth: people of habits who like short ways, with sight limited by the setting."""
+    """Draw ground-truth people with habits who prefer short paths; the setting limits sight."""
     habits, patiences, lapses = [], [], []
     for person in range(people):
         generator = derived_generator(seed, "habits", person)
@@ -81,20 +81,20 @@ def participants(setting: str, people: int, seed: int) -> SimulatedFirefighters:
 
 
 def transitions_of(habit: Tensor, patience: Tensor) -> Tensor:
-    """How likely P people go on to a subgoal from another, ``[P, 8, 6, 6]``.
+    """Return probabilities of P people's next subgoals, ``[P, 8, 6, 6]``.
 
-    It falls with the steps of the way by it, as far as they know where it has to lead.
+    They decrease with the steps of the path through a subgoal, as far as it is known.
 
     Args:
-        habit: how much each likes to go on so, ``[P, 6, 6]``, in nats.
-        patience: how many steps more make a way e times less likely, ``[P]``.
+        habit: preference of each for each transition, ``[P, 6, 6]``, in nats.
+        patience: extra steps that make a path e times less probable, ``[P]``.
     """
     return (habit[:, None] - _steps_by_way() / patience[:, None, None, None]).softmax(-1)
 
 
 @lru_cache
 def _steps_by_way() -> Tensor:
-    """Steps of the way to a subgoal and on from there ``[8, 6, 6]``, by `possible_rooms`."""
+    """Return steps of the path to a subgoal and beyond ``[8, 6, 6]``, by `possible_rooms`."""
     far = subgoal_distances().to(torch.get_default_dtype())
     corridors, rooms = slice(0, len(CORRIDORS)), slice(len(CORRIDORS), HOME)
     steps = far.repeat(2 ** len(ROOMS), 1, 1)
@@ -106,13 +106,13 @@ def _steps_by_way() -> Tensor:
 
 
 def learn_transitions(recordings: list[Recording]) -> Tensor:
-    """How each of P people goes on from a subgoal, ``[P, 8, 6, 6]``, learned from what they did.
+    """Learn transitions between subgoals of P people, ``[P, 8, 6, 6]``, from recordings.
 
     A choice was made wherever the subgoal changed, among the subgoals that were possible then.
-    Habits and patience are those of the largest posterior density, by Newton-like steps (L-BFGS).
+    Habits and patience are at their posterior mode, found by L-BFGS.
 
     Args:
-        recordings: of the same people, in whatever settings.
+        recordings: of the same people, in any settings.
     """
     people, number = recordings[0].actions.shape[0], len(SUBGOALS)
     places, chosen, possible = [], [], []
@@ -154,7 +154,7 @@ def learn_transitions(recordings: list[Recording]) -> Tensor:
 
 @lru_cache(maxsize=8)
 def learned_transitions(people: int, seed: int) -> Tensor:
-    """How the participants go on ``[P, 8, 6, 6]``, learned from their rounds in every setting."""
+    """Learn the participants' transitions ``[P, 8, 6, 6]`` from their rounds in every setting."""
     rounds, domain = PARTICIPANT_ROUNDS, SearchRescue()
     recordings = []
     for setting in domain.settings:
@@ -174,17 +174,17 @@ def learned_transitions(people: int, seed: int) -> Tensor:
 def simulated_firefighters(
     setting: str, population: str, people: int, seed: int, device: torch.device | str = "cpu"
 ) -> SimulatedFirefighters:
-    """The simulated people of a population, to be stepped by whoever wants to.
+    """Return the simulated people of a population, to be stepped by the caller.
 
-    Each is made for one participant. The same seed gives the same people.
+    Each is made from one participant. The same seed gives the same people.
 
     Args:
         setting: a setting of search and rescue.
         population: ``paper``, sight limited by the setting alone; ``diverse``, each person's own
             radius in every setting.
         people: number of people P.
-        seed: determines their sight, their habits, and how often they step anywhere.
-        device: where they live.
+        seed: determines their sight, habits and lapse probability.
+        device: device of their tensors.
 
     Raises:
         UnknownNameError: there is no such setting or population.
@@ -199,4 +199,4 @@ def simulated_firefighters(
 
 
 FIREFIGHTERS = DomainPeople(tuple(RESCUE_POPULATIONS), simulated_firefighters)
-"""What the rest of the package knows of them."""
+"""The firefighters as registered in the domain's record."""

@@ -1,25 +1,25 @@
-"""People who search and rescue: what they have in mind, and how they walk (supplement, section B).
+"""Simulated firefighters: their memory, subgoals and moves (supplement, section B).
 
 A firefighter goes from one subgoal to the next: a corridor, a room where the victim may be, the
-entrance. A subgoal is given up when it was reached, or when what is known of the house rules it
-out: a corridor that is blocked, a room that is empty. Who learns something of where the victim is
-thinks again, as if at the entrance. Then the next is chosen among those that are possible:
+entrance. A subgoal is given up when it was reached, or when knowledge of the house rules it out: a
+corridor that is blocked, a room that is empty. A firefighter who learns about the victim's place
+chooses anew, as at the entrance. The next subgoal is chosen among those that are possible:
 
 ===================  ===========================================================================
 ``radius``           how far they see, in cells to the centre of a portion of the map
-``k_t``              what they know at step t, of what they ever saw or were told
-``v_t``              the rooms where the victim may be, for all they know
-``g_t``              their subgoal; ``G_t`` are those that are possible, given ``k_t``
-``transitions``      how they like to go on from a subgoal, by what they know of the victim
-``lapse``            how often they step anywhere
+``k_t``              what they know at step t from sight and messages
+``v_t``              the rooms where the victim may be, given ``k_t``
+``g_t``              their subgoal; ``G_t`` are the possible subgoals, given ``k_t``
+``transitions``      preferences for the next subgoal, by ``v_t`` and present subgoal
+``lapse``            probability of a step in a random direction
 ===================  ===========================================================================
 
 ``p(g_t | g_{t-1}, k_t) = transitions[v_t, g_{t-1}, g_t] / sum over G_t``, if ``g_{t-1}`` is not in
-``G_t`` or ``v_t`` is news to somebody on the way to the rooms; else they stay with it.
+``G_t``, or if ``v_t`` changes on the way to the rooms; else ``g_t = g_{t-1}``.
 
 ``p(a_t | g_t, k_t) = (1 - lapse) * uniform over steps on a shortest way to g_t + lapse / 4``
 
-Choices that the supplement leaves open, with their reasons, are in ``docs/people.md``.
+Choices that the supplement does not specify, and their reasons, are in ``docs/people.md``.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ SUBGOALS: dict[str, tuple[int, int]] = {
     **ROOMS,
     "entrance": ENTRANCE,
 }
-"""Where subgoals are: the middle of each corridor, of each room, and the entrance."""
+"""Places of subgoals: the middle of each corridor, of each room, and the entrance."""
 HOME = list(SUBGOALS).index("entrance")
 MIDDLE_ROW = CORRIDORS["left"][0]
-"""Who is below it is in the hall's half of the house, who is above it in the rooms'."""
+"""Row that divides the house: the half of the hall is below, that of the rooms above."""
 FAR = 1000
 
 
 @dataclass(frozen=True)
 class Mind:
-    """What a firefighter knows and wants.
+    """Knowledge and subgoals of firefighters.
 
     Attributes:
-        corridors: whether it is known of each if it is blocked, ``[..., 2]``.
-        rooms: whether it is known of each if the victim is there, ``[..., 3]``.
+        corridors: corridors known to be blocked or clear, ``[..., 2]``.
+        rooms: rooms known to have the victim or not, ``[..., 3]``.
         goal: the subgoal, an index into ``SUBGOALS``, ``[...]``.
-        mind_noise: uniform numbers that choose what comes after each subgoal, ``[..., 6, 6]``.
+        mind_noise: uniform numbers that choose the subgoal after each, ``[..., 6, 6]``.
     """
 
     corridors: Tensor
@@ -68,12 +68,12 @@ class Mind:
 
 @dataclass(frozen=True)
 class SimulatedFirefighters(SimulatedPeople):
-    """P people who search and rescue.
+    """P simulated firefighters.
 
     Attributes:
         radius: how far each sees, in cells to the centre of a portion, ``[P]``.
-        transitions: how likely each goes on to a subgoal from another, ``[P, 8, 6, 6]``, by the
-            rooms where the victim may be (see `possible_rooms`); only ratios within a row count.
+        transitions: weights of the next subgoal given the present one, ``[P, 8, 6, 6]``, by the
+            rooms where the victim may be (see `possible_rooms`); only ratios within a row matter.
         lapse: probability ``[P]`` of a step in any direction.
     """
 
@@ -85,15 +85,15 @@ class SimulatedFirefighters(SimulatedPeople):
 
     @property
     def domain(self) -> SearchRescue:
-        """Search and rescue."""
+        """Search and rescue domain."""
         return SearchRescue()
 
     def truth(self) -> dict[str, Tensor]:
-        """How far they see, and how often they step anywhere."""
+        """Return their radius of sight and their lapse probability."""
         return {"sight_radius": self.radius, "lapse": self.lapse}
 
     def start(self, *batch: int, mind_noise: Tensor | None = None) -> Mind:
-        """Minds ``[P, *batch]`` at the entrance; see `SimulatedPeople.start`."""
+        """Return minds ``[P, *batch]`` at the entrance; see `SimulatedPeople.start`."""
         shape, device = (len(self.radius), *batch), self.radius.device
         knowledge = HouseKnowledge.nothing(*shape, device=device)
         if mind_noise is None:
@@ -106,7 +106,7 @@ class SimulatedFirefighters(SimulatedPeople):
         )
 
     def sees(self, observation: Observation) -> Visibility:
-        """The portions ``[P, ..., 9]`` within their radius; they hear nothing by themselves."""
+        """Return the portions ``[P, ..., 9]`` within their radius; no utterances."""
         _, distance = self.domain.distance(observation)
         return by_eye(self.domain, distance <= each(self.radius, distance.dim() - 1))
 
@@ -118,7 +118,7 @@ class SimulatedFirefighters(SimulatedPeople):
         chance = self._next(memory, knowledge, observation)
         here = memory.goal[..., None, None]
         row = chance.take_along_dim(here, -2).squeeze(-2)
-        # The largest of logarithms with Gumbel noise is a draw with these probabilities.
+        # Gumbel-max trick: the argmax is a draw with these probabilities.
         noise = -(-memory.mind_noise.take_along_dim(here, -2).squeeze(-2).log()).log()
         goal = (row.log() + noise).argmax(-1)
         steps = self._steps(knowledge, observation)
@@ -128,7 +128,7 @@ class SimulatedFirefighters(SimulatedPeople):
     def branches(
         self, memory: Mind, observation: Observation, told: Visibility
     ) -> tuple[Tensor, Mind, Tensor]:
-        """Each subgoal ``G`` = 6 that they may have next; see `SimulatedPeople.branches`."""
+        """Return all next subgoals, ``G`` = 6; see `SimulatedPeople.branches`."""
         knowledge = self._learn(memory, observation, told)
         chance = self._next(memory, knowledge, observation)
         chance = chance.take_along_dim(memory.goal[..., None, None], -2).squeeze(-2)
@@ -147,15 +147,15 @@ class SimulatedFirefighters(SimulatedPeople):
         return chance, minds, self._steps(knowledge, observation)
 
     def kept(self, memory: Mind) -> Mind:
-        """What they know, and their subgoal."""
+        """Return knowledge and subgoal; see `SimulatedPeople.kept`."""
         return replace(memory, mind_noise=memory.mind_noise[..., :0, :0])
 
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
     ) -> Tensor:
-        """Of actions ``[P, B, T, A]``, given what was done before but not what they had in mind.
+        """Return probabilities of actions ``[P, B, T, A]``, given the actions before each.
 
-        The subgoal is filtered: ``p(g_t | a_1, ..., a_{t-1})`` exactly.
+        The subgoal is filtered exactly: ``p(g_t | a_1, ..., a_{t-1})``.
         """
         memory = self.start(actions.shape[1])
         goals = torch.nn.functional.one_hot(memory.goal, len(SUBGOALS)).to(probabilities.dtype)
@@ -182,7 +182,7 @@ class SimulatedFirefighters(SimulatedPeople):
         return HouseKnowledge(memory.corridors, memory.rooms).learn(observation, visible)
 
     def _next(self, memory: Mind, knowledge: HouseKnowledge, observation: Observation) -> Tensor:
-        """Probability ``[P, ..., 6, 6]`` of each subgoal, by the subgoal before."""
+        """Return the probability ``[P, ..., 6, 6]`` of each subgoal, given the one before."""
         possible = possible_subgoals(knowledge, observation)
         rooms = possible_rooms(knowledge, observation)
         people = torch.arange(len(self.transitions), device=rooms.device)
@@ -196,7 +196,7 @@ class SimulatedFirefighters(SimulatedPeople):
         return torch.where(news[..., None, None], chosen[..., HOME : HOME + 1, :], following)
 
     def _steps(self, knowledge: HouseKnowledge, observation: Observation) -> Tensor:
-        """Probability ``[P, ..., 6, 4]`` of each action on the way to each subgoal."""
+        """Return the probability ``[P, ..., 6, 4]`` of each action, given the subgoal."""
         place = observation["ego"][..., :2].long()
         barred = _barred(knowledge, observation)
         known = (barred * torch.arange(1, 3, device=barred.device)).sum(-1)
@@ -206,9 +206,9 @@ class SimulatedFirefighters(SimulatedPeople):
 
 
 def possible_rooms(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
-    """Where the victim may be, for all they know: 1, 2 and 4 for the rooms, added up ``[...]``.
+    """Return the rooms where the victim may be: 1, 2 and 4 for the rooms, added up ``[...]``.
 
-    Of a victim who is carried that no longer matters.
+    It no longer matters for a victim who is carried.
     """
     holds = observation["verbal"][..., len(CORRIDORS) :, 0] == 1
     may_be = ~knowledge.rooms | holds
@@ -216,7 +216,7 @@ def possible_rooms(knowledge: HouseKnowledge, observation: Observation) -> Tenso
 
 
 def possible_subgoals(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
-    """Which subgoals make sense, boolean ``[..., 6]``.
+    """Return which subgoals are possible, boolean ``[..., 6]``.
 
     - On the way to the rooms, and back from there with the victim: a corridor that is not known to
       be blocked.
@@ -233,23 +233,23 @@ def possible_subgoals(knowledge: HouseKnowledge, observation: Observation) -> Te
 
 
 def _barred(knowledge: HouseKnowledge, observation: Observation) -> Tensor:
-    """Which corridors ``[..., 2]`` are known to be blocked."""
+    """Return which corridors ``[..., 2]`` are known to be blocked."""
     return knowledge.corridors & (observation["verbal"][..., : len(CORRIDORS), 0] == 1)
 
 
 def subgoal_distances() -> Tensor:
-    """Steps from each subgoal to each, in a house without obstacles, ``[6, 6]``."""
+    """Return steps between subgoals in a house without obstacles, ``[6, 6]``."""
     row, column = torch.tensor(list(SUBGOALS.values())).unbind(-1)
     return _distances_and_ways()[0][0][row, column]
 
 
 @cache
 def _distances_and_ways() -> tuple[Tensor, Tensor]:
-    """Steps to each subgoal ``[3, 9, 9, 6]``, and first steps of shortest ways.
+    """Return steps to each subgoal ``[3, 9, 9, 6]``, and first steps of shortest paths.
 
-    The latter are uniform probabilities ``[3, 9, 9, 6, 4]``. By the corridor that is known to be
-    blocked (0 none), row, column, subgoal and action. Where there is no way, or nowhere to go,
-    every action is as likely.
+    The latter are uniform probabilities ``[3, 9, 9, 6, 4]``. Dimensions are the corridor known to
+    be blocked (0 none), row, column, subgoal and action. Without a path, and at the subgoal, all
+    actions are equally probable.
     """
     cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
     moves = torch.tensor(list(MOVES.values()))

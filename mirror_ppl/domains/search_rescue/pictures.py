@@ -1,4 +1,4 @@
-"""The house as firefighters see it: samples of the posterior over sight (supplement, Fig. 12)."""
+"""Figures of the posterior over sight, as maps of the house (supplement, Fig. 12)."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ if TYPE_CHECKING:
 
 SITE = SIGHT + "radius"
 MOST_PEOPLE = 12
-"""More people than this do not fit on one picture."""
+"""Maximum number of people on one picture."""
 SAMPLES = 4
 PLACE = (6, 2)
-"""Where the firefighter of the pictures stands: in the hall, by the left corridor, in a corner of a
-portion, which they do not see all of with a radius of 1."""
+"""Place of the firefighter in the pictures: in the hall by the left corridor, in a corner of a
+portion that is not seen with a radius of 1."""
 SCENARIO = "victim top-left, right corridor blocked"
 
 
 def has_sight(data: az.InferenceData) -> bool:
-    """Whether the human model has the radius that the house is shaded by."""
+    """True if the posterior has the radius that shades the house."""
     return SITE in data["posterior"]
 
 
 def sight_probability(data: az.InferenceData, person: str) -> np.ndarray:
-    """Posterior probability that a person sees each cell of the map, ``[9, 9]``.
+    """Return the posterior probability that a person sees each cell of the map, ``[9, 9]``.
 
-    It is that of a firefighter who stands by the left corridor and has not looked around yet.
+    The firefighter stands by the left corridor and has not looked around yet.
 
     Args:
         data: with the site ``sight_radius``, in cells.
         person: id of the person.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     return _seen(draws(of_person(data, "posterior", person)[SITE])).mean(0)
 
 
 def sight_picture(data: az.InferenceData) -> Picture:
-    """What people see of the house, one row each: the house, truth, probability, samples.
+    """Draw the house as each person sees it, one row each: house, truth, probability, samples.
 
-    Black is what they do not see. Of more than 12 people the first 12 are shown.
+    Black is what they do not see. At most the first 12 people are shown.
 
     Args:
         data: as for :func:`sight_probability`.
@@ -107,7 +107,7 @@ def _state() -> RescueState:
 
 
 def _seen(radii: np.ndarray) -> np.ndarray:
-    """Which cells of the map are seen with each radius, ``[S, 9, 9]``, 0 or 1."""
+    """Return which cells of the map are seen with each radius, ``[S, 9, 9]``, 0 or 1."""
     world = SearchRescue()
     _, distance = world.distance(world.observe(_state()))
     portions = (distance[0].numpy() <= radii[:, None]).astype(float)
@@ -149,4 +149,4 @@ def _finish(ax: Axes) -> None:
 PICTURES = {
     "sight.png": SightPicture(has_sight, sight_picture, "the house as each person sees it"),
 }
-"""Of what each person sees, by file name."""
+"""Pictures of each person's sight, by file name."""

@@ -1,4 +1,4 @@
-"""What the package knows of search and rescue besides its rules."""
+"""The record of search and rescue: settings, people and pictures."""
 
 from mirror_ppl.domains.record import Record
 
@@ -29,7 +29,7 @@ RECORD = Record(
     },
     baselines={
         "bc": {"learning_rate": 0.003, "weight_decay": 3.0},
-        # Rounds are long, and it takes many steps until what networks do is like what people do.
+        # Rounds are long, so networks need many steps to imitate people.
         "sqil": {
             "batch": 5,
             "sampled": 5,

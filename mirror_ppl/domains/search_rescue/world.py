@@ -15,7 +15,7 @@ Description
         . . . . e . . . .
 
     A scenario says where the victim is (three places) and which corridor is blocked, in its middle
-    (none, left or right): nine in all. The house itself is known to everybody.
+    (none, left or right): nine in all. The house itself is known to all people.
 
 Actions
     0 up, 1 down, 2 left, 3 right: one cell, if there is neither wall nor obstacle.
@@ -25,7 +25,7 @@ Observations
     ego       row, column   cells    where the firefighter is, 0 at the top and left; always known
     ego       carrying      0 or 1   whether they have the victim with them
     visual    27 numbers    0 to 1   pixels of each portion of the map: row, column, red-green-blue
-    verbal    holds         0 or 1   whether what an utterance is about is so: the corridor is
+    verbal    holds         0 or 1   whether the statement about an item holds: the corridor is
                                      blocked, the victim is in that room
     ========  ============  =======  ===============================================================
 
@@ -86,10 +86,10 @@ from mirror_ppl.domains.world import World
 
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 SMOKE_REACH = 1.5
-"""How far a firefighter sees in smoke, in cells to the centre of a portion."""
+"""Sight of a firefighter in smoke, in cells to the centre of a portion."""
 FOUND, RETURNED, COLLISION, TIME = 1.0, 15.0, -10.0, -0.1
 BEGINNINGS = 0.25
-"""Share of the rounds that the robot learns from that begin where rounds begin."""
+"""Share of the robot's training rounds that begin in ordinary initial states."""
 
 UTTERANCES: Mapping[str, tuple[str, str]] = {
     **{
@@ -98,7 +98,7 @@ UTTERANCES: Mapping[str, tuple[str, str]] = {
     },
     **{room: (f"victim not in {room}", f"victim in {room}") for room in ROOMS},
 }
-"""What is said of each verbal item if it does not hold, and if it does."""
+"""Utterances about each verbal item, if it does not hold and if it does."""
 
 
 @dataclass(frozen=True)
@@ -166,25 +166,25 @@ class SearchRescue(World):
     mishap: tuple[str, str] = ("collision", "collisions")
     directions: tuple[str, ...] = ("radius",)
     reach_bins: tuple[float, ...] = reach_distances()
-    """Radii in cells, one of each set of those with which one sees the same from every place."""
+    """Radii in cells, one for each set of radii with equal sight from every place."""
     reach_unit = "cells"
-    # What is seen a few steps ahead or only beside is what people in smoke differ in.
+    # People in smoke differ in whether they see a few steps ahead or only beside them.
     reach_practice: tuple[float, ...] = tuple(
         4.0 if abs(radius - SMOKE_REACH) <= 1 else 1.0 for radius in reach_distances()
     )
     told_practice = 0.05
     partial_views: Mapping[str, tuple[float, ...]] = {"smoke": (SMOKE_REACH,)}
     assumptions: tuple[str, ...] = ("open",)
-    """A corridor of which nothing is known is not blocked."""
+    """An unknown corridor is not blocked."""
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
     ) -> RescueState:
-        """States ``[batch]`` at the entrance.
+        """Draw states ``[batch]`` at the entrance.
 
         Args:
             batch: number of rounds.
-            generator: source of randomness; its device is where the states live.
+            generator: source of randomness; its device is that of the states.
             scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
         """
         device = generator.device
@@ -199,16 +199,16 @@ class SearchRescue(World):
         )
 
     def anywhere(self, batch: int, generator: torch.Generator) -> RescueState:
-        """States ``[batch]``: a quarter as rounds begin, the others anywhere on the floor.
+        """Draw states ``[batch]``: a quarter as rounds begin, the others anywhere on the floor.
 
-        In half of those anywhere the victim is carried.
+        In half of the latter the victim is carried.
         """
         state = self.initial(batch, generator)
         cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
         cells = cells[walkable(cells)].to(generator.device)
         cell = torch.randint(len(cells), (batch,), generator=generator, device=generator.device)
         place = cells[cell]
-        # Nobody stands on the obstacle.
+        # No firefighter stands on the obstacle.
         place = torch.where(self._obstructed(state, place)[..., None], state.place, place)
         carried = torch.rand(batch, generator=generator, device=generator.device) < 0.5  # noqa: PLR2004
         found = carried | self._at_victim(state, place)
@@ -218,7 +218,7 @@ class SearchRescue(World):
         return replace(state, place=place, found=found, home=found & at_entrance(place))
 
     def transition(self, state: RescueState, action: Tensor) -> RescueState:
-        """State at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
+        """Return the state at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
         moves = torch.tensor(list(MOVES.values()), device=state.place.device)
         target = state.place + moves[action]
         stays = state.home | ~walkable(target) | self._obstructed(state, target)
@@ -230,7 +230,7 @@ class SearchRescue(World):
     def rewards(
         self, state: RescueState, action: Tensor, following: RescueState
     ) -> dict[str, Tensor]:
-        """Reward terms ``[...]`` by name, in units of reward."""
+        """Return reward terms ``[...]`` by name, in units of reward."""
         moves = torch.tensor(list(MOVES.values()), device=state.place.device)
         into = self._obstructed(state, state.place + moves[action])
         dtype = torch.get_default_dtype()
@@ -250,11 +250,11 @@ class SearchRescue(World):
         return (place == corridors[state.blocked]).all(-1)
 
     def over(self, state: RescueState) -> Tensor:
-        """Where they are back at the entrance with the victim ``[...]``."""
+        """Return where they are back at the entrance with the victim ``[...]``."""
         return state.home
 
     def observe(self, state: RescueState) -> Observation:
-        """Everything there is to observe: ego ``[..., 3]``, visual ``[..., 9, 27]`` and so on."""
+        """Return ego ``[..., 3]``, visual ``[..., 9, 27]`` and verbal ``[..., 5, 1]``."""
         dtype = torch.get_default_dtype()
         device = state.place.device
         ego = torch.cat([state.place.to(dtype), state.found[..., None].to(dtype)], -1)
@@ -266,7 +266,7 @@ class SearchRescue(World):
         return {"ego": ego, "visual": portion_pixels(holds), "verbal": holds[..., None].to(dtype)}
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
-        """What the setting lets an unaided person see, and hear.
+        """Return what an unaided person sees and hears in a setting.
 
         Raises:
             UnknownNameError: if the setting is neither ``clear`` nor ``smoke``.
@@ -279,7 +279,7 @@ class SearchRescue(World):
         return {"visual": distance <= SMOKE_REACH, "verbal": ~everything}
 
     def faults(self, observation: Observation) -> dict[str, Tensor]:
-        """Which observations ``[...]`` break each rule that recordings have to keep, by rule."""
+        """Return which observations ``[...]`` break each rule of recordings, by rule."""
         place, carrying = observation["ego"][..., :2], observation["ego"][..., 2]
         holds = observation["verbal"][..., 0]
         known = (holds == 0) | (holds == 1)
@@ -301,7 +301,7 @@ class SearchRescue(World):
         }
 
     def nothing_known(self, *batch: int, device: torch.device | None = None) -> HouseKnowledge:
-        """Knowledge ``[*batch]`` before anything was observed."""
+        """Return knowledge ``[*batch]`` before anything was observed."""
         return HouseKnowledge.nothing(*batch, device=device)
 
     def learn(
@@ -311,18 +311,18 @@ class SearchRescue(World):
         visible: Visibility,
         sees: Callable[[Observation], Visibility],
     ) -> HouseKnowledge:
-        """What a portion shows and what is said stays known, and what follows from it."""
+        """Return knowledge after a step: what was shown or said, and its implications."""
         del sees
         return knowledge.learn(observation, visible)
 
     def known(self, knowledge: HouseKnowledge) -> Visibility:
-        """Portions ``[..., 9]`` and utterances ``[..., 5]`` whose content is known."""
+        """Return portions ``[..., 9]`` and utterances ``[..., 5]`` whose content is known."""
         return knowledge.items()
 
     def assume(
         self, knowledge: HouseKnowledge, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """Who takes it for granted imagines corridors of which they know nothing to be free."""
+        """Return the assumption ``open``: unknown corridors are imagined to be free."""
         unknown = ~knowledge.corridors
         corridors, rooms = len(CORRIDORS), len(ROOMS)
         items = {
@@ -342,13 +342,13 @@ class SearchRescue(World):
     def supposed(
         self, state: RescueState, knowledge: HouseKnowledge, assumes: Mapping[str, Tensor]
     ) -> RescueState:
-        """The state without an obstacle of which they know nothing, where they assume that."""
+        """Return the state without an unknown obstacle, for people who assume ``open``."""
         sides = torch.arange(1, 1 + len(CORRIDORS), device=state.blocked.device)
         known = ((state.blocked[..., None] == sides) & knowledge.corridors).any(-1)
         return replace(state, blocked=torch.where(known | ~assumes["open"], state.blocked, 0))
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
-        """Observations in the form in which networks read them.
+        """Encode observations for networks.
 
         Returns:
             ego ``[..., 19]``, one-hot row and column, and whether they carry the victim; visual
@@ -364,15 +364,15 @@ class SearchRescue(World):
         return {"ego": torch.cat(parts, -1), "visual": observation["visual"], "verbal": said}
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
-        """Direction (there is one) and distance in cells to the centre of each portion."""
+        """Return the only direction, and distances in cells to the centre of each portion."""
         place = observation["ego"][..., None, :2]
         distance = (place - portion_centres().to(place)).pow(2).sum(-1).sqrt()
         return torch.zeros_like(distance, dtype=torch.long), distance
 
     def state_behind(self, observation: Observation) -> RescueState:
-        """The state ``[...]`` that gives this observation of everything.
+        """Return the state ``[...]`` with this full observation.
 
-        Of a victim who is carried it cannot be observed where they were, and no longer matters.
+        The former room of a carried victim cannot be observed and no longer matters.
         """
         holds = observation["verbal"][..., 0].round().bool()
         place = observation["ego"][..., :2].round().long()
@@ -388,10 +388,10 @@ class SearchRescue(World):
         )
 
     def nearest(self, observation: Observation) -> Observation:
-        """The observation that can be and is nearest to decoded values.
+        """Return the possible observation nearest to decoded values.
 
-        Places are rounded to the nearest floor. What is in the house is the scenario whose pixels
-        and utterances are nearest.
+        Places are rounded to the nearest floor. The scenario is the one with the nearest pixels and
+        utterances.
         """
         place = observation["ego"][..., :2]
         cells = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
@@ -424,14 +424,14 @@ class SearchRescue(World):
         return {name: chosen(part) for name, part in possible.items()}
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
-        """Where the victim is, and the obstacle (supplement, section F)."""
+        """Return the items of the victim and the obstacle (supplement, section F)."""
         holds = observation["verbal"][..., 0] == 1
         portions = torch.zeros_like(observation["visual"][..., 0], dtype=torch.bool)
         portions[..., [*CORRIDOR_PORTIONS, *ROOM_PORTIONS]] = holds
         return {"goal_and_obstacle": {"visual": portions, "verbal": holds}}
 
     def describe(self, observation: Observation, modality: str, item: str) -> str:
-        """Such as "victim in top-right", or "the middle-left of the map (left corridor clear)"."""
+        """Describe an item, such as "victim in top-right"."""
         holds = observation["verbal"][:, 0].int().tolist()
         said = [about[value] for about, value in zip(UTTERANCES.values(), holds, strict=True)]
         if modality == "verbal":
@@ -441,12 +441,12 @@ class SearchRescue(World):
         return f"the {item} of the map{shows}"
 
     def deed(self, observation: Observation, item: str | None, action: int) -> str:
-        """Where they would go."""
+        """Describe an action, such as "go up"."""
         del observation, item
         return f"go {self.actions[action]}"
 
     def reference_values(self, state: RescueState, discount: float) -> Tensor:
-        """Exact action values ``[..., 4]`` with everything known, for as long as it takes."""
+        """Return exact action values ``[..., 4]`` of known states, without a horizon."""
         table = _action_values(discount).to(state.place.device)
         row, column = state.place.unbind(-1)
         found, home = state.found.long(), state.home
@@ -454,7 +454,7 @@ class SearchRescue(World):
         return torch.where(home[..., None], 0.0, values)
 
     def render(self, state: RescueState) -> np.ndarray:
-        """Picture ``uint8 [height, width, 3]`` of one state: the map, the firefighter in blue."""
+        """Draw ``uint8 [height, width, 3]`` of one state: the map, the firefighter in blue."""
         cell = 12
         pixels = as_image(self.observe(state)["visual"]).numpy()
         picture = (255 * pixels).round().astype(np.uint8).repeat(cell, 0).repeat(cell, 1)
@@ -465,7 +465,7 @@ class SearchRescue(World):
 
 @cache
 def _action_values(discount: float) -> Tensor:
-    """``[blocked 3, victim 3, found 2, row 9, column 9, action 4]`` by value iteration."""
+    """Compute ``[blocked 3, victim 3, found 2, row 9, column 9, action 4]`` by value iteration."""
     world = SearchRescue()
     shape = (1 + len(CORRIDORS), len(ROOMS), 2, SIDE, SIDE)
     grid = torch.cartesian_prod(*(torch.arange(size) for size in shape))
@@ -482,7 +482,7 @@ def _action_values(discount: float) -> Tensor:
         strides = torch.tensor([shape[1] * 2 * SIDE**2, 2 * SIDE**2, SIDE**2, SIDE, 1])
         parts = [after.blocked, after.victim, after.found.long(), *after.place.unbind(-1)]
         outcomes.append((reward.double(), (torch.stack(parts, -1) * strides).sum(-1), after.home))
-    # From inside of walls nothing leads anywhere.
+    # Cells inside walls have no transitions.
     floor = walkable(state.place)
     values = torch.zeros(number, dtype=torch.double)
     while True:

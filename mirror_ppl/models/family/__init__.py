@@ -1,6 +1,6 @@
-"""A family of human models: people who differ from the package's own model in one respect.
+"""A family of human models that differ from the package's own model in one respect each.
 
-Each is a file of its own, to fit, simulate and calibrate; :class:`AnyKind` is all of them at once.
+Each is one file and can be fitted, simulated and calibrated; :class:`AnyKind` is their mixture.
 """
 
 from mirror_ppl.models.family.any_kind import KIND, AnyKind, OneOfKinds, model_of

@@ -1,12 +1,12 @@
-"""The family of human models as one program.
+"""The family of human models as one program, a mixture over models.
 
-Which of them holds for a person is a site, ``kind``. Its posterior weighs the models by their
-marginal likelihoods, and what they share, predictions and plans are averages over them (Bayesian
-model averaging)::
+The model of a person is a site, ``kind``. Its posterior weighs the models by their marginal
+likelihoods. Shared implants, predictions and plans are averages over models (Bayesian model
+averaging)::
 
     kind_p ~ Categorical(.6, .1, .1, .1, .1)      mirror, late, noticing, forgetting, preferring
 
-Implants of the other models keep their prior.
+Implants of models other than a person's own follow their prior.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from mirror_ppl.models.family.preferring import PREFERS, SHARES_GOAL, Preferring
 from mirror_ppl.models.human import HumanModel, Implants
 
 KIND = "kind"
-"""Site of the kind."""
+"""Site of the model that holds for a person."""
 MIRROR = "mirror"
 """The package's own model."""
 USUAL = 0.6
-"""Prior probability of that; the others share the rest."""
+"""Prior probability of ``mirror``; the other models share the rest equally."""
 SITES = {
     LATE: ("late", 0.0),
     NOTICES: ("noticing", 1.0),
@@ -39,17 +39,17 @@ SITES = {
     SHARES_GOAL: ("preferring", 1.0),
     PREFERS: ("preferring", 0.0),
 }
-"""Of each site that a model adds (of preferences, how they begin): that model, and the value at
-which it is the package's own."""
+"""The model that adds each site (for preferences, each prefix), and the value of the site at which
+that model equals the package's own."""
 
 
 def model_of(site: str) -> str:
-    """The model of the family that adds a site; none, an empty name, if they share it."""
+    """Return the model of the family that adds a site; an empty name if the models share it."""
     return SITES.get(PREFERS if site.startswith(PREFERS) else site, ("", 0.0))[0]
 
 
 class OneOfKinds(HumanModel):
-    """People whose kind is unknown: it is inferred together with the other implants.
+    """Base class of mixtures of models: the kind of each person is inferred with other implants.
 
     Derive from it and from the models, which differ from the package's own in one respect each.
     """
@@ -65,18 +65,18 @@ class OneOfKinds(HumanModel):
 
     @property
     def value_names(self) -> Mapping[str, Sequence[str]]:
-        """What the kinds are called."""
+        """Names of the values of discrete sites, including ``kind``."""
         return {**super().value_names, KIND: self.family}
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the implants of every person, of all kinds, and their kind."""
+        """Sample the implants of all models, and the kind, of every person."""
         other = (1 - USUAL) / (len(self.family) - 1)
         chances = torch.tensor([USUAL, *[other] * (len(self.family) - 1)])
         chances = chances.to(next(self.self_model.parameters()))
         return super().prior() | {KIND: pyro.sample(KIND, dist.Categorical(chances))}
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of actions ``[..., P, B, A]``, as their kind has it."""
+        """Return log-probabilities of actions ``[..., P, B, A]`` under each person's kind."""
         own = dict(implants)
         for site, value in implants.items():
             if kind := model_of(site):

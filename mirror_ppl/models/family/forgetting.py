@@ -1,4 +1,4 @@
-"""People who forget what they saw and heard."""
+"""A model of people who forget what they saw and heard."""
 
 from __future__ import annotations
 
@@ -17,43 +17,43 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.view import View
 
 FORGETS = "forgets"
-"""Site of how probably somebody forgets at a step all that was before it."""
+"""Site of the probability of forgetting, at a step, everything before it."""
 FORGOT = ("forgot 0", "forgot 1", "forgot 2")
-"""Beliefs of somebody who forgot all before this step, before the last one, and the one before."""
+"""Beliefs after forgetting everything before this step, the last step, and the one before that."""
 AFRESH = "afresh"
-"""The view of somebody who knows nothing from before."""
+"""The view of a person with no knowledge from earlier steps."""
 
 
 class Forgetting(SeveralBeliefs):
-    """Forgets with a probability at each step what was seen and heard before it::
+    """Forgets, at each step with some probability, everything seen and heard before it::
 
         forgets_p ~ Beta(1, 1)
-        zH_t^m    what is believed of this step and the m before it alone: m = 0, 1, 2
+        zH_t^m    the belief given this step and the m before it alone: m = 0, 1, 2
         a_t       ~ sum_m forgets (1 - forgets)^m p(a | zH_t^m) + (1 - forgets)^3 p(a | zH_t)
 
-    Who has not forgotten for more than two steps has forgotten nothing.
+    A person who has not forgotten for more than two steps has the full belief ``zH_t``.
     """
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__(self_model)
         if len(self.domain.reach_bins) <= 1:
             raise HumanModelError(
-                f"forgetting: in {self.domain.name} what was found stays in view, and there is "
-                "nothing to forget"
+                f"forgetting: in {self.domain.name} items stay in view once they are found, so "
+                "there is nothing to forget"
             )
 
     @property
     def views(self) -> tuple[str, ...]:
-        """That of somebody who knows nothing from before, too."""
+        """Names of the views, with that of a person with no earlier knowledge."""
         return (*super().views, AFRESH)
 
     @property
     def beliefs(self) -> tuple[str, ...]:
-        """Those of somebody who forgot, too."""
+        """Names of the beliefs, with those after forgetting."""
         return (*super().beliefs, *FORGOT)
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the implants of every person; ``forgets`` is how probably they forget."""
+        """Sample the implants of every person, with the probability ``forgets``."""
         one = next(self.self_model.parameters()).new_ones(())
         return super().prior() | {FORGETS: pyro.sample(FORGETS, dist.Beta(one, one))}
 
@@ -65,14 +65,14 @@ class Forgetting(SeveralBeliefs):
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """What a person sees and knows, and what they see alone."""
+        """Return the views with and without knowledge from earlier steps."""
         nothing = self.domain.nothing_known(1, device=observation["ego"].device)
         afresh, _ = super().perceive(implants, nothing, observation, told, step)
         view, after = super().perceive(implants, knowledge, observation, told, step)
         return joined({NOW: view, AFRESH: afresh}), after
 
     def after(self, before, evidence, action, still) -> dict[str, Tensor]:
-        """The beliefs after one step; of who forgot just now, as at the first step of a round."""
+        """Return the beliefs after one step; after forgetting just now, as at a first step."""
         found = super().after(before, evidence, action, still)
         begins = torch.full_like(action, len(self.domain.actions))
         nothing = torch.zeros_like(before[NOW])
@@ -84,7 +84,7 @@ class Forgetting(SeveralBeliefs):
         return found
 
     def shares(self, implants: Implants) -> dict[str, Tensor]:
-        """Of what is done now, so much is done by somebody who forgot."""
+        """Return the probabilities of acting on each belief, with those after forgetting."""
         found, forgets = super().shares(implants), implants[FORGETS]
         left = found[NOW]
         for name in FORGOT:

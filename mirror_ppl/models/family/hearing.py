@@ -1,4 +1,4 @@
-"""People who do not hear."""
+"""A model of people whom messages may not reach."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.view import View
 
 HEARS = "hears_"
-"""What sites begin with of whether messages of a modality reach somebody."""
+"""Prefix of the sites of whether messages of a modality reach the person."""
 
 
 class HardOfHearing(HumanModel):
-    """Does not take in what is communicated by some channels: ``hears_<modality>``, 1 if they do.
+    """Misses messages through some channels: ``hears_<modality>`` is 1 if messages reach them.
 
-    It is inferred from recordings with messages, such as rounds in which a communicator assists.
+    Only recordings with messages identify it, such as rounds in which a communicator assists.
     """
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the implants of every person, and the channels that reach them."""
+        """Sample the implants of every person, with the channels that reach them."""
         even = next(self.self_model.parameters()).new_full((2,), 1 / 2)
         hears = {
             site: pyro.sample(site, dist.Categorical(even))
@@ -39,7 +39,7 @@ class HardOfHearing(HumanModel):
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """What a person sees, and of what is communicated what reaches them."""
+        """Return the view, with only the messages that reach the person."""
         reaches = {
             name: mask & (implants[HEARS + name][..., None] == 1) for name, mask in told.items()
         }

@@ -1,4 +1,4 @@
-"""People who notice what is in reach with a probability."""
+"""A model of people who notice items in reach with some probability."""
 
 from __future__ import annotations
 
@@ -18,43 +18,43 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.view import View
 
 NOTICES = "notices"
-"""Site of how probably somebody notices at a step what is in reach."""
+"""Site of the probability of noticing, at a step, the items in reach."""
 MISSED = ("missed 1", "missed 2")
-"""Beliefs of somebody who noticed nothing at this step; and at the one before."""
+"""Beliefs after noticing nothing at this step; at this and the one before."""
 UNNOTICED = "unnoticed"
-"""The view of somebody who notices nothing: what they are told, and what they know already."""
+"""The view of a person who notices nothing: messages, and what they already know."""
 
 
 class Noticing(SeveralBeliefs):
-    """Notices what is in reach with a probability at each step, and else keeps to what is known::
+    """Notices items in reach with some probability at each step, else uses known items only::
 
         notices_p ~ Beta(1, 1)
-        zH_t^m    what is believed if nothing was noticed for m steps: 1, or 2 and more
+        zH_t^m    the belief if nothing was noticed for m steps: 1, or 2 and more
         a_t       ~ sum_m notices (1 - notices)^m p(a | zH_t^m)
 
-    Who notices again is taken to notice all that is in reach. Messages are always noticed.
+    A person who notices again notices all items in reach. Messages are always noticed.
     """
 
     def __init__(self, self_model: SelfModel) -> None:
         super().__init__(self_model)
         if len(self.domain.reach_bins) <= 1:
             raise HumanModelError(
-                f"noticing: in {self.domain.name} it does not count how far away things are, and "
-                'the model "mirror" says itself when they are noticed'
+                f"noticing: in {self.domain.name} distance does not matter, and the model "
+                '"mirror" already includes when items are noticed'
             )
 
     @property
     def views(self) -> tuple[str, ...]:
-        """That of somebody who notices nothing, too."""
+        """Names of the views, with that of a person who notices nothing."""
         return (*super().views, UNNOTICED)
 
     @property
     def beliefs(self) -> tuple[str, ...]:
-        """Those of somebody who noticed nothing, too."""
+        """Names of the beliefs, with those after noticing nothing."""
         return (*super().beliefs, *MISSED)
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the implants of every person; ``notices`` is how probably they notice."""
+        """Sample the implants of every person, with the probability ``notices``."""
         one = next(self.self_model.parameters()).new_ones(())
         return super().prior() | {NOTICES: pyro.sample(NOTICES, dist.Beta(one, one))}
 
@@ -66,7 +66,7 @@ class Noticing(SeveralBeliefs):
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """What a person sees if they notice it, and if not."""
+        """Return the views if the items in reach are noticed and if not."""
 
         def nothing(seen: Observation) -> Visibility:
             return {
@@ -80,14 +80,14 @@ class Noticing(SeveralBeliefs):
         return joined({NOW: view, UNNOTICED: missed}), after
 
     def after(self, before, evidence, action, still) -> dict[str, Tensor]:
-        """The beliefs after one step, of which nothing was noticed, or of two."""
+        """Return the beliefs after one step, also if nothing was noticed for one step or two."""
         found = super().after(before, evidence, action, still)
         for name, own in zip(MISSED, (NOW, *MISSED), strict=False):
             found[name] = self.inferred(before[own], evidence[UNNOTICED], action, still)
         return found
 
     def shares(self, implants: Implants) -> dict[str, Tensor]:
-        """Of what is done now, so much is done by somebody who noticed nothing."""
+        """Return the probabilities of acting on each belief, with those after noticing nothing."""
         found, notices = super().shares(implants), implants[NOTICES]
         once, more = (found[NOW] * (1 - notices) * part for part in (notices, 1 - notices))
         return found | {NOW: found[NOW] * notices} | dict(zip(MISSED, (once, more), strict=True))

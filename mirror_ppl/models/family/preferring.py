@@ -1,4 +1,4 @@
-"""People who want something else."""
+"""A model of people with other preferences than the robot."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torch import Tensor
 from mirror_ppl.models.human import HumanModel, Implants
 
 SHARES_GOAL = "shares_goal"
-"""Site of how far the robot's action values are theirs."""
+"""Site of the factor on the robot's action values."""
 PREFERS = "prefers_"
-"""What sites of preferences begin with."""
+"""Prefix of the sites of preferences."""
 
 
 class Preferring(HumanModel):
-    """Wants something else: another goal, more or less caution, a habit.
+    """Has other preferences than the robot: another goal, more or less caution, a habit.
 
-    ``shares_goal`` is how far the robot's action values are theirs: 1 for all of it, 0 for not at
-    all, -1 for the opposite. ``prefers_<action>`` is added to the log-probability of an action,
-    whatever it leads to (lapses, too), before normalization; it is 0 for the first action::
+    ``shares_goal`` scales the robot's action values: 1 for the robot's goal, 0 for none, -1 for the
+    opposite. ``prefers_<action>`` is added to the log-probability of an action (of lapses, too)
+    before normalization, whatever the action leads to; it is 0 for the first action::
 
         shares_goal_p ~ Uniform(-1, 1)
         prefers_a_p   ~ Normal(0, 1.5)
@@ -29,11 +29,11 @@ class Preferring(HumanModel):
 
     @property
     def preferences(self) -> tuple[str, ...]:
-        """Sites of all actions but the first."""
+        """Names of the sites of preferences, one for each action but the first."""
         return tuple(PREFERS + action.replace(" ", "_") for action in self.domain.actions[1:])
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the implants of every person, and what they prefer."""
+        """Sample the implants of every person, with their preferences."""
         one = next(self.self_model.parameters()).new_ones(())
         preferences = {
             site: pyro.sample(site, dist.Normal(0 * one, 1.5 * one)) for site in self.preferences
@@ -42,7 +42,7 @@ class Preferring(HumanModel):
         return super().prior() | preferences | {SHARES_GOAL: shares}
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of actions ``[..., P, B, A]``."""
+        """Return log-probabilities of actions ``[..., P, B, A]``."""
         shared = implants[SHARES_GOAL][..., None] * values
         others = [implants[site] for site in self.preferences]
         liked = torch.stack([torch.zeros_like(others[0]), *others], -1)

@@ -1,12 +1,12 @@
-"""People who act on one of several beliefs: with which probability on which is up to them.
+"""Models of people who act on one of several beliefs, with probabilities of their own.
 
-The program stays what it is; a belief is several of the robot's, one behind the other::
+The program is unchanged; a belief is the concatenation of several of the robot's::
 
     zH_t = (zH_t^1, ..., zH_t^N)                             each as the robot would infer it
-    a_t  ~ sum_i w_i(psi) p(a | zH_t^i, psi)                 which one is drawn anew at every step
+    a_t  ~ sum_i w_i(psi) p(a | zH_t^i, psi)                 i is drawn anew at every step
 
-As which belief somebody acts on at a step is summed out there, nothing has to be inferred of each
-step. Of those at different steps it says that they do not depend on each other.
+The belief acted on is summed out at each step, so there is no latent per step. The model assumes
+that these choices are independent across steps.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from mirror_ppl.models.view import View
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
 NOW = "now"
-"""The name of the belief, and of the view, that people have in the package's own model."""
+"""Name of the belief, and of the view, of the package's own model."""
 DRAWS = 3
-"""Dimensions of a site's values where there are several draws of them: ``[S, P, 1]``."""
+"""Dimensions of a site's values if they have draws: ``[S, P, 1]``."""
 MANY_DRAWS = 64
-"""Draws from which on it pays to find out which beliefs are the same."""
+"""Number of draws from which finding equal beliefs saves time."""
 
 
 class SeveralBeliefs(HumanModel):
-    """Acts on one of several beliefs, by chance at every step.
+    """Base class: acts on one of several beliefs, drawn anew at every step.
 
-    Derive from it, and say what other :attr:`views` and beliefs there are (:meth:`after`), and how
-    probable it is that they are acted on (:meth:`shares`), each beside what ``super()`` says.
+    Derive from it and add :attr:`views`, :attr:`beliefs` (updated by :meth:`after`) and the
+    probabilities of acting on them (:meth:`shares`), each to those of ``super()``.
     """
 
     @property
@@ -55,28 +55,28 @@ class SeveralBeliefs(HumanModel):
         action: Tensor,
         still: Tensor | None,
     ) -> dict[str, Tensor]:
-        """Each belief after one step ``[..., Z]``.
+        """Return each belief after one step ``[..., Z]``.
 
         Args:
-            before: those of the step before, ``[..., Z]`` by name.
-            evidence: that of each view, ``[..., H]``.
-            action: what was done in between, and
-            still: where nothing came up, as of :meth:`believe`.
+            before: beliefs of the step before, ``[..., Z]`` by name.
+            evidence: evidence of each view, ``[..., H]``.
+            action: the action in between, as in :meth:`believe`.
+            still: where nothing is new, as in :meth:`believe`.
         """
         return {NOW: self.inferred(before[NOW], evidence[NOW], action, still)}
 
     def shares(self, implants: Implants) -> dict[str, Tensor]:
-        """How probably each belief is acted on, ``[..., P, 1]``; they add up to 1."""
+        """Return the probability of acting on each belief, ``[..., P, 1]``; they sum to 1."""
         del implants
         return {NOW: next(self.self_model.parameters()).new_ones(())}
 
     @property
     def belief_size(self) -> int:
-        """Beliefs of the robot's size, one behind the other: ``N Z``."""
+        """Size ``N Z`` of the concatenated beliefs."""
         return len(self.beliefs) * super().belief_size
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
-        """Of one view behind the other, ``[..., V H]``."""
+        """Return the concatenated evidence of all views, ``[..., V H]``."""
         each = parted(view)
         parts = [
             super(SeveralBeliefs, self).evidence(each[name], observation) for name in self.views
@@ -86,7 +86,7 @@ class SeveralBeliefs(HumanModel):
     def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
     ) -> Tensor:
-        """All beliefs after one step."""
+        """Return all beliefs after one step, concatenated."""
         before = dict(zip(self.beliefs, belief.chunk(len(self.beliefs), -1), strict=True))
         of_views = dict(zip(self.views, evidence.chunk(len(self.views), -1), strict=True))
         found = self.after(before, of_views, action, still)
@@ -95,12 +95,12 @@ class SeveralBeliefs(HumanModel):
     def inferred(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None
     ) -> Tensor:
-        """The belief that the robot would infer of another one ``[..., Z]``."""
+        """Return the belief ``[..., Z]`` that the robot would infer from a belief before."""
         found = super().believe(belief, evidence, action, still)
         return found.mean if isinstance(found, Gaussian) else found
 
     def action_values(self, belief: Tensor) -> Tensor:
-        """Action values ``[..., N A]`` at each of the beliefs."""
+        """Return action values ``[..., N A]`` at all beliefs, concatenated."""
         number = len(self.beliefs)
         apart = belief.unflatten(-1, (number, belief.shape[-1] // number))
         rows = apart.flatten(0, -2)
@@ -109,7 +109,7 @@ class SeveralBeliefs(HumanModel):
         return values.view(*apart.shape[:-1], values.shape[-1]).flatten(-2)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
-        """Log-probabilities of actions ``[..., P, B, A]``, over all that may be acted on."""
+        """Return log-probabilities of actions ``[..., P, B, A]``, beliefs summed out."""
         shares = self.shares(implants)
         parts = [part.chunk(len(self.beliefs), -1) for part in (belief, values)]
         each = [(shares[name], *own) for name, *own in zip(self.beliefs, *parts, strict=True)]
@@ -127,10 +127,9 @@ class SeveralBeliefs(HumanModel):
     def _act_of_draws(
         self, implants: Implants, each: Sequence[tuple[Tensor, Tensor, Tensor]]
     ) -> Tensor:
-        """The same of S draws of implants: of each belief, of those that ever act on it.
+        """Compute :meth:`act` of S draws, at each belief only for draws that may act on it.
 
-        That is a few of them where draws are of people of several kinds, and it is where the time
-        goes.
+        These are few in a mixture of kinds, and this computation takes most of the time.
         """
         number = max(len(share) for share, *_ in each if share.dim())
         found = None
@@ -141,7 +140,7 @@ class SeveralBeliefs(HumanModel):
                 continue
             own, place = [belief, values], None
             if number >= MANY_DRAWS and belief.dim() == DRAWS and len(belief) == 1:
-                # Beliefs that differ together are few one by one.
+                # Distinct joint beliefs are many, distinct single ones few.
                 first, place = distinct_rows(as_whole_numbers(belief[0]))
                 own = [part[:, first] for part in own]
             own = [part[rows] if _is_of(part, number, DRAWS + 1) else part for part in own]
@@ -162,12 +161,12 @@ class SeveralBeliefs(HumanModel):
 
 
 def _is_of(value: Tensor, draws: int, dimensions: int) -> bool:
-    """Whether a value is of so many draws, with at least so many dimensions."""
+    """True if a value has that many draws and at least that many dimensions."""
     return value.dim() >= dimensions and len(value) == draws
 
 
 def joined(views: Mapping[str, View]) -> View:
-    """Several views as one, which is the first with all masks of the others beside its own."""
+    """Join several views into one: the first, with all masks of the others added by name."""
     first = next(iter(views.values()))
 
     def together(kind: str) -> dict[str, Tensor]:
@@ -181,7 +180,7 @@ def joined(views: Mapping[str, View]) -> View:
 
 
 def parted(view: View) -> dict[str, View]:
-    """The views that were joined, by name."""
+    """Split a view from :func:`joined` into its parts by name."""
     found: dict[str, dict[str, dict[str, Tensor]]] = {}
     for kind in ("visible", "taken", "imagined"):
         for name, value in getattr(view, kind).items():
