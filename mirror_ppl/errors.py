@@ -1,8 +1,8 @@
 """Exceptions of this project, for errors that its user can correct.
 
 A command turns each of them into one line on stderr and exit status 2 (see `mirror_ppl.console`).
-Errors of the code itself stay `ValueError`, `TypeError` and so on. Messages say
-what was expected and what was given, in one printable line (see `shown`).
+Errors of the code itself stay `ValueError`, `TypeError` and so on. Messages say what was expected
+and what was given, in one printable line (see `shown`).
 """
 
 from collections.abc import Iterable

@@ -29,7 +29,7 @@ OF_PERSON = (TRUTH, MEASURED)
 NO_INDEX = -1
 """Stands for the actions and scenarios of padding, and for scenarios that are unknown."""
 ROUNDING = 1e-3
-"""By how much an entropy may be out of its range."""
+"""Amount by which an entropy may be out of its range."""
 A_NAME = f"printable text of at most {MOST_CHARACTERS} characters"
 """Requirement for ids and names of truths."""
 

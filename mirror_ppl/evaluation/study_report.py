@@ -234,4 +234,4 @@ REPORTS: dict[str, Callable[[Rows], Report]] = {
     "assistance": _assistance,
     "relevance": _relevance,
 }
-"""By study."""
+"""Makers of reports, by study."""
