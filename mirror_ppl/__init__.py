@@ -9,8 +9,8 @@
     decision = mirror_ppl.Communicator(fit, "person-01").plan(moment)
 
 The models are in `mirror_ppl.models`, the ways to fit them in `mirror_ppl.inference`, the worlds in
-`mirror_ppl.domains`. Nothing of it is imported before it is used, so that `import mirror_ppl` stays
-quick; Gymnasium (0.06 s beyond numpy) only learns the names under which it can make the worlds.
+`mirror_ppl.domains`. Modules are imported on first use, so that `import mirror_ppl` stays quick;
+only Gymnasium (0.06 s beyond numpy) is imported, to register the worlds.
 """
 
 from typing import TYPE_CHECKING as _TYPE_CHECKING

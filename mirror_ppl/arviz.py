@@ -1,4 +1,4 @@
-"""ArviZ without its announcement."""
+"""ArviZ, imported without the announcement of its next version."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.assist`, see :mod:`mirror_ppl.commands.assist`."""
+"""Entry point of `python -m mirror_ppl.assist`, see :mod:`mirror_ppl.commands.assist`."""
 
 from mirror_ppl.commands import call
 

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.calibrate`, see :mod:`mirror_ppl.commands.calibrate`."""
+"""Entry point of `python -m mirror_ppl.calibrate`, see :mod:`mirror_ppl.commands.calibrate`."""
 
 from mirror_ppl.commands import call
 

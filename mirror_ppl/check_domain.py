@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.check_domain`, see :mod:`mirror_ppl.commands.check_domain`."""
+"""Entry point of `mirror_ppl.check_domain`, see :mod:`mirror_ppl.commands.check_domain`."""
 
 from mirror_ppl.commands import call
 

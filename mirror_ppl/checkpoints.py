@@ -1,4 +1,4 @@
-"""Checkpoints of long work: what a run that was stopped goes on from."""
+"""Checkpoints of long work, from which a stopped run can continue."""
 
 import io
 import os
@@ -13,7 +13,7 @@ DIGEST = 32
 
 
 def save_checkpoint(path: str | os.PathLike[str], run: Any, content: dict[str, Any]) -> None:
-    """Write a checkpoint, whole or not at all.
+    """Write a checkpoint atomically.
 
     Args:
         path: the file.
@@ -27,7 +27,7 @@ def save_checkpoint(path: str | os.PathLike[str], run: Any, content: dict[str, A
 
 
 def checkpoint_content(run: Any, content: dict[str, Any]) -> memoryview:
-    """What the file of a checkpoint holds; arguments as of `save_checkpoint`."""
+    """Content of a checkpoint's file; arguments as of `save_checkpoint`."""
     import torch
 
     buffer = io.BytesIO()

@@ -1,8 +1,8 @@
-"""Arguments from Python as the package's own kinds, or an error that says what was expected.
+"""Checks and conversion of arguments from Python; errors say what was expected.
 
-Arrays may be torch tensors of any dtype, numpy arrays or lists of numbers. Whatever they are, what
-comes out is what a tensor of the package's own kind would have given: numbers in torch's default
-dtype, whole numbers as int64, flags as bool.
+Arrays may be torch tensors of any dtype, numpy arrays or lists of numbers. They are converted to
+tensors of the package's dtypes: numbers in torch's default dtype, whole numbers as int64, flags as
+bool.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Kind = TypeVar("Kind")
 
 
 def require_kind(value: Any, kind: type[Kind], name: str) -> Kind:
-    """The value if it is of that class.
+    """Return the value if it is of that class.
 
     Raises:
         InputError: it is not.
@@ -36,7 +36,7 @@ def require_kind(value: Any, kind: type[Kind], name: str) -> Kind:
 
 
 def require_methods(value: Any, methods: Iterable[str], name: str, what: str) -> None:
-    """Make sure that a user's own object has the methods that it needs.
+    """Check that a user's own object has the methods that it needs.
 
     Raises:
         InputError: it lacks one.
@@ -47,7 +47,7 @@ def require_methods(value: Any, methods: Iterable[str], name: str, what: str) ->
 
 
 def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
-    """The path of a file.
+    """Return a text or path as the path of a file.
 
     Raises:
         InputError: it is neither text nor a path.
@@ -64,7 +64,7 @@ def whole_number(
     most: int | None = None,
     error: type[MirrorError] = InputError,
 ) -> int:
-    """One whole number as an int: an int, or one of numpy's or torch's.
+    """Convert one whole number, of Python, numpy or torch, to an int.
 
     Raises:
         error: it is something else, True or False included, or beyond the limits.
@@ -83,19 +83,19 @@ def whole_number(
 
 
 def seed_number(value: Any, name: str = "seed") -> int:
-    """A seed as an int.
+    """Convert a seed to an int.
 
     Raises:
-        InputError: it is no whole number, or too large.
+        InputError: it is not a whole number, or too large.
     """
     return whole_number(value, name, 0, MOST_SEED)
 
 
 def real_number(value: Any, name: str, least: float, most: float = float("inf")) -> float:
-    """One number as a float, within limits.
+    """Convert one number within limits to a float.
 
     Raises:
-        InputError: it is no number, or beyond the limits.
+        InputError: it is not a number, or beyond the limits.
     """
     try:
         if isinstance(value, bool | str | bytes):
@@ -110,10 +110,10 @@ def real_number(value: Any, name: str, least: float, most: float = float("inf"))
 
 
 def as_tensor(value: Any, name: str, error: type[MirrorError] = InputError) -> Tensor:
-    """An array of numbers as a tensor, with the dtype and on the device that it has.
+    """Convert an array of numbers to a tensor; dtype and device stay.
 
     Raises:
-        error: it is no array of real numbers, or some of them are masked.
+        error: it is not an array of real numbers, or some of them are masked.
     """
     if isinstance(value, Tensor):
         if value.is_complex() or value.layout != torch.strided:
@@ -121,7 +121,7 @@ def as_tensor(value: Any, name: str, error: type[MirrorError] = InputError) -> T
         return value.detach()
     try:
         array = np.asarray(value)
-    except Exception:  # of numpy, or of what an object does to become an array
+    except Exception:  # of numpy, or of an object's conversion to an array
         raise error(f"{name} is {shown(value)}, expected an array of numbers") from None
     if array.dtype.kind not in "biuf":
         kind = f" of {array.dtype}" if array.ndim else ""
@@ -134,16 +134,16 @@ def as_tensor(value: Any, name: str, error: type[MirrorError] = InputError) -> T
 
 
 def numbers(value: Any, name: str, device: torch.device | None = None) -> Tensor:
-    """Numbers in torch's default dtype, as they are shaped.
+    """Convert numbers to torch's default dtype; the shape stays.
 
     Raises:
-        InputError: they are none.
+        InputError: they are not numbers.
     """
     return as_tensor(value, name).to(torch.get_default_dtype()).to(device)
 
 
 def whole_numbers(value: Any, name: str, device: torch.device | None = None) -> Tensor:
-    """Whole numbers as int64, as they are shaped.
+    """Convert whole numbers to int64; the shape stays.
 
     Raises:
         InputError: some are not whole, or True and False.
@@ -159,7 +159,7 @@ def whole_numbers(value: Any, name: str, device: torch.device | None = None) -> 
 
 
 def flags(value: Any, name: str, device: torch.device | None = None) -> Tensor:
-    """True or False as bool, as they are shaped; 1 and 0 will do.
+    """Convert True or False, or 1 or 0, to bool; the shape stays.
 
     Raises:
         InputError: some are neither.
@@ -173,7 +173,7 @@ def flags(value: Any, name: str, device: torch.device | None = None) -> Tensor:
 
 
 def require_shape(value: Tensor, shape: tuple[int, ...], name: str) -> None:
-    """Make sure that a tensor has that shape.
+    """Check that a tensor has that shape.
 
     Raises:
         InputError: it has another.
@@ -190,10 +190,10 @@ def require_keys(
     *,
     all_of_them: bool = True,
 ) -> Mapping[str, Any]:
-    """The mapping, if it has these keys, all of them or some, and no others.
+    """Return the mapping if it has these keys, all of them or some, and no others.
 
     Raises:
-        error: it is no mapping, or keys are missing or too many.
+        error: it is not a mapping, or keys are missing or too many.
     """
     keys = tuple(keys)
     if not isinstance(value, Mapping):
@@ -205,10 +205,10 @@ def require_keys(
 
 
 def listed(value: Any, name: str, what: str, error: type[MirrorError] = InputError) -> list[Any]:
-    """The entries of a list, tuple, range, array or other iterable.
+    """Return the entries of a list, tuple, range, array or other iterable.
 
     Raises:
-        error: it is none, or one text.
+        error: it is not an iterable, or one text.
     """
     if isinstance(value, np.ndarray | Tensor):
         value = value.tolist()

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.compare`, see :mod:`mirror_ppl.commands.compare`."""
+"""Entry point of `python -m mirror_ppl.compare`, see :mod:`mirror_ppl.commands.compare`."""
 
 from mirror_ppl.commands import call
 

@@ -2,11 +2,11 @@
 
 Implements the planner that the supplement calls CE (section B): sequences are drawn from a product
 of Bernoulli distributions, the best of them (the elites) move those distributions towards
-themselves, and so on. What is returned is the best sequence seen in any iteration, not a draw from
-the last distribution, so more iterations never make the answer worse.
+themselves, and so on. The result is the best sequence of all iterations, not a draw from the last
+distribution, so more iterations never make it worse.
 
-It knows nothing of driving: it maximizes any function of sequences. N stands for the sequences that
-are tried at a time; the other shape letters are those of `mirror_ppl.domains.base`.
+It maximizes any function of sequences. N stands for the sequences that are tried at a time; the
+other shape letters are those of `mirror_ppl.domains.base`.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class CrossEntropyOptions:
-    """How hard the cross-entropy method searches.
+    """Settings of the cross-entropy method.
 
     Args:
         samples: sequences tried in each iteration, N.
-        elites: how many of the best of them the distribution moves towards.
-        iterations: how often.
+        elites: number of the best of them, towards which the distribution moves.
+        iterations: number of iterations.
         smoothing: how far it moves, from 0 (not at all) to 1 (to the elites' frequencies).
         start_probability: of action 1 at every step, in the first iteration.
 
@@ -62,8 +62,8 @@ def best_sequences(
 ) -> tuple[Tensor, Tensor]:
     """Search for the sequence of binary actions that has the highest value.
 
-    Every element of the batch is searched with the same random numbers. So what is found for it
-    does not depend on what else is in the batch, and equal elements get equal answers.
+    Every element of the batch is searched with the same random numbers. So its result does not
+    depend on the rest of the batch, and equal elements get equal results.
 
     Args:
         value: maps sequences, boolean ``[*batch, N, H]``, to their values ``[*batch, N]``; higher
@@ -71,8 +71,8 @@ def best_sequences(
         batch: shape ``[...]`` of the problems that are solved at once.
         horizon: length H of a sequence.
         generator: source of randomness; its device is where the search happens.
-        options: how hard to search.
-        first: boolean ``[...]``, the first action where it is given and not searched for.
+        options: settings of the search.
+        first: boolean ``[...]``, the first action; searched for unless given.
 
     Returns:
         The best sequence found, boolean ``[..., H]``, and its value ``[...]``. Of several that are

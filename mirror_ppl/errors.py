@@ -1,8 +1,8 @@
-"""The exceptions that this project raises for what its user can put right.
+"""Exceptions of this project, for errors that its user can correct.
 
 A command turns each of them into one line on stderr and exit status 2 (see `mirror_ppl.console`).
-Mistakes of the code itself stay what they are: `ValueError`, `TypeError` and so on. Messages say
-what was expected and what was given, in one printable line (see `shown`).
+Errors of the code itself stay `ValueError`, `TypeError` and so on. Messages say what was expected
+and what was given, in one printable line (see `shown`).
 """
 
 from collections.abc import Iterable
@@ -11,15 +11,15 @@ from reprlib import repr as short_repr
 from typing import Any, Self
 
 MOST_CHARACTERS = 100
-"""What is expected of a name that a user chooses, such as a person's id."""
+"""Most characters of a name that a user chooses, such as a person's id."""
 SHOWN = 40
 """Characters of a longer text that a message shows."""
 
 
 def shown(value: Any) -> str:
-    """A value as a message shows it: short, printable, on one line.
+    """Format a value for a message: short, printable, on one line.
 
-    Of a long text only the beginning, of an array its shape, of other objects their class.
+    A long text is cut, an array is shown by its shape, other objects by their class.
     """
     shape = getattr(value, "shape", None)
     if isinstance(shape, tuple):
@@ -36,9 +36,9 @@ def shown(value: Any) -> str:
 
 
 def is_name(value: object) -> bool:
-    """Whether a value can be a name: printable text of at most 100 characters, not empty.
+    """True if a value can be a name: printable text of at most 100 characters, not empty.
 
-    Without spaces at its ends, which nobody sees.
+    Spaces at its ends are not allowed, as they are invisible.
     """
     if not isinstance(value, str) or value.strip() != value:
         return False
@@ -83,13 +83,13 @@ class UnknownNameError(MirrorError):
     # the report of an error that a worker process raised.
     @classmethod
     def of(cls, kind: str, name: str, known: Iterable[str], where: str = "") -> Self:
-        """The exception that says which names there are, and which of them was perhaps meant.
+        """Make the exception; its message lists the known names and the closest one.
 
         Args:
             kind: what the name stands for, such as "domain".
             name: the name that was given.
             known: the names that would have been right.
-            where: the domain, if it is another in others.
+            where: the domain, if names differ between domains.
         """
         names = sorted(known)
         place = f" in {where}" if where else ""
@@ -126,7 +126,7 @@ class OutputError(MirrorError):
 
 
 class WorkerError(MirrorError):
-    """Raised where a process that shares the work was ended from outside."""
+    """Raised if a worker process was killed."""
 
 
 class CheckpointError(MirrorError):
@@ -137,8 +137,8 @@ class CheckpointError(MirrorError):
 
 
 class StaleSelfModel(UserWarning):
-    """A world of somebody's own has changed since its self-model was trained."""
+    """Warns that a user's world has changed since its self-model was trained."""
 
 
 class UnreliableWeights(UserWarning):
-    """Importance weights of somebody are not to be relied on."""
+    """Warns that a person's importance weights are not reliable."""

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.evaluate`, see :mod:`mirror_ppl.commands.evaluate`."""
+"""Entry point of `python -m mirror_ppl.evaluate`, see :mod:`mirror_ppl.commands.evaluate`."""
 
 from mirror_ppl.commands import call
 

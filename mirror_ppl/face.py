@@ -1,6 +1,6 @@
-"""What most users need: infer people from recordings, look at them, plan what to tell them.
+"""The main interface: infer people from recordings, plot them, and plan messages to them.
 
-The names here are those of the package itself, as in ``mirror_ppl.infer``. Commands call them, too.
+Its names are those of the package itself, as in ``mirror_ppl.infer``. Commands call them, too.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ __all__ = [
 ]
 
 KEPT = ("means", "draws")
-"""What may be kept of predictions."""
+"""Forms in which predictions may be kept."""
 SHIPPED = "the people that ship"
 """Recordings of :func:`infer` unless others are given."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
@@ -74,15 +74,15 @@ RESULTS = ("summary.json", "posterior.nc", *FILES)
 
 @dataclass(frozen=True, repr=False)
 class Fit(fitting.Fit):
-    """What was inferred of P people.
+    """A fit of P people: the posterior, predictions and checks.
 
     Attributes:
         human: the human model.
-        train: the rounds that were learned from.
-        posterior: draws ``[S, P, 1, ...]`` by site, and how they came about.
+        train: the training rounds.
+        posterior: draws ``[S, P, 1, ...]`` by site, and how they were obtained.
         data: posterior, predictions and recordings as ArviZ ``InferenceData``.
         summary: the numbers that `summary.json` holds.
-        seconds: of processors that it took, by stage.
+        seconds: processor seconds by stage.
     """
 
     def __repr__(self) -> str:
@@ -103,17 +103,17 @@ class Fit(fitting.Fit):
 
     @cached_property
     def plot(self) -> FitPlots:
-        """The pictures of this fit, such as ``fit.plot.sight()``."""
+        """Figures of this fit, such as ``fit.plot.sight()``."""
         return FitPlots(self.data)
 
     @property
     def check(self) -> pd.DataFrame:
-        """Whether the model explains each person: verdict, reasons, held-out NLLs, p-values.
+        """Model check, one row per person: verdict, reasons, held-out NLLs, p-values.
 
-        A row a person. ``nll`` (nats an action of held-out rounds) stands beside ``nll_base_rate``
-        (by how often they did each action before) and ``nll_no_implants`` (if they were the robot);
-        p-values are near 0 where there is more of something than the model says, near 1 where less.
-        Of the human model ``all``, ``p(<model>)`` are the probabilities of its models.
+        ``nll`` (nats an action of held-out rounds) stands beside ``nll_base_rate`` (of the base
+        rate of each action) and ``nll_no_implants`` (if the person were the robot). p-values are
+        near 0 where there is more of something than the model predicts, near 1 where there is less.
+        With the human model ``all``, ``p(<model>)`` are the probabilities of its models.
         """
         import pandas as pd
 
@@ -130,10 +130,10 @@ class Fit(fitting.Fit):
         return pd.DataFrame(rows, index=pd.Index(self.people, name="person"))
 
     def person(self, name: str | None = None) -> FittedPerson:
-        """One of the people; the only one unless named.
+        """Select one of the people; the only one unless named.
 
         Raises:
-            UnknownNameError: there is nobody of that id.
+            UnknownNameError: no person has that id.
             InputError: there are several people, and none is named.
         """
         if name is None and len(self.people) > 1:
@@ -148,11 +148,11 @@ class Fit(fitting.Fit):
         """Write ``posterior.nc``, ``summary.json`` and the pictures, all of them or none.
 
         Args:
-            folder: where to; files of an older fit are replaced.
-            told: what ``summary.json`` says besides.
+            folder: the folder; files of an older fit are replaced.
+            told: additional entries of ``summary.json``.
 
         Returns:
-            What each picture shows, by file name.
+            Descriptions of the pictures, by file name.
 
         Raises:
             OutputError: a file cannot be written.
@@ -171,8 +171,8 @@ class Fit(fitting.Fit):
             **{folder / name: content for name, content in drawn.items()},
             folder / "summary.json": json_text(summary),
         }
-        # Those of an older fit go first: it may have drawn what this one does not, and results of
-        # a fit that is killed here cannot be taken for whole without their summary.
+        # Files of an older fit go first: it may have drawn pictures that this one does not, and
+        # without a summary the results of a fit that is killed here do not look complete.
         write_together(contents, remove=[folder / name for name in RESULTS])
         return {name: shows for name, (_, shows) in pictures.items()}
 
@@ -182,8 +182,8 @@ class FittedPerson:
     """One person of a fit.
 
     Attributes:
-        fit: that they are of.
-        name: their id.
+        fit: the fit.
+        name: id of the person.
     """
 
     fit: Fit
@@ -199,12 +199,12 @@ class FittedPerson:
 
     @property
     def number(self) -> int:
-        """Which of the people this is, from 0."""
+        """Index of the person in the fit, from 0."""
         return self.fit.people.index(self.name)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Their part of the fit's summary."""
+        """The person's part of the fit's summary."""
         return self.fit.summary["people"][self.number]
 
     @property
@@ -221,7 +221,7 @@ class FittedPerson:
         return {name: value[:, own] for name, value in self.fit.posterior.draws.items()}
 
     def listener(self, draws: int = 64) -> Person:
-        """The person to plan messages for, of so many draws, spread evenly over all there are."""
+        """Make the person to plan messages for, with ``draws`` evenly spaced posterior draws."""
         held = len(next(iter(self.fit.posterior.draws.values())))
         number = min(whole_number(draws, "draws", *LIMITS["draws"]), held)
         chosen = [round(place * (held - 1) / max(number - 1, 1)) for place in range(number)]
@@ -235,14 +235,14 @@ class Communicator(PlannedCommunicator):
         fit: what :func:`infer` returned.
         person: id; the only one unless named.
         planner: ``mirror`` (reward, in the domain's simulator), ``mirror-self-model`` (reward, in
-            what the robot learned of the world) or ``mirror-kl`` (beliefs near to the robot's).
+            the robot's learned model of the world) or ``mirror-kl`` (beliefs near the robot's).
         draws: posterior draws to plan with; 20 to 100 are enough.
         seed: of everything random; the same seed and round give the same decision.
         settings: of the planner, see :class:`PlannerOptions`; those of the domain unless given.
 
     Raises:
-        InputError: the fit is of several people and none is named, or an argument is something
-            else.
+        InputError: the fit is of several people and none is named, or an argument is of another
+            kind.
         UnknownNameError: there is no such person, planner or setting.
     """
 
@@ -278,10 +278,10 @@ def load_recordings(
 
     Args:
         path: the file.
-        domain: of the shipped recordings, ``driving`` unless given. Of a file it is checked; a
-            world of your own is made known by ``path/to/file.py:Class``, whose code is run.
-        setting: of the shipped recordings, the one in which people see less unless given. Of a
-            file it is checked.
+        domain: of the shipped recordings, ``driving`` unless given. That of a file is checked; a
+            world of your own is loaded by ``path/to/file.py:Class``, whose code is run.
+        setting: of the shipped recordings, the one in which people see less unless given. That of a
+            file is checked.
         population: of the shipped recordings, ``paper`` unless given.
 
     Raises:
@@ -338,44 +338,44 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     Args:
         recordings: rounds of P people, or a file of them; simulated people that ship unless given
             (people are chosen by ``recordings.select_people``).
-        domain: the world that the recordings are of, if it is one of your own: it, its class, or
+        domain: the world of the recordings, if it is your own: an object, its class, or
             ``path/to/file.py:Class``, whose code is run.
         human: the human model: an object or a class, one of the package's names (such as
             ``one-radius``) or ``path/to/file.py:Class``; the package's own for the domain unless
             given.
         engine: one of ``mirror_ppl.inference.engines.ENGINES``; ``auto`` is the amortized guide
-            where a network of this human model is there and its draws can be relied on, and
-            ``importance`` otherwise; each person's part of the summary says which.
+            where there is a network of this human model and its draws are reliable, and
+            ``importance`` otherwise; each person's part of the summary names the engine.
         pooling: ``none``, or ``partial`` to infer the population that the people are from, too.
         seed: of everything random: the same seed gives the same fit.
         draws: posterior draws S of each person.
         train_rounds: how many rounds of each person to learn from; see
             :func:`mirror_ppl.inference.results.fitting.split_rounds`.
         settings: of the engine, such as ``{"steps": 500}``; its own unless given.
-        refine: gradient steps on each person's rounds that refine what a network proposes.
+        refine: gradient steps on each person's rounds that refine a network's proposal.
         explore: rounds that the model plays in each scenario, to find the most informative one; 0
-            leaves it out.
+            for none.
         allow_contradictions: share of steps, from 0 to 1, that may contradict the next observation.
         prior_from: a file of a fit with ``pooling="partial"``, whose population is the prior.
         guide_file: network of ``auto`` and ``amortized``; the one that ships unless given.
         self_model: the robot's networks, or a file of them; those that ship unless given. Not with
             a human model that is an object, which has its own.
         device: where to compute: cpu, cuda or cuda:0.
-        jobs: processes that share the people; -1 for one a core, None for as many as pay. Results
-            do not depend on it. The engines svi and nuts infer people together, in one process.
+        jobs: processes that share the people; -1 for one per core, None to choose by the work.
+            Results do not depend on it. The engines svi and nuts use one process for all people.
         scheduler: address of a Dask cluster that does the work instead, such as
             ``tcp://host:8786``.
         keep: of predicted held-out actions, ``means`` over draws or ``draws``; with ``draws`` also
             all sites of the prior, not only those that are one number a person.
-        report: told of progress; shown on stderr if that is a terminal unless given.
+        report: called with the progress; shown on stderr, if that is a terminal, unless given.
         checkpoint: file to continue from; written on the way, and kept.
 
     Warns:
-        UnreliableWeights: importance weights of somebody are not to be relied on.
+        UnreliableWeights: importance weights of a person are not reliable.
 
     Raises:
         InputError: an argument of another kind.
-        MirrorError: what was asked for cannot be done; its kinds are those of
+        MirrorError: the fit is not possible; its kinds are those of
             :func:`mirror_ppl.inference.results.fitting.fit_people`.
     """
     if recordings is None:
@@ -444,7 +444,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
 
 
 def _doubtful(summary: Mapping[str, Any]) -> list[str]:
-    """Ids of people whose importance weights are not to be relied on."""
+    """Ids of people whose importance weights are not reliable."""
     return [
         person["id"]
         for person in summary["people"]
@@ -457,7 +457,7 @@ def _human(
     self_model: SelfModel | str | Path | None,
     domain: str,
 ) -> HumanModel:
-    """The human model of recordings of that domain."""
+    """Make the human model for recordings of a domain."""
     if isinstance(human, HumanModel):
         if self_model is not None:
             raise InputError("self_model is for a human model that is to be made; this one has one")

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and files that are read whole."""
+"""Atomic writing of files, and reading of whole files."""
 
 import errno
 import json
@@ -24,14 +24,14 @@ except ImportError:  # not a POSIX system: files are written whole there, but no
 PARTIAL = ".partial"
 """Suffix of files that are being written."""
 LOCK = ".lock"
-"""Name of the file that a process holds while it alone writes in a folder."""
+"""Name of the file that a process locks while it alone writes in a folder."""
 
 
 Content = bytes | memoryview | str
 
 
 def write_whole(path: str | os.PathLike[str], content: Content) -> Path:
-    """Write a file such that readers see its old content or all of the new, never a part.
+    """Write a file atomically: readers see its old content or all of the new, never a part.
 
     Args:
         path: the file to write; a link is followed.
@@ -51,19 +51,18 @@ def write_together(
     contents: Mapping[str | os.PathLike[str], Content] | Mapping[Path, Content],
     remove: Iterable[Path] = (),
 ) -> None:
-    """Write several files, all of them or none, each whole.
+    """Write several files atomically, all of them or none.
 
-    Temporary files in the same folders are filled, and then take the files' places. Folders that
-    are missing are created. On any failure, interruption included, old files are as before and
-    nothing new is left behind. A process that is killed in the moment in which files take their
-    places may leave some of the new ones, each whole; temporary files that it leaves are removed by
-    the next `output_folder`.
+    Temporary files in the same folders are written, and then renamed. Folders that are missing are
+    created. On any failure, interruption included, old files are as before and nothing new is left
+    behind. A process that is killed during the renaming may leave some of the new files, each
+    complete; temporary files that it leaves are removed by the next `output_folder`.
 
     Content is made in memory first: libraries that write files themselves report a full disk in
     many ways, one of which is to crash.
 
     Args:
-        contents: of each file all that will be in it; links are followed, text becomes UTF-8.
+        contents: complete content of each file; links are followed, text becomes UTF-8.
         remove: older files that are out of date when these are written.
 
     Raises:
@@ -123,7 +122,7 @@ def write_together(
 
 
 def read_whole(path: str | os.PathLike[str], failure: type[MirrorError]) -> bytes:
-    """Everything that is in a regular file.
+    """Read the whole content of a regular file.
 
     Pipes and devices are refused: reading them may never end.
 
@@ -152,7 +151,7 @@ def json_text(content: Any) -> str:
 
 
 def plain(content: Any) -> Any:
-    """Values that strict JSON has: of numpy's numbers and arrays, paths, dataclasses."""
+    """Convert numpy's numbers and arrays, paths and dataclasses to values of strict JSON."""
     if hasattr(content, "tolist"):  # of numpy or torch
         content = content.tolist()
     if isinstance(content, float):
@@ -175,18 +174,18 @@ def output_folder(
     lock: str = LOCK,
     parts: Sequence[str] = (),
 ) -> Iterator[Path]:
-    """A folder in which this process alone writes its results; a context around long work.
+    """Lock a folder in which this process alone writes its results; a context around long work.
 
     It is created where it is missing, and removed again if the work fails before anything is in it.
-    What cannot be written is found out first. Temporary files of killed processes are removed. The
-    lock is a file that names its process; the operating system gives it up when that process ends,
-    however it ends.
+    Results that cannot be written are detected first. Temporary files of killed processes are
+    removed. The lock is a file that names its process; the operating system releases it when that
+    process ends, however it ends.
 
     Args:
         path: the folder.
         names: of the files that will be written in it.
-        lock: name of the lock; another than the folder's where files of one folder are the results
-            of several commands, see `lock_of`.
+        lock: name of the lock; another than the folder's where several commands write their results
+            in one folder, see `lock_of`.
         parts: names of folders in it that will hold parts of the results.
 
     Yields:
@@ -194,8 +193,8 @@ def output_folder(
 
     Raises:
         OutputError: it cannot be created or written, something that is not a regular file has the
-            name of a result, or another process is at work on these results; says which. Nothing is
-            left behind.
+            name of a result, or another process, named in the message, writes these results.
+            Nothing is left behind.
     """
     folder = Path(path)
     for name in names:
@@ -245,7 +244,7 @@ def _sole_use(path: Path) -> Iterator[None]:
 def require_files_of_their_own(
     outputs: Mapping[str, Path | None], inputs: Mapping[str, Sequence[Path | None]]
 ) -> list[Path]:
-    """Make sure that files to write are neither something else that was named nor folders.
+    """Check that files to write are regular files, and named by no other option.
 
     Args:
         outputs: files to write, by the option that names them; ``None`` where none does.
@@ -279,7 +278,7 @@ def _require_file(target: Path, named: str | os.PathLike[str]) -> None:
     except FileNotFoundError:
         return
     except (OSError, ValueError) as error:
-        # What is in the way of a folder is reported when the folder is made.
+        # A file in the place of a folder is reported when the folder is made.
         if isinstance(error, NotADirectoryError):
             return
         raise OutputError(f"cannot write {named}: {_reason(error)}") from error
@@ -298,7 +297,7 @@ def _short(name: str) -> str:
 
 
 def _locked_temporary(target: Path) -> tuple[Path, BinaryIO]:
-    """A new file that is locked as long as it is open, so that nobody takes it for abandoned."""
+    """Make a file that is locked while it is open, so that no process counts it as abandoned."""
     while True:
         path = _temporary_beside(target)
         # Created here, not by tempfile, so that it gets the permissions of any other new file.
@@ -316,7 +315,7 @@ def _remove_abandoned(folder: Path) -> None:
 
 
 def _lock(file: BinaryIO) -> bool | None:
-    """Whether this process holds the file's lock now; None where there are no locks."""
+    """True if this process now holds the file's lock; None where there are no locks."""
     if fcntl is None:
         return None
     try:
@@ -331,14 +330,14 @@ def _lock(file: BinaryIO) -> bool | None:
 
 
 def _held(path: Path) -> BinaryIO | None:
-    """The lock, open and held; None where another process holds it."""
+    """Open and lock a file; None where another process holds it."""
     while True:
         file = path.open("a+b")
         try:
             if _lock(file) is False:
                 file.close()
                 return None
-            # Whoever held it before may have removed it in between.
+            # The process that held it before may have removed it in between.
             if os.fstat(file.fileno()).st_nlink:
                 file.truncate(0)
                 file.write(f"process {os.getpid()} on {node()}\n".encode())
@@ -376,7 +375,7 @@ def _make_folder(folder: Path) -> list[Path]:
 
 def _remove_folders(made: list[Path]) -> None:
     for folder in reversed(made):
-        # Not empty any more: somebody else uses it by now.
+        # Not empty any more: another process uses it by now.
         with suppress(OSError):
             folder.rmdir()
 

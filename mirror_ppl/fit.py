@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.fit`, see :mod:`mirror_ppl.commands.fit`."""
+"""Entry point of `python -m mirror_ppl.fit`, see :mod:`mirror_ppl.commands.fit`."""
 
 from mirror_ppl.commands import call
 

@@ -1,4 +1,4 @@
-"""Resumable work in cells: a run that is stopped goes on where it was.
+"""Resumable work in cells: a run that was stopped continues where it was.
 
 A cell is a frozen dataclass of plain values. Its result is kept in a file of its own, named by a
 hash of the cell and of everything else that the result depends on. A file of another cell, another
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 DISPATCHED = 2
-"""Cells for each process that have been handed out when one of them kills its process."""
+"""Cells that have been dispatched per process when one of them kills its process."""
 FILE = re.compile(r"[0-9a-f]{24}\.(json|nc|pt)")
-"""Names of the files of results."""
+"""Pattern of the names of result files."""
 
 
 class Cell(Protocol):
@@ -41,21 +41,21 @@ class Cell(Protocol):
 
     @property
     def label(self) -> str:
-        """What it is, for people who wait."""
+        """Name in progress messages."""
         ...
 
 
 class Format(Protocol[Result]):
-    """How results are kept in files."""
+    """File format of results."""
 
     suffix: str
 
     def write(self, result: Result, about: dict[str, Any]) -> Content:
-        """The content of a file of a result, and of plain values about it."""
+        """Return a file's content for a result and plain values about it."""
         ...
 
     def read(self, path: Path) -> tuple[Result, dict[str, Any]]:
-        """A result and what is known about it; any exception of a damaged file."""
+        """Read a result and the values about it; any exception if the file is damaged."""
         ...
 
 
@@ -63,7 +63,7 @@ class JsonFormat(Generic[Result]):
     """Results of plain values and dataclasses, as JSON.
 
     Args:
-        decode: makes a result of what JSON holds; plain values are the result unless given.
+        decode: makes a result of plain values from JSON; they are the result unless given.
     """
 
     suffix = ".json"
@@ -72,11 +72,11 @@ class JsonFormat(Generic[Result]):
         self.decode = decode
 
     def write(self, result: Result, about: dict[str, Any]) -> str:
-        """See `Format`."""
+        """Return a file's content, see `Format`."""
         return json.dumps(about | {"result": result}, indent=1, default=asdict) + "\n"
 
     def read(self, path: Path) -> tuple[Result, dict[str, Any]]:
-        """See `Format`."""
+        """Read a result, see `Format`."""
         about = json.loads(path.read_text())
         return self.decode(about.pop("result")), about
 
@@ -87,11 +87,11 @@ class DatasetFormat:
     suffix = ".nc"
 
     def write(self, result: xr.Dataset, about: dict[str, Any]) -> Content:
-        """See `Format`."""
+        """Return a file's content, see `Format`."""
         return result.assign_attrs(about=json.dumps(about)).to_netcdf(engine="h5netcdf")
 
     def read(self, path: Path) -> tuple[xr.Dataset, dict[str, Any]]:
-        """See `Format`."""
+        """Read a result, see `Format`."""
         from mirror_ppl.netcdf import read_netcdf
 
         data = read_netcdf(path, PosteriorError)["/"]
@@ -104,23 +104,23 @@ class TensorFormat:
     suffix = ".pt"
 
     def write(self, result: dict[str, Any], about: dict[str, Any]) -> Content:
-        """See `Format`."""
+        """Return a file's content, see `Format`."""
         return checkpoint_content("", {"result": result, "about": about})
 
     def read(self, path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-        """See `Format`."""
+        """Read a result, see `Format`."""
         content = read_checkpoint(path, "")
         return content["result"], content["about"]
 
 
 @dataclass(frozen=True)
 class Outcome(Generic[Result]):
-    """What came of a cell.
+    """Outcome of a cell.
 
     Attributes:
-        cell: which it is.
+        cell: the cell.
         result: of the work; ``None`` if it failed.
-        seconds: that it took, by the process that did it.
+        seconds: of work in its process.
         error: why it failed, and where.
     """
 
@@ -132,12 +132,12 @@ class Outcome(Generic[Result]):
 
 @dataclass(frozen=True)
 class Runner:
-    """Does the work of cells that is not done yet.
+    """Runs cells that are not finished yet.
 
     Attributes:
         folder: where results of finished cells are kept; none are kept unless given.
-        identity: of everything that the result of a cell depends on and that is not in the cell.
-        jobs: processes on this machine; 1 for this one, -1 for one a core.
+        identity: identifies everything besides a cell that its result depends on.
+        jobs: processes on this machine; 1 for this one, -1 for one per core.
         scheduler: address of a Dask cluster that does the work instead.
         keep_going: when a cell fails, report it in its outcome and go on with the others, instead
             of ending with its exception. Results of finished cells are kept in both cases.
@@ -158,18 +158,18 @@ class Runner:
         form: Format[Result] | None = None,
         given: Callable[[Any], Any] | None = None,
     ) -> list[Outcome[Result]]:
-        """Do the work of every cell that is not done yet.
+        """Run every cell that is not finished yet.
 
-        Where a process is killed, the cells that may be why are tried again one at a time.
+        If a process is killed, the cells that may be the cause are tried again one at a time.
 
         Args:
             cells: in the order in which they are begun.
             work: of one cell; can be pickled if other processes do it.
             form: of results in files; JSON unless given.
-            given: what the work gets in place of the cell, made when its turn comes.
+            given: makes the argument of the work from the cell, when its turn comes.
 
         Returns:
-            One outcome a cell, in their order.
+            One outcome per cell, in their order.
 
         Raises:
             OptionError: the cluster's library is not installed, or it cannot be reached.
@@ -256,7 +256,7 @@ def _done(
 
 
 def _kept(path: Path | None, cell: Cell, form: Format[Result]) -> Outcome[Result] | None:
-    """What an earlier run left of a cell; what is damaged counts as missing."""
+    """Read an earlier run's result of a cell; a damaged one counts as missing."""
     if path is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Limits of numbers that users give, and of the memory that they ask for."""
+"""Limits of users' numbers, and of the memory that they need."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from mirror_ppl.errors import OptionError
 
 MOST_SEED = 2**32 - 1
-"""Seeds are numbers from 0 to this one, everywhere; what they are mixed with fits into 64 bits."""
+"""Largest seed, in every command; mixed with other numbers, seeds fit into 64 bits."""
 LIMITS: Mapping[str, tuple[int, int]] = {
     "seed": (0, MOST_SEED),
     "people_seed": (0, MOST_SEED),
@@ -36,12 +36,12 @@ def check_numbers(options: Any, *names: str, **least: int) -> None:
     """Refuse whole numbers outside of their limits.
 
     Args:
-        options: has them as attributes; ``None`` and tuples of several numbers are fine.
+        options: object with the numbers as attributes; ``None`` and tuples are allowed.
         names: of the options.
-        least: names of options whose least value is another here.
+        least: least values by name, for options with another one here.
 
     Raises:
-        OptionError: one is less or greater; says what it may be.
+        OptionError: a number is out of its limits; the message names them.
     """
     for name in (*names, *least):
         value = getattr(options, name)
@@ -60,10 +60,10 @@ def check_numbers(options: Any, *names: str, **least: int) -> None:
 
 
 def share(text: str, option: str) -> float:
-    """A share from 0 to 1, of a percentage such as "2.5%".
+    """Convert a percentage such as "2.5%" to a share from 0 to 1.
 
     Raises:
-        OptionError: it is none; says what is expected.
+        OptionError: the text is not a percentage; the message says what is expected.
     """
     try:
         # A number alone might be meant as a share.
@@ -76,14 +76,14 @@ def share(text: str, option: str) -> float:
 
 
 def require_memory(needed: int, what: str) -> None:
-    """Refuse what does not fit into the memory that is free.
+    """Refuse work that does not fit into free memory.
 
     Args:
         needed: bytes.
         what: for the message, such as "rounds of so many people".
 
     Raises:
-        OptionError: there is less; says how much.
+        OptionError: less memory is free; the message says how much.
     """
     free = free_memory()
     if free is not None and needed > free:
@@ -94,7 +94,7 @@ def require_memory(needed: int, what: str) -> None:
 
 
 def free_memory() -> int | None:
-    """Bytes that this process may still use; None where nobody says."""
+    """Bytes of memory that this process may still use; None where unknown."""
     free = []
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()

@@ -1,7 +1,7 @@
-"""Reading netCDF files that may be damaged, and that other software may have written.
+"""Reading of netCDF files that may be damaged, and that other software may have written.
 
-The HDF5 library neither ends nor fails on some damaged files, and crashes on others. So another
-process tries first.
+The HDF5 library hangs on some damaged files, and crashes on others, so another process reads them
+first.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ ENGINES = {b"\x89HDF\r\n\x1a\n": "h5netcdf", b"CDF": "scipy"}
 """First bytes of a file, and the xarray engine that reads it: netCDF-4 is HDF5; netCDF-3 is what
 xarray writes where it finds nothing but scipy."""
 MOST_COMPRESSED = 1032
-"""Bytes that deflate makes of one at most, by its format."""
+"""Most bytes that deflate can make of one, by its format."""
 SMALL = 2**24
-"""Bytes that a file may declare however small it is."""
+"""Bytes that any file may declare, however small."""
 SECONDS, BYTES_PER_SECOND = 3.0, 2**26
-"""Time of a processor after which reading counts as endless: for any file, and for so many bytes
-that it declares more."""
+"""Processor time after which reading counts as endless: seconds for any file, and declared bytes
+for each second more."""
 IMPORTS = 2.0
-"""Time of a processor that a new process needs for its libraries."""
+"""Processor seconds that a new process needs to import its libraries."""
 START, SLOW = 20.0, 20.0
-"""Seconds that another process may take to start, and how much slower a busy machine may be."""
+"""Seconds that another process may take to start, and allowed slowdown of a busy machine."""
 READ_ALL = """
 import io, resource, sys
 most, seconds = int(sys.argv[1]), int(sys.argv[2])
@@ -59,17 +59,17 @@ with h5py.File(io.BytesIO(sys.stdin.buffer.read())) as file:
         for part in data:
             part[()]
 """
-"""A program that reads all of a netCDF-4 file, if it declares no more than so many bytes."""
+"""A program that reads all of a netCDF-4 file, if it declares at most a given number of bytes."""
 
 
 def read_netcdf(
     path: str | os.PathLike[str], failure: type[MirrorError], groups: Iterable[str] = ("/",)
 ) -> dict[str, xr.Dataset]:
-    """Groups of a netCDF file, in memory.
+    """Read groups of a netCDF file into memory.
 
     Args:
         path: the file.
-        failure: what to raise.
+        failure: class of the exception to raise.
         groups: their names; those that the file lacks are left out.
 
     Raises:
@@ -99,7 +99,7 @@ def read_netcdf(
 
 @cache
 def _import_libraries() -> None:
-    """Here, as other processes would import them time and again."""
+    """Import libraries in this process, or each other process would import them again."""
     import h5netcdf  # noqa: F401
     from xarray.backends import list_engines
 
@@ -109,7 +109,7 @@ def _import_libraries() -> None:
 def _read(
     content: bytes, engine: str, groups: tuple[str, ...], allow: Callable[[int], object]
 ) -> dict[str, xr.Dataset]:
-    """The groups; `allow` is called with the bytes that the file declares, before they are read."""
+    """Read the groups; `allow` is called before with the bytes that the file declares."""
     import xarray as xr
 
     if engine == "h5netcdf":
@@ -119,7 +119,7 @@ def _read(
         groups = tuple(group for group in groups if group == "/")
     found = {}
     with warnings.catch_warnings():
-        # Of oddities in a file that can be read all the same.
+        # For oddities in a file that can still be read.
         warnings.simplefilter("ignore")
         for group in groups:
             # From memory, because the libraries leave a damaged file open. Without
@@ -135,7 +135,7 @@ def _read(
 
 
 def _checked_groups(content: bytes, groups: tuple[str, ...]) -> tuple[tuple[str, ...], int]:
-    """Those of the groups that are there, and the bytes that the file declares.
+    """Return the groups that exist, and the bytes that the file declares.
 
     Raises:
         ValueError: it declares more than can be in it.
@@ -165,12 +165,12 @@ def _most(content: bytes) -> int:
 
 
 def _ends(read: Callable[[Callable[[int], object]], object], content: bytes) -> bool:
-    """Whether reading comes to an end, with a result or an exception, in another process."""
+    """True if reading ends in another process, with a result or an exception."""
     most = START + SLOW * (SECONDS + _most(content) / BYTES_PER_SECOND)
     others = {thread.name for thread in threading.enumerate()} - {"MainThread", WATCH}
     if hasattr(os, "fork") and not others:
         return _forked(read, most)
-    # A copy of a process with threads may wait for ever for what another thread holds. A new one
+    # A fork of a process with threads may wait forever for a lock of another thread. A new process
     # takes longer to start.
     limit = math.ceil(IMPORTS + SECONDS + _most(content) / BYTES_PER_SECOND)
     command = [sys.executable, "-c", READ_ALL, str(_most(content)), str(limit), *sys.path]
@@ -180,7 +180,7 @@ def _ends(read: Callable[[Callable[[int], object]], object], content: bytes) -> 
         )
     except subprocess.TimeoutExpired:
         return False
-    except OSError:  # there is no program of Python
+    except OSError:  # there is no Python executable
         return True
     return done.returncode >= 0
 
@@ -215,7 +215,7 @@ def _try(read: Callable[[Callable[[int], object]], object], end: int) -> None:
         faulthandler.disable()
         with suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-        # Of the processor's time, so that a busy machine makes no difference.
+        # Processor time, so that a busy machine makes no difference.
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
         with suppress(BaseException):

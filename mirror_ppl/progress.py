@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 Report = Callable[[str, int, int, str], None]
-"""Told of long work: what it is, how many steps are done, of how many, and a message."""
+"""Called with the name of long work, steps that are done, all steps, and a message."""
 
 
 def silent(name: str, done: int, total: int, message: str) -> None:
@@ -20,12 +20,12 @@ def silent(name: str, done: int, total: int, message: str) -> None:
 
 
 class Progress:
-    """Shows on stderr how far long work has come; a context manager.
+    """Shows the progress of long work on stderr; a context manager.
 
     On a terminal it is a bar with the time elapsed and remaining. Elsewhere (a file, a pipe, a
     notebook) it is plain lines such as `fit: 120/300 loss 12.3, 8 s, 12 s left`: at most one in
-    `interval` seconds, and one for the last state when the work ends or fails. Cheap enough to be
-    told about every step.
+    `interval` seconds, and one for the last state when the work ends or fails. It is cheap enough
+    to be updated at every step.
 
     Args:
         name: what is being done, such as "fit".
@@ -69,9 +69,9 @@ class Progress:
 
     @property
     def left(self) -> float | None:
-        """Seconds that the rest will take if it goes on like this; None as long as nobody knows.
+        """Estimated seconds that the rest will take; None while unknown.
 
-        By all that was done in this run: steps can take minutes, and each another time.
+        The estimate uses all steps of this run: steps can take minutes, and differ in duration.
         """
         done = self.done - self._begun
         if self.total is None or done < 1:
@@ -80,7 +80,7 @@ class Progress:
         return max(0.0, estimate - (monotonic() - self._last))
 
     def resume(self, done: int) -> None:
-        """Tell how many steps an earlier run did; what is left is not reckoned by those."""
+        """Set the steps of an earlier run, which do not enter the estimate of the time left."""
         self._resume(done)
         self.done = done
         if self._display is not None:
@@ -99,7 +99,7 @@ class Progress:
         return self
 
     def _show(self) -> None:
-        """Tell how far it is; work goes on if nobody can be told any more."""
+        """Show the progress; work goes on if the stream is closed."""
         assert self._display is not None
         try:
             self._display.show(self)
@@ -121,7 +121,7 @@ class Progress:
                     display.close()
 
     def update(self, done: int, message: str = "") -> None:
-        """Tell that `done` steps are done in all, with a message such as "loss 12.3"."""
+        """Report that `done` steps are done in all, with a message such as "loss 12.3"."""
         now = monotonic()
         self.done, self.message, self._last = done, message, now
         if self._display is not None and now >= self._next:
@@ -130,18 +130,18 @@ class Progress:
             self._show()
 
     def advance(self, message: str = "") -> None:
-        """Tell that one more step is done."""
+        """Report that one more step is done."""
         self.update(self.done + 1, message)
 
 
 class Reported(Progress):
-    """Tells a report instead of a terminal, in units of which each step does several.
+    """Calls a report instead of showing progress, in units of which each step does several.
 
     Args:
-        name: what is being done.
+        name: of the work.
         total: units in all.
         each: units of a step; the last one may have fewer.
-        report: told of units done.
+        report: called with the units that are done.
     """
 
     def __init__(self, name: str, total: int, each: int, report: Report) -> None:
@@ -149,12 +149,12 @@ class Reported(Progress):
         self._each, self._report = each, report
 
     def resume(self, done: int) -> None:
-        """Tell how many steps an earlier run did."""
+        """Set the number of steps of an earlier run."""
         super().resume(done)
         self._tell()
 
     def update(self, done: int, message: str = "") -> None:
-        """Tell that `done` steps are done in all."""
+        """Report that `done` steps are done in all."""
         super().update(done, message)
         self._tell()
 
@@ -178,7 +178,7 @@ class Stages:
             self.progress = None
 
     def report(self, name: str, done: int, total: int, message: str) -> None:
-        """Tell how far a stage is; the one before it is over when the name changes."""
+        """Report the progress of a stage; another name ends the stage before it."""
         if self.progress is None or self.progress.name != name:
             self.__exit__(None, None, None)
             self.progress = Progress(name, total).__enter__()
@@ -214,7 +214,7 @@ class _Lines:
 class _Bar:
     """A bar of rich, for terminals."""
 
-    interval = 0.1  # rich redraws ten times a second; telling it more often is wasted
+    interval = 0.1  # rich redraws ten times a second; more frequent updates are wasted
 
     def __init__(self, progress: Progress, console: "Console") -> None:
         from rich.progress import (
@@ -229,7 +229,7 @@ class _Bar:
         from rich.text import Text
 
         class Left(ProgressColumn):
-            """rich's own forgets what took longer than its window."""
+            """Time left; rich's own column ignores steps longer than its window."""
 
             def render(self, task: Task) -> Text:
                 left = progress.left

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.simulate`, see :mod:`mirror_ppl.commands.simulate`."""
+"""Entry point of `python -m mirror_ppl.simulate`, see :mod:`mirror_ppl.commands.simulate`."""
 
 from mirror_ppl.commands import call
 

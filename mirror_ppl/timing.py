@@ -1,4 +1,4 @@
-"""Where time goes: seconds of this process by stage of work."""
+"""Timing: seconds of this process by stage of work."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from time import perf_counter
 
 @dataclass
 class Clock:
-    """Seconds by stage; those of a stage within another one count once, for the inner.
+    """Measures seconds by stage; those of a nested stage count once, for the inner one.
 
     Attributes:
         seconds: by name of the stage.
@@ -34,7 +34,7 @@ _clock: ContextVar[Clock | None] = ContextVar("clock", default=None)
 
 @contextmanager
 def clocked() -> Iterator[dict[str, float]]:
-    """Measure the stages of the work done in this context; seconds by stage, at its end."""
+    """Measure the stages of work in this context; yields seconds by stage, filled as they end."""
     clock = Clock()
     token = _clock.set(clock)
     try:
@@ -45,7 +45,7 @@ def clocked() -> Iterator[dict[str, float]]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Count what is done in this context as this stage, if anybody measures."""
+    """Count this context as a stage, if it is within `clocked`."""
     clock = _clock.get()
     if clock is None:
         yield
@@ -60,6 +60,6 @@ def stage(name: str) -> Iterator[None]:
 
 
 def add_seconds(total: dict[str, float], more: Mapping[str, float]) -> None:
-    """Add seconds by stage to those of others."""
+    """Add seconds by stage to a total, in place."""
     for name, seconds in more.items():
         total[name] = total.get(name, 0.0) + seconds

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.train`, see :mod:`mirror_ppl.commands.train`."""
+"""Entry point of `python -m mirror_ppl.train`, see :mod:`mirror_ppl.commands.train`."""
 
 from mirror_ppl.commands import call
 

@@ -1,4 +1,4 @@
-"""Code of users: files that commands load and run, and faults in them described in one line."""
+"""Code of users: loading of their files, and one-line descriptions of faults in them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def class_in_file(path: Path, name: str, base: type[Base], error: type[MirrorErr
     Args:
         path: the file.
         name: of the class.
-        base: from which it has to be derived.
-        error: raised if it cannot be had.
+        base: class from which it must be derived.
+        error: class of the exception to raise.
 
     Raises:
         MirrorError: ``error``; the file or class is missing, does not import, or is another one.
@@ -57,21 +57,21 @@ def class_in_file(path: Path, name: str, base: type[Base], error: type[MirrorErr
 
 
 def remember_file(path: Path) -> None:
-    """Count a file among those of users from now on."""
+    """Register a file as one of users."""
     _FILES.add(path.resolve())
 
 
 def remembered_files() -> tuple[Path, ...]:
-    """Files of users, for other processes to remember."""
+    """Registered files of users, for other processes to register."""
     return tuple(_FILES)
 
 
 def describe(error: BaseException, path: Path | None = None) -> str:
-    """An exception in one line, with the last line of the user's own file that it passed.
+    """Describe an exception in one line, with the last line of the user's own file that it passed.
 
     Args:
         error: the exception.
-        path: the file; any that was remembered unless given.
+        path: the file; any registered one unless given.
     """
     if isinstance(error, SyntaxError) and error.filename:
         return f"SyntaxError: {error.msg} ({Path(error.filename).name}, line {error.lineno})"
@@ -89,7 +89,7 @@ def describe(error: BaseException, path: Path | None = None) -> str:
 
 
 def passed_user_code(error: BaseException) -> bool:
-    """Whether an exception was raised in, or came through, a file of a user."""
+    """True if an exception was raised in a file of a user, or passed through one."""
     return bool(_own_frames(traceback.extract_tb(error.__traceback__), _FILES))
 
 

@@ -1,3 +1,3 @@
-"""The version of the package, which results carry."""
+"""Version of the package, which is stored in results."""
 
 __version__ = "0.1.0"

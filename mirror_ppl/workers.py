@@ -1,4 +1,4 @@
-"""Tasks in processes, which end with the one that started them, or on a cluster."""
+"""Tasks in processes that end with their parent process, or on a cluster."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from mirror_ppl.user_code import describe, passed_user_code, remember_file, reme
 Result = TypeVar("Result")
 
 SECONDS_BETWEEN_LOOKS = 1.0
-"""How often a worker looks whether the process that started it is still there."""
+"""Seconds between a worker's checks that its parent process is still there."""
 WATCH = "mirror_ppl watch"
-"""Name of the thread that looks."""
+"""Name of the thread that checks."""
 KILLED = "its process was killed; there may be too little memory for so many --jobs"
-"""What is said of work that takes its process along."""
+"""Message for work whose process was killed."""
 
 
 def run_tasks(
     tasks: Iterable[Callable[[], Result]], jobs: int, here: bool = True
 ) -> Iterator[Result]:
-    """Do tasks in processes; when this is interrupted or closed, so are they.
+    """Run tasks in processes, which end when this is interrupted or closed.
 
     Args:
         tasks: calls without arguments, such as a `functools.partial` of a module's function.
-        jobs: number of processes; 1 for this one, -1 for one a core.
-        here: whether they are processes of this machine, and not those of a `cluster`.
+        jobs: number of processes; 1 for this one, -1 for one per core.
+        here: True for processes of this machine, False for those of a `cluster`.
 
     Yields:
         Results, in the order in which tasks end.
 
     Raises:
         HumanModelError: a task failed in code of a user.
-        WorkerError: a process was ended from outside.
+        WorkerError: a process was killed.
     """
     from joblib import Parallel, delayed
 
@@ -72,7 +72,7 @@ def run_tasks(
 
 
 def cluster(address: str) -> ExitStack:
-    """A context in which tasks that are not done here are done by the workers of a Dask scheduler.
+    """Make a context in which tasks that do not run here run on the workers of a Dask scheduler.
 
     Raises:
         OptionError: Dask is not installed, or the scheduler cannot be reached.
@@ -95,7 +95,7 @@ def cluster(address: str) -> ExitStack:
 
     with ExitStack() as stack:
         try:
-            # A client that cannot connect would stay behind as what xarray asks for its locks.
+            # A client that cannot connect would stay the default client of xarray's locks.
             LoopRunner().run_sync(reach)
             # xarray would ask the default client for locks of files that are written here.
             client = stack.enter_context(Client(address, timeout="10s", set_as_default=False))
@@ -106,7 +106,7 @@ def cluster(address: str) -> ExitStack:
 
 
 def _files_of_users() -> tuple[Path, ...]:
-    """Files of users, whose classes are sent whole: other processes cannot import them."""
+    """Files of users; their classes are pickled by value, as other processes cannot import them."""
     import cloudpickle
 
     files = remembered_files()
@@ -138,15 +138,15 @@ def _guarded(task: Callable[[], Result]) -> Result:
         raise
     except (Exception, SystemExit) as error:
         if isinstance(error, SystemExit) or passed_user_code(error):
-            # In one line, as where it came from is lost on the way to another process.
+            # In one line, as the traceback is lost on the way to another process.
             raise HumanModelError(describe(error)) from None
         raise
 
 
 def _end_with(parent: int) -> None:
-    """End this process soon after the one that started it, also if that one was killed."""
+    """End this process soon after its parent, even if that was killed."""
     with suppress(ValueError):  # not the main thread
-        # A terminal interrupts all processes at once; the one that started this one decides.
+        # A terminal interrupts all processes at once; the parent decides.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

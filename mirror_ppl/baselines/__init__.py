@@ -1,4 +1,4 @@
-"""What MIRROR is compared with: models of people that are not built on the robot's own."""
+"""Baselines for MIRROR: models of people that are not built on the robot's self-model."""
 
 from mirror_ppl.baselines.behaviour_cloning import (
     BehaviourClone,

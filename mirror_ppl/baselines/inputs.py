@@ -1,11 +1,11 @@
-"""What recurrent baselines read at each step of rounds.
+"""Inputs of the recurrent baselines at each step of a round.
 
-Items of all modalities as the domain's symbols, with masks: which are visible, which were told. Of
-most steps the same is to be read as of others, so each different row of inputs is kept once.
+Inputs are the domain's symbols of all items of all modalities, with masks of the visible and of the
+communicated ones. Most rows of inputs occur at many steps, so each distinct row is kept once.
 
-Networks of the sight "informed" are given what a message means, as the human model is: what is told
-counts as seen and no more, and what follows from everything seen and told so far can be read as
-well (:meth:`mirror_ppl.domains.base.Domain.known`).
+With the sight "informed", networks are given the meaning of messages, as the human model is:
+communicated items count as seen, without a mask of their own, and everything that follows from
+earlier observations and messages is visible (:meth:`mirror_ppl.domains.base.Domain.known`).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from mirror_ppl.models.human import at_step, messages_at
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
 Sight = Literal["setting", "everything", "informed"]
-"""Which items a network reads: those that the setting shows or that were told, or all visual ones,
-or those that the setting shows or that follow from what was seen and told.
+"""Items that a network reads: those that the setting shows or that were communicated; in addition
+all visual ones ("everything"), or all that follow from earlier ones ("informed").
 """
 INFORMED: Sight = "informed"
-"""The sight to which what is told is as if it were seen."""
+"""The sight in which communicated items count as seen."""
 SIGHTS: tuple[Sight, ...] = get_args(Sight)
 
 
@@ -39,15 +39,15 @@ def network_inputs(
     told: Visibility,
     previous: Tensor,
 ) -> Tensor:
-    """What a recurrent network reads at each step, ``[..., I]``; zero for all that is not visible.
+    """Build a recurrent network's inputs ``[..., I]`` at each step; invisible items are zero.
 
     Args:
         domain: the world.
-        observation: everything that there was to observe, ego ``[..., E]`` and modalities
+        observation: everything that could be observed, ego ``[..., E]`` and modalities
             ``[..., K, F]`` in the domain's units.
-        seen: what the setting shows, ``[..., K]`` for each modality.
-        told: what is communicated, likewise.
-        previous: indices ``[...]`` of the actions before, A where there was none.
+        seen: mask of the items that the setting shows, ``[..., K]`` for each modality.
+        told: mask of the communicated items, likewise.
+        previous: indices ``[...]`` of the previous actions, A where there was none.
     """
     symbols = domain.symbols(observation)
     dtype = symbols["ego"].dtype
@@ -64,7 +64,7 @@ def network_inputs(
 def visible_items(
     domain: Domain, sight: Sight, setting: str, observation: Observation
 ) -> Visibility:
-    """Which items a setting lets a baseline read, ``[..., K]`` for each modality."""
+    """Mask of the items that a setting shows to a baseline, ``[..., K]`` for each modality."""
     visible = domain.visibility(setting, observation)
     if sight == "everything":
         visible = visible | {"visual": torch.ones_like(visible["visual"])}
@@ -79,15 +79,15 @@ def look(
     observation: Observation,
     told: Visibility,
 ) -> tuple[Visibility, Visibility, Any]:
-    """What a baseline reads at one step as seen and as told, and the knowledge after it.
+    """Masks of a step's items that a baseline reads as seen and as communicated, and its knowledge.
 
     Args:
         domain: the world.
         sight: which items are read.
-        setting: which lets people see what they see by themselves.
-        knowledge: the domain's, of the step before; only read and changed if informed.
-        observation: everything that there is to observe, ``[..., K, F]``.
-        told: what is communicated ``[..., K]``.
+        setting: the setting, which limits unaided sight.
+        knowledge: the domain's knowledge after the step before; only used if informed.
+        observation: everything that could be observed, ``[..., K, F]``.
+        told: mask of the communicated items ``[..., K]``.
     """
     seen = visible_items(domain, sight, setting, observation)
     if sight != INFORMED:
@@ -100,7 +100,7 @@ def look(
 
 
 def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations) -> Tensor:
-    """What a baseline reads at each step of recorded rounds, ``[P, B, T, I]``."""
+    """Build a baseline's inputs at each step of recorded rounds, ``[P, B, T, I]``."""
     people, rounds, steps = demonstrations.shape
     observation, told = demonstrations.observation(), dict(demonstrations.told)
     device = demonstrations.actions.device
@@ -119,7 +119,7 @@ def recorded_inputs(domain: Domain, sight: Sight, demonstrations: Demonstrations
     observation = {name: value[:, :, :steps] for name, value in observation.items()}
     actions = demonstrations.actions
     none = torch.full_like(actions[:, :, :1], len(domain.actions))
-    # Padding has the action -1, which is nobody's business but has to have a symbol.
+    # Padding has the action -1, which needs a symbol although it is not used.
     previous = torch.cat([none, actions[:, :, :-1].clamp(min=0)], 2)
     return network_inputs(domain, observation, seen, heard, previous)
 
@@ -132,11 +132,11 @@ def input_size(domain: Domain) -> int:
 
 @dataclass(frozen=True)
 class StepInputs:
-    """What P people's networks read at each step of B rounds, different rows kept once.
+    """Inputs of P people's networks at each step of B rounds, distinct rows kept once.
 
     Attributes:
-        rows: the N different ones of each person, padded with zeros ``[P, N, I]``.
-        place: which of them each step's is, ``[P, B, T]``.
+        rows: the N distinct rows of each person, padded with zeros ``[P, N, I]``.
+        place: index of each step's row, ``[P, B, T]``.
     """
 
     rows: Tensor
@@ -144,7 +144,7 @@ class StepInputs:
 
     @classmethod
     def of(cls, inputs: Tensor) -> StepInputs:
-        """Of what is read at each step, ``[P, B, T, I]``."""
+        """Keep distinct rows of the inputs at each step, ``[P, B, T, I]``, once."""
         first, place = zip(*(_distinct(own) for own in inputs.flatten(1, 2)), strict=True)
         most = max(len(rows) for rows in first)
         rows = torch.stack([pad(rows, [0, 0, 0, most - len(rows)]) for rows in first])
@@ -152,11 +152,11 @@ class StepInputs:
 
     @property
     def steps(self) -> Tensor:
-        """What is read at each step, ``[P, B, T, I]``."""
+        """Inputs at each step, ``[P, B, T, I]``."""
         return each_step(self.rows, self.place)
 
     def beside(self, other: StepInputs) -> StepInputs:
-        """These rounds and then those of another, of the same people, padded to equal lengths."""
+        """Append other rounds of the same people, both padded to equal lengths."""
         steps = max(self.place.shape[-1], other.place.shape[-1])
         own = pad(self.place, [0, steps - self.place.shape[-1]])
         more = pad(other.place, [0, steps - other.place.shape[-1]]) + self.rows.shape[1]
@@ -164,12 +164,12 @@ class StepInputs:
 
 
 def each_step(rows: Tensor, place: Tensor) -> Tensor:
-    """Of rows ``[P, N, I]`` that of each step ``[P, B, T, I]``, by ``place`` ``[P, B, T]``."""
+    """Look up each step's row ``[P, B, T, I]`` in ``[P, N, I]``, by ``place`` ``[P, B, T]``."""
     begin = rows.shape[1] * torch.arange(len(rows), device=place.device)[:, None, None]
     return rows.flatten(0, 1)[place + begin]
 
 
 def _distinct(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """The different ones of rows ``[N, I]``, and which of them each is ``[N]``."""
+    """Distinct rows of ``[N, I]``, and for each row the index of its distinct one ``[N]``."""
     first, place = distinct_rows(as_whole_numbers(rows))
     return rows[first], place

@@ -1,13 +1,13 @@
 """Logistic regression pooled over people: the strongest simple baseline where rounds are few.
 
-No memory, and weights that people share but for what their own rounds say against it::
+The model has no memory, and weights that are partially pooled over people::
 
     a_pt ~ Categorical(softmax((w + u_p) . [ego_t, v_t * x_t, v_t, a_{t-1}, 1]))
     w    ~ Normal(0, shared^-1/2)          what all P people have in common
     u_p  ~ Normal(0, own^-1/2)             how person p differs
 
-fitted by the posterior's mode, which is the only one. How much is shared is chosen by the people's
-validation rounds. It is not in the supplement.
+It is fitted by the posterior's mode, which is unique. The precisions ``shared`` and ``own`` are
+chosen on the people's validation rounds. This baseline is not in the supplement.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError
 
 ITERATIONS, ENOUGH = 200, 1e-5
-"""Most of the optimizer, which stops where a step changes the loss by less than this, in nats."""
+"""Most iterations of the optimizer, and the change of the loss in nats below which it stops."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class LogisticOptions:
 
     Attributes:
         sight: a name in ``SIGHTS``: which items are read.
-        shared: precisions of what people share that are tried.
-        own: precisions of how they differ that are tried.
+        shared: candidate precisions of the shared weights ``w``.
+        own: candidate precisions of the individual weights ``u_p``.
     """
 
     sight: Sight = "setting"
@@ -60,7 +60,7 @@ class PooledLogistic:
         people: P ids.
         sight: which items are read.
         weights: ``w + u_p`` ``[P, I + 1, A]``, the last row being that of 1.
-        precisions: of what is shared and of how people differ, as chosen.
+        precisions: chosen precisions of ``w`` and ``u_p``.
     """
 
     domain: Domain
@@ -76,7 +76,7 @@ class PooledLogistic:
             demonstrations: rounds of the people in their order.
 
         Raises:
-            DemonstrationsError: they are of others, or of another domain.
+            DemonstrationsError: they are of other people or another domain.
         """
         if (demonstrations.domain, demonstrations.people) != (self.domain.name, self.people):
             raise DemonstrationsError(
@@ -91,16 +91,16 @@ def fit_pooled_logistic(
     validation: Demonstrations,
     options: LogisticOptions = LogisticOptions(),  # noqa: B008 - frozen
 ) -> PooledLogistic:
-    """Fit P people together.
+    """Fit logistic regression to P people jointly.
 
     Args:
         train: rounds to learn from, of any lengths and numbers.
-        validation: rounds of the same people in the same order, by which the precisions are chosen.
+        validation: rounds of the same people in the same order, to choose the precisions.
         options: settings.
 
     Raises:
-        DemonstrationsError: somebody has no round to learn from or none to validate with; or the
-            validation rounds are of another domain or other people.
+        DemonstrationsError: a person has no training or no validation round; or the validation
+            rounds are of another domain or other people.
     """
     check_parts(train, validation)
     domain = get_domain(train.domain)
@@ -125,7 +125,7 @@ def _log_softmax(inputs: Tensor, weights: Tensor) -> Tensor:
 
 def _mode(inputs: Tensor, actions: Tensor, number: int, precisions: Sequence[float]) -> Tensor:
     """Weights ``[P, I + 1, A]`` of the posterior's mode."""
-    used = inputs[actions >= 0].any(0)  # what never occurs keeps the weight 0
+    used = inputs[actions >= 0].any(0)  # inputs that never occur keep the weight 0
     some, chosen, times = _counted(inputs[..., used], actions)
     shared = some.new_zeros(some.shape[-1], number, requires_grad=True)
     own = some.new_zeros(len(some), some.shape[-1], number, requires_grad=True)
@@ -149,10 +149,10 @@ def _mode(inputs: Tensor, actions: Tensor, number: int, precisions: Sequence[flo
 
 
 def _counted(inputs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Each distinct pair of inputs and action of a person once, and how often it occurs.
+    """Distinct pairs of inputs and action of each person, with their counts.
 
     Returns:
-        Inputs ``[P, N, I]``, actions ``[P, N, 1]``, and how often ``[P, N]``, 0 in padding.
+        Inputs ``[P, N, I]``, actions ``[P, N, 1]``, and counts ``[P, N]``, 0 in padding.
     """
     each = []
     for own, done in zip(inputs, actions, strict=True):

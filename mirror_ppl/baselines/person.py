@@ -1,13 +1,13 @@
-"""A recurrent baseline in the place of the human model, for the same communicator.
+"""A recurrent baseline as a human model, with which the same communicator can plan.
 
-What the network remembers is the person's belief, and what it says of actions their values::
+The network's hidden state is the person's belief, and its outputs are the action values::
 
     zH_t = h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])
-    v_t  = what the setting lets an unaided person see, or what they are told; m_t the latter alone
+    v_t  = items that the setting shows or that are communicated; m_t the latter alone
     a_t ~ Categorical(softmax(y(h_t)))
 
-There is nothing to infer any more: training made a point estimate of the network, or several from
-different beginnings, an ensemble, of which each is as probable::
+Nothing is left to infer: training gave a point estimate of the network, or an ensemble of them from
+different initializations, which are equally probable::
 
     network ~ Categorical(1 / E, ..., 1 / E)
 """
@@ -33,19 +33,19 @@ from mirror_ppl.models.view import View
 from mirror_ppl.models.world_knowledge import WorldKnowledge
 
 NETWORK = "network"
-"""Name of the only site, and of the mask ``[..., E]`` of views that tells which network it is."""
+"""Name of the only site, and of the mask ``[..., E]`` of views that marks the network."""
 TOLD = "told_"
-"""Prefix of masks of what is told, which networks read besides what is seen."""
+"""Prefix of masks of communicated items, which networks read besides those of seen items."""
 
 
 class NetworkPerson(HumanModel, WorldKnowledge):
-    """A person as a trained network has them.
+    """A human model of one person that is a trained network, or an ensemble of E networks.
 
     Args:
-        self_model: the robot's; it has no part in what the person does.
-        networks: of one person; E of them, one for each time that its id is among the people.
-        setting: which lets them see what they see by themselves.
-        world: as the robot knows it and plans in; that of the self-model unless given.
+        self_model: the robot's; it has no part in the person's actions.
+        networks: E networks of one person, whose id is repeated for each.
+        setting: the setting, which limits unaided sight.
+        world: the world in which the robot plans; that of the self-model unless given.
 
     Raises:
         HumanModelError: the networks are of several people, or of another domain.
@@ -75,16 +75,16 @@ class NetworkPerson(HumanModel, WorldKnowledge):
 
     @property
     def belief_size(self) -> int:
-        """H, the number of the GRU's units, and E, which network it is."""
+        """H + E: the GRU's units, and the indicator of the network."""
         return self.networks.hidden + self._number
 
     def prior(self) -> dict[str, Tensor]:
-        """Which network it is."""
+        """Sample the index of the network."""
         like = next(self.self_model.parameters())
         return {NETWORK: pyro.sample(NETWORK, dist.Categorical(like.new_ones(self._number)))}
 
     def draws(self, number: int) -> dict[str, Tensor]:
-        """As many draws of the posterior, ``[S, 1, 1]``: each network in turn."""
+        """Return ``number`` draws of the posterior, ``[S, 1, 1]``: each network in turn."""
         return {NETWORK: (torch.arange(number) % self._number)[:, None, None]}
 
     def planning_domain(self, draws: Mapping[str, Tensor]) -> Domain:
@@ -100,7 +100,7 @@ class NetworkPerson(HumanModel, WorldKnowledge):
         told: Visibility,
         step: int,
     ) -> tuple[View, Any]:
-        """What the setting shows and what is told; whatever follows is left to the network."""
+        """Return masks of the shown and the communicated items, and the knowledge after them."""
         del step
         seen, told, knowledge = look(
             self.domain, self.sight, self.setting, knowledge, observation, told
@@ -110,10 +110,10 @@ class NetworkPerson(HumanModel, WorldKnowledge):
         return View({**seen, **heard, NETWORK: which}), knowledge
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
-        """What is read at each step adds to the GRU's gates, but for the action.
+        """Compute the part of the GRU's gates that depends on the inputs without the action.
 
         Returns:
-            The gates' part, and which network it is, ``[..., 3 H + E]``.
+            The gates' part, and the indicator of the network, ``[..., 3 H + E]``.
         """
         none = torch.full(observation["ego"].shape[:-1], self._none, dtype=torch.long)
         none = none.to(observation["ego"].device)
@@ -128,7 +128,7 @@ class NetworkPerson(HumanModel, WorldKnowledge):
     def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None
     ) -> Tensor:
-        """The state of the GRU after one step, and which network it is, ``[..., H + E]``."""
+        """Return the GRU's state after a step, and the network's indicator, ``[..., H + E]``."""
         del still
         evidence = evidence.expand(*belief.shape[:-1], -1)
         gates, which = evidence.split([evidence.shape[-1] - self._number, self._number], -1)
@@ -142,19 +142,19 @@ class NetworkPerson(HumanModel, WorldKnowledge):
         return torch.cat([after, which], -1)
 
     def action_values(self, belief: Tensor) -> Tensor:
-        """What the network says of actions, ``[..., A]``."""
+        """Return the network's outputs for all actions, ``[..., A]``."""
         hidden, which = belief[..., : -self._number], belief[..., -self._number :]
         return self._each(
             which == 1, lambda networks, rows: networks.outputs(rows[None])[0], hidden
         )
 
     def _each(self, which: Tensor, function: Callable[..., Tensor], *values: Tensor) -> Tensor:
-        """What each row's network makes of values ``[..., N]``, by ``which`` ``[..., E]``."""
+        """Apply each row's network, marked by ``which`` ``[..., E]``, to values ``[..., N]``."""
         shape, which = which.shape[:-1], which.flatten(0, -2)
         rows = [one.reshape(len(which), *one.shape[len(shape) :]) for one in values]
         if self._number == 1:
             return function(self._alone[0], *rows).unflatten(0, shape)
-        # Before the first step a belief is zero and nobody's; then nothing but its shape counts.
+        # Before the first step a belief is zero and marks no network; only its shape matters.
         number = which.long().argmax(-1)
         found = None
         for place, networks in enumerate(self._alone):
@@ -181,5 +181,5 @@ class NetworkPerson(HumanModel, WorldKnowledge):
 
     @property
     def _none(self) -> int:
-        """A, which stands for no action."""
+        """A, the index that stands for no action."""
         return len(self.domain.actions)

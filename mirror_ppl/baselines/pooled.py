@@ -1,4 +1,4 @@
-"""Rounds of everybody as those of one person, for baselines that people share."""
+"""Joining of all people's rounds as those of one person, for baselines that people share."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.data.schema import OF_PERSON
 
 EVERYBODY = "everybody"
-"""The id of the one person whose rounds are those of all."""
+"""Id of the person to whom all rounds are assigned."""
 
 
 def as_one_person(rounds: Demonstrations) -> Demonstrations:
-    """Everybody's rounds, one after the other, as those of one person.
+    """Join all people's rounds, one after the other, as those of one person.
 
-    What is known of people beside their rounds, truths and measurements, is left out.
+    Truths and measurements are left out.
     """
     real = rounds.lengths > 0  # [P, B]
     variables = {

@@ -1,13 +1,13 @@
-"""Recurrent networks of people, a network of its own for each, side by side.
+"""Recurrent networks of people: a separate network for each, evaluated as one batch.
 
-What the supplement's baselines have in common (section D)::
+The supplement's baselines share this architecture (section D)::
 
     h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])
     y_t = output(relu(layer_L(... relu(layer_1(h_t)))))          a number for each action
 
-``x_t`` are the domain's symbols of all items of all modalities and ``v_t`` masks: which items the
-setting lets an unaided person see, or were told. ``m_t`` is which were told. P stands for people, H
-for the GRU's units.
+``x_t`` are the domain's symbols of all items of all modalities. The mask ``v_t`` marks items that
+the setting shows to an unaided person or that were communicated, ``m_t`` the latter alone. P stands
+for people, H for the GRU's units.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ LAYER = "layer_"
 
 
 class RecurrentNetworks(nn.Module):
-    """A number ``y_t`` for each action, of what came before it, for each of P people.
+    """Networks of P people that give a number ``y_t`` for each action, from what came before it.
 
-    No network shares anything with another.
+    The networks share no weights.
 
     Args:
         domain: the world.
@@ -62,7 +62,7 @@ class RecurrentNetworks(nn.Module):
         return self.weights["recurrent"].shape[1]
 
     def inputs(self, demonstrations: Demonstrations) -> StepInputs:
-        """What the networks read at each step of recorded rounds."""
+        """Build the networks' inputs at each step of recorded rounds."""
         return StepInputs.of(recorded_inputs(self.domain, self.sight, demonstrations))
 
     def start(self, rounds: int) -> Tensor:
@@ -70,18 +70,18 @@ class RecurrentNetworks(nn.Module):
         return self.weights["recurrent"].new_zeros(len(self.people), rounds, self.hidden)
 
     def step(self, hidden: Tensor, inputs: Tensor) -> Tensor:
-        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` ``[P, B, H]`` and ``inputs`` ``[P, B, I]``."""
+        """Compute ``h_t`` ``[P, B, H]`` from ``h_{t-1}`` and ``inputs`` ``[P, B, I]``."""
         return self.update(hidden, self.gates(inputs))
 
     def outputs(self, hidden: Tensor) -> Tensor:
-        """``y_t`` ``[P, B, A]`` of hidden states ``[P, B, H]``."""
+        """Compute ``y_t`` ``[P, B, A]`` from hidden states ``[P, B, H]``."""
         own, values = self.weights, hidden
         for name in self.layers:
             values = torch.relu(torch.baddbmm(own[f"{name}_bias"], values, own[name]))
         return torch.baddbmm(own["output_bias"], values, own["output"])
 
     def forward(self, inputs: StepInputs) -> Tensor:
-        """``y_t`` at every step ``[P, B, T, A]`` of the steps' inputs."""
+        """Compute ``y_t`` at every step, ``[P, B, T, A]``."""
         _, rounds, steps = inputs.place.shape
         gates = each_step(self.gates(inputs.rows), inputs.place)
         hidden, states = self.start(rounds), []
@@ -98,20 +98,20 @@ class RecurrentNetworks(nn.Module):
     def log_probabilities(self, demonstrations: Demonstrations) -> Tensor:
         """Log-probabilities in nats of all actions at every step, ``[P, B, T, A]``.
 
-        Each is of what came before the action alone. In padding they mean nothing.
+        Each depends only on what came before the action. In padding they are meaningless.
 
         Args:
             demonstrations: rounds of some of the people, in any order; P is their number.
 
         Raises:
             DemonstrationsError: they are of another domain.
-            UnknownNameError: there is somebody whose network this is not.
+            UnknownNameError: a person has no network here.
         """
         own = self.of(demonstrations)
         return own(own.inputs(demonstrations)).log_softmax(-1)
 
     def of(self, demonstrations: Demonstrations) -> Self:
-        """The networks of these people, in their order; errors as above."""
+        """Select the networks of the recorded people, in their order; errors as above."""
         if demonstrations.domain != self.domain.name:
             raise DemonstrationsError(
                 f"demonstrations of {demonstrations.domain}, expected {self.domain.name}"
@@ -126,13 +126,13 @@ class RecurrentNetworks(nn.Module):
         )
 
     def only(self, *numbers: int) -> Self:
-        """The networks of the people of these numbers."""
+        """Select the networks of people by index."""
         weights = {name: value[list(numbers)] for name, value in self.weights.items()}
         people = [self.people[number] for number in numbers]
         return type(self)(self.domain, people, self.sight, weights)
 
     def shared_by(self, people: Sequence[str]) -> Self:
-        """The only network there is, as that of each of several people."""
+        """Use the single network for each of several people."""
         weights = {
             name: value.expand(len(people), *value.shape[1:])
             for name, value in self.weights.items()
@@ -141,21 +141,21 @@ class RecurrentNetworks(nn.Module):
 
     @classmethod
     def ensemble(cls, members: Sequence[Self], number: int) -> Self:
-        """The networks of the person of that number in each of several trainings."""
+        """Collect the networks of one person, by index, from several trainings."""
         each = [networks.only(number) for networks in members]
         weights = {name: torch.cat([one.weights[name] for one in each]) for name in each[0].weights}
         people = [one.people[0] for one in each]
         return cls(each[0].domain, people, each[0].sight, weights).requires_grad_(False)
 
     def gates(self, inputs: Tensor) -> Tensor:
-        """The inputs' part ``[P, N, 3 H]`` of the gates, of ``inputs`` ``[P, N, I]``."""
+        """Compute the inputs' part ``[P, N, 3 H]`` of the gates from ``inputs`` ``[P, N, I]``."""
         # Most symbols never occur in a batch, and columns of zeros add nothing.
         used = inputs.flatten(0, -2).any(0)
         weight = self.weights["input"][:, used]
         return torch.baddbmm(self.weights["input_bias"], inputs[..., used], weight)
 
     def update(self, hidden: Tensor, gates: Tensor) -> Tensor:
-        """``h_t`` ``[P, B, H]`` of ``h_{t-1}`` and the inputs' part of the :meth:`gates`."""
+        """Compute ``h_t`` ``[P, B, H]`` from ``h_{t-1}`` and the inputs' part of :meth:`gates`."""
         own = torch.baddbmm(self.weights["recurrent_bias"], hidden, self.weights["recurrent"])
         size = 2 * self.hidden
         reset, keep = torch.sigmoid(gates[..., :size] + own[..., :size]).chunk(2, -1)
@@ -171,8 +171,8 @@ def initial_weights(
 ) -> dict[str, Tensor]:
     """Weights ``[P, inputs, outputs]`` and biases ``[P, 1, outputs]`` of each layer by name.
 
-    Those of the GRU and the layers are the usual ones of torch; those on inputs are zero, so that
-    a symbol that recordings lack adds nothing; so is the output's bias.
+    The GRU and the layers are initialized as in torch. Input weights are zero, so that a symbol
+    that recordings lack adds nothing; so is the output's bias.
 
     Args:
         domain: the world.

@@ -1,4 +1,4 @@
-"""SQIL: soft Q imitation learning, by recurrent networks.
+"""SQIL: soft Q imitation learning, with recurrent networks.
 
 Implements the baseline SQIL of MIRROR (Chen, Fong and Soh, RSS 2022; supplement, section D) after
 Reddy, Dragan and Levine, *SQIL: Imitation Learning via Reinforcement Learning with Sparse Rewards*
@@ -11,13 +11,13 @@ Reddy, Dragan and Levine, *SQIL: Imitation Learning via Reinforcement Learning w
     delta^2(D, r) = mean over D of (Q(h_t, a_t) - r - discount * log sum_a exp Q(h_{t+1}, a))^2
     loss          = delta^2(recorded, reward) + sampled_weight * delta^2(sampled, 0)
 
-Sampled rounds are those that the network itself plays in the domain, of which it learns that they
-are worth nothing, so that it keeps to what the person does. Each person has a network of their own.
+Sampled rounds are played in the domain by the network itself and have reward 0, so that it keeps to
+the person's actions. Each person has a separate network.
 
 Departures from the supplement are those of `mirror_ppl.baselines.behaviour_cloning`: the GRU reads
-``a_{t-1}``, masks are inputs, weights on inputs begin at zero, early stopping. After the last step
-of a round nothing follows. Rewards are larger than 1, which is the same as a temperature below 1:
-people are more consistent than somebody to whom an imitated action is worth 1.
+``a_{t-1}``, masks are inputs, input weights are initialized at zero, training stops early. The
+value after a round's last step is 0. The reward is larger than 1, which is equivalent to a
+temperature below 1: people are more consistent than a reward of 1 implies.
 """
 
 from __future__ import annotations
@@ -46,26 +46,26 @@ from mirror_ppl.domains.base import map_state
 from mirror_ppl.people.base import derived_generator
 
 SAMPLED = 0.0
-"""Reward of what the network does by itself."""
+"""Reward of steps in sampled rounds."""
 
 
 @dataclass(frozen=True)
 class SoftQOptions(TrainingOptions):
     """Settings of SQIL.
 
-    With the defaults the tasks that tests set are solved, with each of three seeds: all values
-    begin where they would be if all actions were alike, as otherwise the first steps leave units
-    dead, and every other time nothing was learned.
+    The defaults solve the tests' tasks with each of three seeds. Action values are initialized
+    where they would be if all actions were equivalent; otherwise the first steps left units dead,
+    and every other run learned nothing.
 
     Attributes:
         layers: units of the layers after the GRU (supplement: 32 each).
-        reward: of what the person did.
+        reward: of the person's actions.
         discount: per step.
-        target_rate: rate at which the network follows whose values are looked ahead to, per step.
-        sampled_weight: of the error in sampled rounds.
-        sampled: rounds that are played at a time.
-        sample_every: gradient steps after which as many are played anew.
-        kept: sets of sampled rounds that are learned from, the last ones.
+        target_rate: rate per gradient step at which the target network follows the trained one.
+        sampled_weight: weight of the error in sampled rounds.
+        sampled: number of rounds sampled at a time.
+        sample_every: gradient steps between samplings.
+        kept: number of the latest sets of sampled rounds that are learned from.
     """
 
     learning_rate: float = 0.02
@@ -93,7 +93,7 @@ class SoftQOptions(TrainingOptions):
 
 
 class SoftQ(RecurrentNetworks):
-    """``Q(h_t, a_t)``: outputs are soft action values, and logits of what people do.
+    """Networks of ``Q(h_t, a_t)``: outputs are soft action values, and logits of actions.
 
     Made by `fit_soft_q`.
     """
@@ -106,13 +106,13 @@ class SoftQ(RecurrentNetworks):
         generators: Sequence[torch.Generator],
         told: Tensor | None = None,
     ) -> tuple[StepInputs, Tensor]:
-        """Rounds as the networks themselves play them.
+        """Play rounds with the networks.
 
         Args:
-            setting: what they see is as in this one.
-            rounds: B, of each of P people.
-            generators: one for each of them.
-            told: chance ``[P]`` that an item that can be communicated is told, at each step.
+            setting: the setting, which limits unaided sight.
+            rounds: number of rounds B of each of P people.
+            generators: one for each person.
+            told: probability ``[P]`` that a communicable item is communicated, at each step.
 
         Returns:
             Inputs, and actions ``[P, B, T]``, -1 after the end.
@@ -157,11 +157,11 @@ def squared_errors(
     reward: Tensor,
     discount: float,
 ) -> Tensor:
-    """Squared errors of all steps of each person's rounds ``[P, B, T]``, zero in padding.
+    """Squared Bellman errors at all steps of each person's rounds ``[P, B, T]``, zero in padding.
 
     Args:
-        networks: what is trained.
-        target: whose values are looked ahead to.
+        networks: the trained networks.
+        target: networks that give the values of the next step.
         inputs: of the rounds.
         actions: ``[P, B, T]``, -1 in padding.
         reward: of every step of a round, ``[B, 1]``.
@@ -187,16 +187,16 @@ def soft_q_loss(
     played: tuple[StepInputs, Tensor],
     options: SoftQOptions,
 ) -> Tensor:
-    """``delta^2`` of recorded rounds and that of played ones, weighted, ``[P]``.
+    """Weighted sum ``[P]`` of ``delta^2`` of recorded and of sampled rounds.
 
     Args:
-        networks: what is trained.
-        target: whose values are looked ahead to.
+        networks: the trained networks.
+        target: networks that give the values of the next step.
         recorded: inputs, and actions ``[P, B, T]``, -1 in padding.
-        played: the same of rounds that the networks played.
+        played: inputs and actions of rounds that the networks played.
         options: settings.
     """
-    # All in one pass, which costs little more than that of either.
+    # One pass over both costs little more than a pass over either.
     inputs = recorded[0].beside(played[0])
     steps = inputs.place.shape[-1]
     own, other = (
@@ -219,23 +219,23 @@ def fit_soft_q(
     seed: int,
     report: Report = no_report,
 ) -> SoftQ:
-    """Imitate P people, each by a network of their own.
+    """Fit a separate soft Q network to each of P people.
 
     Args:
         train: rounds to learn from, of any lengths and numbers.
-        validation: rounds of the same people in the same order, by which training is stopped.
+        validation: rounds of the same people in the same order, for early stopping.
         options: settings.
         seed: seed of everything random here; with a person's id and rounds it determines their
             network.
-        report: called at each look at the validation rounds with the number of gradient steps
-            done, in the end ``options.epochs`` even if training stopped early, and a message.
+        report: called at each validation with the number of gradient steps done (in the end
+            ``options.epochs``, even after early stopping) and a message.
 
     Returns:
         The networks, on the device of the training rounds.
 
     Raises:
-        DemonstrationsError: somebody has no round to learn from or none to validate with; or the
-            validation rounds are of another domain or other people.
+        DemonstrationsError: a person has no training or no validation round; or the validation
+            rounds are of another domain or other people.
     """
     check_parts(train, validation)
     domain = get_domain(train.domain)
@@ -263,7 +263,7 @@ def fit_soft_q(
 
 
 def _told_rates(train: Demonstrations) -> Tensor:
-    """How often what can be communicated was told to each person, ``[P]``."""
+    """Share of the communicable items that were communicated to each person, ``[P]``."""
     real = (train.actions >= 0)[..., None]
     told = could = torch.zeros(train.num_people, device=real.device)
     for name, may in get_domain(train.domain).communicable(train.observation()).items():
@@ -274,10 +274,10 @@ def _told_rates(train: Demonstrations) -> Tensor:
 
 
 def _usual_value(options: SoftQOptions, actions: int) -> float:
-    """The value at which a step's error is 0 on average if all actions and steps are alike.
+    """Value at which a step's mean error is 0 if all actions and steps are equivalent.
 
-    Networks that begin there have to learn differences only; else the first steps, which move all
-    values alike, leave most units dead.
+    Networks that are initialized there only have to learn differences; otherwise the first steps,
+    which move all values equally, leave most units dead.
     """
     reward = (options.reward + options.sampled_weight * SAMPLED) / (1 + options.sampled_weight)
     return (reward + options.discount * math.log(actions)) / (1 - options.discount)

@@ -1,4 +1,4 @@
-"""What training of recurrent baselines has in common: settings, batches, weight decay, stopping."""
+"""Training of recurrent baselines: settings, batches, weight decay, early stopping."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mirror_ppl.domains import get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError
 
 Report = Callable[[int, str], None]
-"""Told of each look at the validation rounds: gradient steps done, and a message."""
+"""Called at each validation with the number of gradient steps done and a message."""
 Loss = Callable[[int, StepInputs, Tensor], Tensor]
-"""Of each person ``[P]``: of the number of the gradient step, the inputs of B rounds and actions
-``[P, B, T]``."""
+"""Loss of each person ``[P]``, given the number of the gradient step, the inputs of B rounds and
+their actions ``[P, B, T]``."""
 
 
 def no_report(done: int, message: str) -> None:
@@ -37,8 +37,8 @@ class TrainingOptions:
         weight_decay: decoupled weight decay on all weights but biases, as in AdamW.
         epochs: most gradient steps; a step uses all training rounds, or ``batch`` of them.
         batch: most rounds of a person in a gradient step, drawn without replacement.
-        check_every: gradient steps between looks at the validation rounds.
-        patience: looks without a better one after which a person's training ends.
+        check_every: gradient steps between validations.
+        patience: validations without improvement after which a person's training ends.
     """
 
     sight: Sight = "setting"
@@ -51,7 +51,7 @@ class TrainingOptions:
     patience: int = 10
 
     BASELINE: ClassVar[str] = ""
-    """The name under which worlds have settings of their own."""
+    """Name under which a world's record holds settings of its own."""
     COUNTS = ("hidden", "epochs", "batch", "check_every", "patience")
     """Settings that have to be at least 1."""
 
@@ -75,11 +75,11 @@ class TrainingOptions:
 
 
 def check_parts(train: Demonstrations, validation: Demonstrations) -> None:
-    """Make sure that everybody has rounds to learn from, and others to stop by.
+    """Check that each person has training and validation rounds.
 
     Raises:
-        DemonstrationsError: somebody has none of either; or the validation rounds are of another
-            domain or other people.
+        DemonstrationsError: a person lacks either; or the validation rounds are of another domain
+            or other people.
     """
     if validation.domain != train.domain or validation.people != train.people:
         raise DemonstrationsError(
@@ -101,17 +101,17 @@ def train_each(
     report: Report = no_report,
     decay: Tensor | None = None,
 ) -> None:
-    """Train everybody's network until nobody gains; leaves the weights of their best look.
+    """Train all people's networks with early stopping, and keep each person's best weights.
 
     Args:
         networks: of P people; changed in place.
-        parts: their rounds to learn from, and those by which training is stopped.
-        loss: what is made small.
+        parts: training and validation rounds.
+        loss: minimized for each person.
         options: settings.
-        generators: one for each of them.
-        report: called at each look with the number of gradient steps done, in the end
-            ``options.epochs`` even if training stopped early, and a message.
-        decay: weight decay of each of them ``[P]``, unless that of the options.
+        generators: one for each person.
+        report: called at each validation with the number of gradient steps done (in the end
+            ``options.epochs``, even after early stopping) and a message.
+        decay: weight decay of each person ``[P]``; that of the options unless given.
     """
     train, validation = parts
     inputs, actions, counts = networks.inputs(train), train.actions, train.round_counts.tolist()
@@ -145,7 +145,7 @@ def held_out_nll(networks: RecurrentNetworks, demonstrations: Demonstrations) ->
 
     Raises:
         DemonstrationsError: they are of another domain.
-        UnknownNameError: there is somebody whose network this is not.
+        UnknownNameError: a person has no network here.
     """
     return mean_nll(networks.log_probabilities(demonstrations), demonstrations.actions)
 
@@ -158,12 +158,12 @@ def mean_nll(log_probabilities: Tensor, actions: Tensor) -> Tensor:
 
 
 class BestWeights:
-    """Each person's weights at their best look at validation rounds.
+    """Keeps each person's weights at the lowest validation NLL.
 
     Args:
-        networks: what is trained.
-        validation: rounds that it does not learn from.
-        patience: looks without a better one after which a person's training has ended.
+        networks: the trained networks.
+        validation: rounds that are not learned from.
+        patience: validations without improvement after which a person's training ends.
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class BestWeights:
 
     @torch.no_grad()
     def look(self) -> bool:
-        """Keep the weights of those who got better; whether nobody is to be trained any more."""
+        """Keep the weights of people who improved; True if training has ended for all."""
         nll = mean_nll(self.networks(self.inputs).log_softmax(-1), self.actions)
         better = (nll < self._best) & (self._looks_since < self.patience)
         self._best = torch.where(better, nll, self._best)
@@ -189,17 +189,17 @@ class BestWeights:
 
     @property
     def message(self) -> str:
-        """How good the best are."""
+        """Mean validation NLL of the best weights, as text."""
         return f"validation {self._best.mean().item():.3f} nats an action"
 
     def restore(self) -> None:
-        """Give everybody their best weights."""
+        """Set each person's weights to their best ones."""
         self.networks.weights.load_state_dict(self._kept)
 
 
 @torch.no_grad()
 def shrink(networks: RecurrentNetworks, rates: Tensor | float) -> None:
-    """Decoupled weight decay of one step, by rates ``[P]``, of all weights but biases."""
+    """Apply one step of decoupled weight decay, by rates ``[P]``, to all weights but biases."""
     factor = 1 - rates
     if isinstance(factor, Tensor):
         factor = factor[:, None, None]
@@ -215,7 +215,7 @@ def draw_batch(
     size: int,
     generators: Sequence[torch.Generator],
 ) -> tuple[StepInputs, Tensor]:
-    """Inputs and actions of ``size`` rounds of each person, of all if they have no more."""
+    """Draw inputs and actions of ``size`` rounds of each person, or of all if there are fewer."""
     if actions.shape[1] <= size:
         return inputs, actions
     index = torch.zeros(len(counts), size, dtype=torch.long)

@@ -18,7 +18,7 @@ def asset_path(name: str) -> Path:
     """Path of a file that ships with the package.
 
     Raises:
-        AssetError: there is none of that name; lists those that ship.
+        AssetError: no such file ships; the message lists those that do.
     """
     folder = Path(str(resources.files(__name__))) / "assets"
     path = folder / as_path(name, "name")

@@ -1,4 +1,4 @@
-"""Recordings held against the world that they are said to be of.
+"""Checks that recordings are possible in their domain's world.
 
 Each observation has to be possible, and the action recorded at step t has to lead from the
 observation at time t to the one at time t + 1.
@@ -20,12 +20,12 @@ from mirror_ppl.errors import DemonstrationsError
 TOLERANCE = 1e-3
 """Differences up to this, in the domain's units, are rounding."""
 ENOUGH_STEPS = 5
-"""With fewer contradicting steps, nothing is said of shifted actions."""
+"""Contradicting steps from which on a message mentions shifted actions."""
 
 
 @dataclass(frozen=True)
 class Contradictions:
-    """How many steps of a recording contradict each other.
+    """Counts of a recording's steps that contradict the next observation.
 
     Attributes:
         steps: number of all steps, by person.
@@ -50,18 +50,18 @@ class Contradictions:
 
 
 def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contradictions:
-    """Make sure that what was recorded can happen in the domain's world.
+    """Check that recordings are possible in the domain's world.
 
     Args:
         demonstrations: rounds of P people.
         allowed: share of steps, from 0 to 1, that may contradict each other.
 
     Returns:
-        How many steps do.
+        The number of steps that do.
 
     Raises:
-        DemonstrationsError: an observation cannot be, or too many steps contradict each other; says
-            where the first is, what was expected and what was found.
+        DemonstrationsError: an observation is impossible, or too many steps contradict each other;
+            the message says where the first is, what was expected and what was found.
     """
     wrong = []
     for person in range(demonstrations.num_people):  # one by one, to bound memory
@@ -81,16 +81,16 @@ def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contrad
 
 
 def _observation(demonstrations: Demonstrations, person: int) -> Observation:
-    """What there was to observe in one person's rounds, ``[B, T+1, ...]``; 0 in padding."""
+    """Observations in one person's rounds, ``[B, T+1, ...]``; 0 in padding."""
     values = {"ego": demonstrations.ego, **demonstrations.observations}
     return {name: value[person].nan_to_num(0.0) for name, value in values.items()}
 
 
 def check_observations(demonstrations: Demonstrations) -> None:
-    """Make sure that each observation can be in the domain's world.
+    """Check that each observation is possible in the domain's world.
 
     Raises:
-        DemonstrationsError: one cannot; says which, and which rule it breaks.
+        DemonstrationsError: one is not; the message names it and the rule that it breaks.
     """
     for person in range(demonstrations.num_people):
         _check_observations(demonstrations, person, _observation(demonstrations, person))
@@ -116,7 +116,7 @@ def _wrong(
 ) -> Tensor:
     """Steps ``[B, T]`` of a person whose action does not lead to the next observation.
 
-    With a shift, the action so many steps before; never where there is none.
+    With a shift, the action that many steps before is tested instead, where there is one.
     """
     domain, mask = get_domain(demonstrations.domain), demonstrations.mask[person]
     actions = demonstrations.actions[person].clamp(min=0)
@@ -132,18 +132,18 @@ def _wrong(
 
 
 def _has_neighbour(mask: Tensor, shift: int) -> Tensor:
-    """Steps ``[B, T]`` with a step of the same round so many steps before."""
+    """Steps ``[B, T]`` that have a step of the same round ``shift`` steps before."""
     shifted = torch.roll(mask, shift, -1)
     shifted[:, 0 if shift > 0 else -1] = False
     return shifted
 
 
 def _differs(expected: Tensor, found: Tensor) -> Tensor:
-    return (expected - found).abs() > TOLERANCE  # never where nothing certain is expected
+    return (expected - found).abs() > TOLERANCE  # False where no certain value is expected
 
 
 def _first(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
-    """The first contradiction in words."""
+    """Describe the first contradiction."""
     domain = get_domain(demonstrations.domain)
     person = next(place for place, steps in enumerate(wrong) if steps.any())
     number, step = wrong[person].nonzero()[0].tolist()
@@ -168,7 +168,7 @@ def _first(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
 
 
 def _shifted(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
-    """Whether most of the wrong steps would fit with the action of the step before or after."""
+    """Describe a shift if most wrong steps would fit with the action one step before or after."""
     number = sum(int(steps.sum()) for steps in wrong)
     if number < ENOUGH_STEPS:
         return ""

@@ -1,4 +1,4 @@
-"""Recorded rounds of people: what there was to see, what they were told, and what they did."""
+"""Recorded rounds of people: observations, messages and actions."""
 
 from __future__ import annotations
 
@@ -23,38 +23,38 @@ OPTIONAL = {"reward": "rewards", "scenario": "scenarios", "action_entropy": "act
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Demonstrations:
-    """Rounds of P people, valid by construction and not to be modified.
+    """Recorded rounds of P people, valid by construction and not to be modified.
 
-    People may have different numbers of rounds (or none), rounds different lengths. Arrays are as
-    large as the largest needs; the rest of them is padding. Rounds, steps and times count from 0.
-    Arrays (tensors, numpy arrays or lists) are copied and brought into one form on creation,
-    whatever numeric dtype they have and whatever stands in their padding.
+    People may have different numbers of rounds (or none), rounds different lengths. Arrays have the
+    size of the largest; the rest is padding. Rounds, steps and times count from 0. Arrays (tensors,
+    numpy arrays or lists) are copied and converted to a standard form on creation, whatever their
+    numeric dtype and their padding.
 
     Args:
         domain: name of the domain.
         setting: name of the domain's setting that the rounds took place in.
         people: P ids, unique, printable, of at most 100 characters.
         ego: the ego's features ``[P, B, T+1, E]``, in the domain's units; NaN in padding.
-        observations: for each modality all that could have been observed, ``[P, B, T+1, K, F]``, in
-            the domain's units; NaN in padding. What of it the person saw is not recorded.
+        observations: for each modality everything that could be observed, ``[P, B, T+1, K, F]``, in
+            the domain's units; NaN in padding. What the person saw of it is not recorded.
         actions: indices of actions ``[P, B, T]``; -1 in padding.
         round_counts: number of rounds of each person ``[P]``.
         lengths: number of actions of each round ``[P, B]``, at least 1; 0 for padding.
-        told: for each modality which items were communicated just before the action,
-            ``[P, B, T, K]``, bool; nothing unless given.
+        told: for each modality the items communicated just before the action,
+            ``[P, B, T, K]``, bool; none unless given.
         rewards: task rewards ``[P, B, T]`` in units of reward; NaN in padding.
         scenarios: indices of scenarios ``[P, B]``; -1 in padding and where unknown.
         truth: values ``[P]`` of implants by name, known of simulated people only; NaN where
             unknown.
-        action_entropy: entropy in nats of the choice that a simulated person made, ``[P, B, T]``,
-            from 0 to the logarithm of the number of actions; NaN in padding and where unknown.
+        action_entropy: entropy in nats of a simulated person's choice, ``[P, B, T]``, from 0 to the
+            logarithm of the number of actions; NaN in padding and where unknown.
         measurements: values ``[P]`` of sites of the human model's prior that were measured, such as
             answers to a questionnaire, by name; NaN where unknown. Fits observe them.
         provenance: where the recordings come from: command, seed, population, version.
 
     Raises:
         UnknownNameError: the domain or its setting is unknown.
-        DemonstrationsError: shapes or values that cannot be; the message names person, round and
+        DemonstrationsError: shapes or values are not valid; the message names person, round and
             variable, what was expected and what was given.
     """
 
@@ -115,9 +115,9 @@ class Demonstrations:
         variables: Mapping[str, Any],
         provenance: Mapping[str, str | int | float] | None = None,
     ) -> Demonstrations:
-        """Demonstrations of arrays that are called as in files, the inverse of `variables`.
+        """Make demonstrations of arrays named as in files, the inverse of `variables`.
 
-        Without ``round_count`` everybody has all rounds, without ``length`` each round all steps.
+        Without ``round_count`` each person has all rounds, without ``length`` each round all steps.
         Variables of other names are ignored.
 
         Raises:
@@ -131,7 +131,7 @@ class Demonstrations:
             if name not in variables:
                 raise DemonstrationsError(f"the variable {name} is missing")
         actions = as_tensor(variables["action"], "action", DemonstrationsError)
-        # Wrong shapes are left to the check of the class, which knows what to say about them.
+        # Wrong shapes are reported by the check of the class.
         number, rounds, steps = actions.shape if actions.dim() == 3 else (0, 0, 0)
         counts = variables.get("round_count", torch.full((number,), rounds))
         counts = as_tensor(counts, "round_count", DemonstrationsError)
@@ -153,7 +153,7 @@ class Demonstrations:
         )
 
     def variables(self) -> dict[str, Tensor]:
-        """The arrays, called as in files; those that are absent are left out."""
+        """Arrays by their names in files; absent ones are left out."""
         optional = {name: getattr(self, field) for name, field in OPTIONAL.items()}
         return {
             "round_count": self.round_counts,
@@ -169,18 +169,18 @@ class Demonstrations:
 
     @property
     def num_people(self) -> int:
-        """P."""
+        """Number of people, P."""
         return len(self.people)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(P, B, T): people, and the rounds and steps that there is room for."""
+        """(P, B, T): people, and rounds and steps of the arrays, padding included."""
         people, rounds, steps = self.actions.shape
         return people, rounds, steps
 
     @property
     def mask(self) -> Tensor:
-        """Which steps are real and not padding, ``[P, B, T]``, bool."""
+        """True for real steps, False in padding, ``[P, B, T]``."""
         return self.actions != NO_INDEX
 
     def __repr__(self) -> str:
@@ -191,7 +191,7 @@ class Demonstrations:
         )
 
     def equals(self, other: Demonstrations) -> bool:
-        """Whether everything is the same, padding and provenance included."""
+        """True if everything is equal, padding and provenance included."""
         if self.variables().keys() != other.variables().keys():
             return False
         theirs = other.variables()
@@ -202,7 +202,7 @@ class Demonstrations:
         )
 
     def observation(self) -> Observation:
-        """What there was to observe, in the domain's layout and finite everywhere.
+        """Everything that could be observed, in the domain's layout and finite everywhere.
 
         Returns:
             ``"ego"`` ``[P, B, T+1, E]`` and each modality ``[P, B, T+1, K, F]``. Past a round's end
@@ -219,15 +219,15 @@ class Demonstrations:
         }
 
     def select_people(self, people: Sequence[str] | Sequence[int]) -> Demonstrations:
-        """Only these people, in this order, with no more padding than they need.
+        """Select people, in this order, with no more padding than they need.
 
         Args:
             people: ids, or indices from 0.
 
         Raises:
-            UnknownNameError: there is nobody of that id.
-            DemonstrationsError: an index is out of range or no index, a person is named twice, or
-                the list is empty or no list.
+            UnknownNameError: no person has that id.
+            DemonstrationsError: an index is out of range or not a whole number, a person is named
+                twice, or the list is empty or not a list.
         """
         chosen = []
         for person in listed(people, "people", "ids or indices", DemonstrationsError):
@@ -240,7 +240,7 @@ class Demonstrations:
         return self._like(variables, [self.people[number] for number in chosen])
 
     def part(self, people: range) -> Demonstrations:
-        """These people, with all the padding, so that shapes are those of everybody."""
+        """Select a range of people with all the padding, so that B and T stay the same."""
         if len(people) == self.num_people:
             return self
         return Demonstrations.from_variables(
@@ -252,7 +252,7 @@ class Demonstrations:
         )
 
     def select_rounds(self, rounds: slice | Sequence[int]) -> Demonstrations:
-        """Only these rounds of each person, with no more padding than they need.
+        """Select rounds of each person, with no more padding than they need.
 
         Args:
             rounds: a slice, applied to each person's own rounds (``slice(-5, None)`` keeps the last
@@ -260,7 +260,7 @@ class Demonstrations:
                 those that they have. People who have none of them stay, with no rounds.
 
         Raises:
-            DemonstrationsError: a number is negative, beyond everybody's rounds, or no number.
+            DemonstrationsError: a number is negative, beyond all people's rounds, or no number.
         """
         counts = self.round_counts.tolist()
         if isinstance(rounds, slice):
@@ -284,7 +284,7 @@ class Demonstrations:
         return self._like(variables, self.people)
 
     def to(self, device: torch.device | str) -> Demonstrations:
-        """These recordings on another device.
+        """Copy the recordings to a device.
 
         Raises:
             UnknownNameError: there is no such device here.
@@ -299,7 +299,7 @@ class Demonstrations:
         return schema.variable_dimensions(get_domain(self.domain)).get(name, ("person",))
 
     def _like(self, variables: Mapping[str, Tensor], people: Sequence[str]) -> Demonstrations:
-        """The same but for these arrays and people, without padding that nobody needs."""
+        """Replace arrays and people, and remove padding that is not needed."""
         most = {
             "round": max(1, int(variables["round_count"].max())) if people else 1,
             "step": max(1, int(variables["length"].max())) if people else 1,
@@ -312,14 +312,14 @@ class Demonstrations:
 
 
 def concatenate(parts: Iterable[Demonstrations]) -> Demonstrations:
-    """The people of all parts, in order, on the first part's device.
+    """Join the people of all parts, in order, on the first part's device.
 
     Scenarios, truths, measurements and entropies that a part lacks become unknown. Rewards are kept
-    if every part has them. Of the provenance, what all parts agree on is kept.
+    if every part has them, provenance where all parts agree.
 
     Raises:
-        DemonstrationsError: there is no part, or something else; the parts are of different domains
-            or settings, or an id occurs twice.
+        DemonstrationsError: there are no parts, or some are not demonstrations; the parts are of
+            different domains or settings, or an id occurs twice.
     """
     parts = listed(parts, "parts", "demonstrations", DemonstrationsError)
     for part in parts:
@@ -363,7 +363,7 @@ def concatenate(parts: Iterable[Demonstrations]) -> Demonstrations:
 
 
 def _fit(value: Tensor, dimensions: Sequence[str], sizes: Mapping[str, int]) -> Tensor:
-    """Cut or extend some dimensions to these sizes; what is added counts as padding."""
+    """Cut or extend some dimensions to these sizes; added entries count as padding."""
     shape = [sizes.get(name, size) for name, size in zip(dimensions, value.shape, strict=True)]
     fitted = value.new_zeros(shape)
     common = tuple(slice(min(old, new)) for old, new in zip(value.shape, shape, strict=True))

@@ -1,4 +1,4 @@
-"""Demonstrations as netCDF files that explain themselves; ``docs/demonstrations.md`` tells how."""
+"""Demonstrations as netCDF files; ``docs/demonstrations.md`` describes the format."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 FORMAT = "mirror_ppl demonstrations"
 FORMAT_VERSION = "1"
 MANY, LONG = 12, 40
-"""Names, and characters of a name, that a message shows."""
+"""Most names, and most characters of a name, in a message."""
 
 _LONG_NAMES = {
     "round_count": ("number of rounds; those from it on are padding", "rounds"),
@@ -67,12 +67,12 @@ def load_demonstrations(
 
     Args:
         path: the file.
-        domain: which domain the file must be of; it may then leave that open.
-        setting: the same for the setting.
+        domain: domain that the file must be of; if given, the file need not name it.
+        setting: setting that the file must be of, likewise.
 
     Raises:
         UnknownNameError: ``domain``, or ``setting`` as one of ``domain``, is unknown.
-        DemonstrationsError: the file is missing, damaged or not netCDF, or what is in it is not
+        DemonstrationsError: the file is missing, damaged or not netCDF, or its content is not
             valid; one line that names the file and the fault.
     """
     if domain is not None and setting is not None:
@@ -88,7 +88,7 @@ def load_demonstrations(
 
 
 def to_dataset(demonstrations: Demonstrations) -> xr.Dataset:
-    """Named dimensions, coordinates and units, in the smallest dtypes that lose nothing."""
+    """Make a dataset with named dimensions, coordinates and units, in the smallest exact dtypes."""
     import xarray as xr
 
     domain = get_domain(demonstrations.domain)
@@ -115,15 +115,15 @@ def to_dataset(demonstrations: Demonstrations) -> xr.Dataset:
 def from_dataset(
     dataset: xr.Dataset, domain: str | None = None, setting: str | None = None
 ) -> Demonstrations:
-    """Demonstrations of a dataset, whatever software made it.
+    """Read demonstrations from a dataset, whatever software made it.
 
     Dimensions may be in any order, and so may items and features if they are named; dtypes may be
     any numeric ones. Variables that the format does not know are ignored.
 
     Args:
         dataset: in the documented format.
-        domain: which domain it must be of; it may then leave that open.
-        setting: the same for the setting.
+        domain: domain that it must be of; if given, the dataset need not name it.
+        setting: setting that it must be of, likewise.
 
     Raises:
         UnknownNameError: the domain or setting is unknown.
@@ -159,7 +159,7 @@ def from_dataset(
         if name in dataset.variables
     }
     if "length" in variables:
-        # Where rounds of different lengths are put together, absent ones easily become nan.
+        # Software that joins rounds of different lengths often marks absent ones by nan.
         variables["length"] = variables["length"].nan_to_num(0)
     if "person" in dataset.coords:
         kind = dataset["person"].dtype
@@ -185,7 +185,7 @@ def _agreed(dataset: xr.Dataset, name: str, wanted: str | None) -> str:
 
 
 def _in_order(dataset: xr.Dataset, labels: Mapping[str, tuple[str, ...]]) -> xr.Dataset:
-    """The dataset with items and features in the domain's order, where it names its own."""
+    """Put a dataset's items and features, where they are named, into the domain's order."""
     for dimension, expected in labels.items():
         if dimension in dataset.coords:
             given = _texts(dataset[dimension])
@@ -199,7 +199,7 @@ def _in_order(dataset: xr.Dataset, labels: Mapping[str, tuple[str, ...]]) -> xr.
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Names in a message, on one line; of many only the first."""
+    """Names for a message, on one line, cut to the first ones."""
     some = [name if name.isprintable() and len(name) <= LONG else shown(name) for name in names]
     return ", ".join(some[:MANY] + [f"... ({len(some)} in all)"] * (len(some) > MANY))
 
@@ -221,13 +221,13 @@ def _tensor(array: xr.DataArray, dimensions: tuple[str, ...]) -> Tensor:
     values = array.transpose(*dimensions).values
     if values.dtype.kind not in "biuf":
         raise DemonstrationsError(f"{array.name} has the dtype {values.dtype}, expected numbers")
-    with np.errstate(invalid="ignore"):  # of values that are no number, and stay none
+    with np.errstate(invalid="ignore"):  # for values that are not numbers, and stay so
         values = values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
     return torch.from_numpy(values)
 
 
 def _provenance(attributes: Mapping[str, object]) -> dict[str, str | int | float]:
-    """Attributes that are one text or number and do not describe the format."""
+    """Select attributes that are one text or number and do not describe the format."""
     provenance = {}
     for name, value in attributes.items():
         plain = value.item() if isinstance(value, np.generic) else value
@@ -237,7 +237,7 @@ def _provenance(attributes: Mapping[str, object]) -> dict[str, str | int | float
 
 
 def _smallest(values: np.ndarray) -> np.ndarray:
-    """The same values in the smallest dtype that holds them."""
+    """Convert values to the smallest dtype that holds them."""
     if values.dtype.kind in "iu":
         kinds = (np.int8, np.int16, np.int32, np.int64)
         return values.astype(
@@ -280,7 +280,7 @@ def _attributes(domain: Domain, name: str) -> dict[str, object]:
 
 
 def _flags(names: tuple[str, ...]) -> dict[str, object]:
-    """Names of whole numbers in the manner of the CF conventions: words, separated by blanks."""
+    """Names of whole numbers by the CF conventions: words, separated by spaces."""
     words = [re.sub(r"[^\w.+@-]+", "_", name) for name in names]
     return {
         "flag_values": np.arange(len(names), dtype=np.int8),

@@ -1,4 +1,4 @@
-"""Where recordings come from: texts and numbers that a file keeps as its attributes."""
+"""Provenance of recordings: texts and numbers that a file keeps as its attributes."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 from mirror_ppl.errors import DemonstrationsError, is_name, shown
 
 DESCRIPTION = ("title", "Conventions", "format", "format_version", "domain", "setting")
-"""Attributes of a file that describe it; all others say where the recordings come from."""
+"""Attributes of a file that describe it; all others are provenance."""
 RESERVED = ("NAME", "CLASS", "DIMENSION_LIST", "REFERENCE_LIST", "_NCProperties", "_nc3_strict")
 RESERVED += ("_Netcdf4Dimid", "_Netcdf4Coordinates")
-"""Attributes that netCDF-4 files keep for themselves."""
+"""Attributes that are reserved by netCDF-4."""
 
 
 def checked_provenance(provenance: Any) -> dict[str, str | int | float]:
-    """Provenance as plain texts and numbers.
+    """Convert provenance to plain texts and numbers.
 
     Raises:
-        DemonstrationsError: it is no dict, or has a name or a value that a file cannot keep.
+        DemonstrationsError: it is not a dict, or has a name or a value that a file cannot keep.
     """
     if not isinstance(provenance, Mapping):
         raise DemonstrationsError(f"provenance must be a dict, not {shown(provenance)}")
     result = {}
     for name, value in provenance.items():
         if name in DESCRIPTION:
-            raise DemonstrationsError(f"provenance has {name}, which is not a matter of origin")
+            raise DemonstrationsError(f"provenance has {name}, which describes the file itself")
         if name in RESERVED:
             raise DemonstrationsError(f"provenance has {name}, which netCDF keeps for itself")
         if not is_name(name):

@@ -1,4 +1,4 @@
-"""Recordings of rounds that a person plays in a Gymnasium environment."""
+"""Recording of rounds that a person plays in a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Recorder(gym.Wrapper):
 
     Args:
         env: the environment that is played, like the world's own.
-        world: says what there is to observe in it, and which actions count.
-        person: id of who plays; change the attribute when another person does.
+        world: defines observations and actions.
+        person: id of the player; change the attribute when another person plays.
         setting: one of the world's settings; the last unless given.
 
     Raises:
@@ -56,10 +56,10 @@ class Recorder(gym.Wrapper):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin a round; see `gymnasium.Env.reset`.
 
-        Without a seed, one of those of which the world is made.
+        Without a seed, one of the world's layouts is drawn.
 
         Raises:
-            InputError: what there is to observe then is none of the world's states.
+            InputError: the round does not begin in one of the world's states.
         """
         if seed is None:
             seed = int(self._chooser.integers(self.world.layouts))
@@ -75,7 +75,7 @@ class Recorder(gym.Wrapper):
         return found
 
     def tell(self, modality: str, *items: str) -> None:
-        """Note that items are communicated before the next action.
+        """Record that items are communicated before the next action.
 
         Raises:
             UnknownNameError: there is no such modality or item.
@@ -89,7 +89,7 @@ class Recorder(gym.Wrapper):
         """Play one step; see `gymnasium.Env.step`.
 
         Raises:
-            InputError: the round has not begun or is over, or the action is none of the world's.
+            InputError: the round has not begun or is over, or the world has no such action.
         """
         if not self._rounds or self._rounds[-1].over:
             raise InputError("the round is over or has not begun; call reset()")
@@ -104,7 +104,7 @@ class Recorder(gym.Wrapper):
         return found, float(reward), terminated, truncated, info
 
     def recordings(self) -> Demonstrations:
-        """All rounds so far, by person in the order in which they first played.
+        """Return all rounds so far, by person in the order of their first rounds.
 
         Raises:
             InputError: there are none.
@@ -149,7 +149,7 @@ class Recorder(gym.Wrapper):
 
 
 class _Round:
-    """A round under way: what there was to observe, what was told and done."""
+    """A round in progress: observations, messages and actions."""
 
     def __init__(self, person: str, first: Mapping[str, Any]) -> None:
         self.person, self.over = person, False
@@ -164,5 +164,5 @@ class _Round:
 
 
 def _copied(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """An environment may go on writing in what it has shown."""
+    """Copy an observation, as an environment may reuse its arrays."""
     return {name: np.array(part, float) for name, part in observation.items()}

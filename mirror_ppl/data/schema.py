@@ -1,6 +1,6 @@
-"""What a recording consists of: its variables, their dimensions, and what makes them valid.
+"""Format of a recording: its variables, their dimensions and their validity.
 
-A recording is a set of arrays, called by the same names in memory and in files (see
+A recording is a set of arrays with the same names in memory and in files (see
 ``docs/demonstrations.md``). Every array begins with the dimension ``person``.
 """
 
@@ -19,19 +19,19 @@ from mirror_ppl.domains import Domain
 from mirror_ppl.errors import MOST_CHARACTERS, DemonstrationsError, is_name, shown
 
 TOLD = "told_"
-"""Prefix of what was communicated through a modality."""
+"""Prefix of the items communicated through a modality."""
 TRUTH = "truth_"
 """Prefix of the true value of an implant."""
 MEASURED = "measured_"
-"""Prefix of what was measured of a person beside their rounds."""
+"""Prefix of a measurement of a person, such as an answer to a questionnaire."""
 OF_PERSON = (TRUTH, MEASURED)
 """Prefixes of variables that have one number a person."""
 NO_INDEX = -1
 """Stands for the actions and scenarios of padding, and for scenarios that are unknown."""
 ROUNDING = 1e-3
-"""By how much an entropy may be out of its range."""
+"""Amount by which an entropy may be out of its range."""
 A_NAME = f"printable text of at most {MOST_CHARACTERS} characters"
-"""What ids and names of truths have to be."""
+"""Requirement for ids and names of truths."""
 
 
 def variable_dimensions(domain: Domain) -> dict[str, tuple[str, ...]]:
@@ -55,7 +55,7 @@ def variable_dimensions(domain: Domain) -> dict[str, tuple[str, ...]]:
 
 
 def required_variables(domain: Domain) -> tuple[str, ...]:
-    """Names of the variables that no file lacks."""
+    """Names of the variables that every file has."""
     return ("ego", *(modality.name for modality in domain.modalities), "action")
 
 
@@ -71,10 +71,10 @@ def dimension_labels(domain: Domain) -> dict[str, tuple[str, ...]]:
 def checked(
     domain: Domain, people: Sequence[str], variables: Mapping[str, Any]
 ) -> dict[str, Tensor]:
-    """Check a recording and bring it into its one form.
+    """Check a recording and convert it to its standard form.
 
     Args:
-        domain: where it was made.
+        domain: of the recording.
         people: ids of the P people.
         variables: arrays by name, tensors or what `mirror_ppl.checks.as_tensor` takes, of any
             numeric dtype: ``round_count``, ``length``, what `required_variables` lists, and any of
@@ -82,7 +82,7 @@ def checked(
 
     Returns:
         Copies on the device of ``action``. Numbers are in torch's default dtype and NaN in padding;
-        indices are int64 and -1 in padding; what was told is bool and False in padding.
+        indices are int64 and -1 in padding; communicated items are bool and False in padding.
 
     Raises:
         DemonstrationsError: one line with variable, person, round and step where they apply, what
@@ -145,7 +145,7 @@ def checked(
 
 def _check_people(people: Sequence[str]) -> None:
     if not people:
-        raise DemonstrationsError("there is nobody in it, expected at least one person")
+        raise DemonstrationsError("there are no people, expected at least one person")
     seen = set()
     for person in people:
         if not is_name(person):
@@ -157,7 +157,7 @@ def _check_people(people: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class _Places:
-    """Checks values and says in words where a wrong one is."""
+    """Checks values, and says where the first wrong one is."""
 
     people: tuple[str, ...]
     dimensions: Mapping[str, tuple[str, ...]]
@@ -208,7 +208,7 @@ class _Places:
         highest: int,
         meaning: str = "",
     ) -> Tensor:
-        """Whole numbers as int64; outside of ``inside`` anything goes and becomes 0."""
+        """Whole numbers as int64; outside of ``inside`` anything is allowed and becomes 0."""
         value = given[name].double()
         good = (value >= lowest) & (value <= highest) & (value == value.round())
         inside = torch.ones_like(good) if inside is None else _over_items(inside, good)
@@ -217,13 +217,13 @@ class _Places:
         return value.masked_fill(~inside, 0).long()
 
     def numbers(self, name: str, value: Tensor, inside: Tensor) -> Tensor:
-        """Finite numbers; outside of ``inside`` anything goes and becomes NaN."""
+        """Finite numbers; outside of ``inside`` anything is allowed and becomes NaN."""
         inside = _over_items(inside, value)
         self.refuse(name, inside & ~value.isfinite(), value, "a finite number")
         return value.masked_fill(~inside, torch.nan)
 
     def entropies(self, name: str, value: Tensor, inside: Tensor, actions: int) -> Tensor:
-        """Entropies in nats of a choice among so many actions, or NaN; outside they become NaN."""
+        """Entropies in nats of a choice among ``actions`` actions, or NaN; NaN in padding."""
         most = math.log(actions)
         possible = (value >= -ROUNDING) & (value <= most + ROUNDING)
         expected = f"from 0 to {most:.4g} (log of {actions} actions), or nan if unknown"
@@ -232,5 +232,5 @@ class _Places:
 
 
 def _over_items(inside: Tensor, like: Tensor) -> Tensor:
-    """The mask for every item and feature that ``like`` has beyond the mask's dimensions."""
+    """Expand the mask over the dimensions that ``like`` has beyond the mask's."""
     return inside.reshape(inside.shape + (1,) * (like.dim() - inside.dim())).expand_as(like)

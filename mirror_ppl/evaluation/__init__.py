@@ -1,1 +1,1 @@
-"""Measurements of models against exact references."""
+"""Evaluation: studies, comparisons of models, and reports of fits."""

@@ -1,7 +1,7 @@
-"""Communicators paired with people: who helps how much, at what cost.
+"""Pairings of communicators with people: how much messages help, at what cost.
 
 Every communicator plays the same rounds with the same random numbers, so that differences between
-them are differences in what they said.
+them are due to their messages.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ COMMUNICATORS = (
     "nearest",
     "oracle",
 )
-"""Everything that can be paired with people, in the order in which it is shown."""
+"""Communicators that can be paired with people, in the order in which they are shown."""
 NO_ORACLE = (
     "there is an oracle only of people with thresholds of sight of their own (population diverse)"
 )
 REFERENCES = ("none", "all", "nearest", "oracle")
-"""Those of them that learn nothing of people, and are compared with those that do."""
+"""Communicators that learn nothing of people, as references for those that do."""
 RATES_FROM = "mirror"
-"""Whose rate of items ``random`` has."""
+"""Communicator whose rates of items ``random`` has."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What only an oracle knows.
+    """Observed by an oracle alone: the true state of world and person.
 
     Attributes:
         step: the number of the step.
         state: of the world, ``[1, R]``.
-        memory: of the person, of the step before, ``[1, R]``.
+        memory: of the person after the step before, ``[1, R]``.
     """
 
     step: int
@@ -63,18 +63,18 @@ class Truth:
 
 
 Say = Callable[[Sequence[RoundSoFar], Truth], tuple[Tensor, list[Decision] | None]]
-"""What to say in each of R rounds: flags ``[R, N]`` and, of planners, the decisions."""
+"""Chooses messages in each of R rounds: flags ``[R, N]`` and, for planners, the decisions."""
 
 
 @dataclass(frozen=True)
 class Listener:
-    """Somebody to speak to, and when.
+    """A person who receives messages, and their rounds.
 
     Attributes:
         domain: the world.
         setting: its setting.
-        driver: the person as they are, P = 1.
-        start: how the rounds ``[1, R]`` begin, and the noise by which the person chooses.
+        driver: the true person, P = 1.
+        start: initial states of the rounds ``[1, R]``, and the noise of the person's choices.
         person: what was inferred of the person, if anything; planners need it.
     """
 
@@ -85,21 +85,21 @@ class Listener:
     person: Person | None = None
 
     def round(self, number: int) -> Listener:
-        """The same person in one of their rounds alone."""
+        """Select one of the person's rounds."""
         return replace(self, start=self.start.round(number))
 
 
 def listeners(
     everybody: SimulatedPeople, people: int, setting: str, rounds: int, seed: int
 ) -> list[Listener]:
-    """Simulated people, and rounds that are the same whoever speaks to them.
+    """Make listeners of simulated people; their rounds do not depend on the communicator.
 
     Args:
         everybody: the people.
-        people: how many they are.
+        people: number of people.
         setting: of their world.
-        rounds: of each of them.
-        seed: of how the rounds begin and of all noise in them.
+        rounds: number of rounds of each person.
+        seed: of initial states and of all noise.
     """
     domain = everybody.domain
     starts = draw_starts(
@@ -120,14 +120,14 @@ def speaker(
     seed: int,
     rates: Mapping[str, float] | None = None,
 ) -> Say:
-    """What speaks to one person.
+    """Make the communicator for one person.
 
     Args:
         name: one of ``COMMUNICATORS``.
         listener: the person, and their rounds.
         options: settings of the planners.
         seed: of everything random.
-        rates: for ``random``, how much of what is communicable it communicates.
+        rates: for ``random``, the share of communicable items that it communicates, by modality.
 
     Raises:
         UnknownNameError: there is no such communicator.
@@ -151,10 +151,10 @@ def speaker(
 
 
 class Planning:
-    """A planner that speaks to one person, and learns which channels reach them.
+    """A planner for one person that learns which channels reach them.
 
     Attributes:
-        planner: for the present round.
+        planner: for the current round.
     """
 
     def __init__(self, planner: Communicator) -> None:
@@ -163,24 +163,24 @@ class Planning:
     def __call__(
         self, rounds: Sequence[RoundSoFar], truth: Truth
     ) -> tuple[Tensor, list[Decision] | None]:
-        """What to say in each of R rounds."""
+        """Plan messages in each of R rounds."""
         del truth
         decisions = [self.planner.plan(past) for past in rounds]
         return torch.stack([decision.flags for decision in decisions]), decisions
 
     def learn(self, past: RoundSoFar) -> None:
-        """Go on to the next round."""
+        """Learn from a finished round, before the next one."""
         self.planner = self.planner.after(past)
 
     @property
     def hears(self) -> dict[str, float]:
-        """Probability that messages of each modality reach the person; nothing if it is given."""
+        """Probability that messages of each modality reach the person; empty if it is given."""
         person = self.planner.person
         return person.hears if isinstance(person, HearingPerson) else {}
 
 
 def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
-    """What knows the person exactly: the best messages, or of people as modelled a planner's."""
+    """The oracle: optimal messages or, for people who follow the human model, a planner's."""
     if (known := listener.driver.modelled()) is not None:
         planner = planner_of("mirror", Person(*known), replace(options, hears=1.0), seed)
         return Planning(planner)
@@ -197,14 +197,14 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
 
 @torch.no_grad()
 def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
-    """Let one person play their rounds while somebody speaks to them.
+    """Play one person's rounds with a communicator.
 
-    A planner learns from each round before the next one; for all others they are played at once.
+    A planner learns from each round before the next one; others play all rounds at once.
 
     Args:
         listener: the person, and their rounds.
-        say: who speaks.
-        keep_log: whether to keep every decision.
+        say: the communicator.
+        keep_log: True to keep every decision.
     """
     if not isinstance(say, Planning):
         return _play(listener, say, keep_log)[0]
@@ -217,7 +217,7 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
 
 
 def _play(listener: Listener, say: Say, keep_log: bool) -> tuple[Played, list[RoundSoFar]]:
-    """All rounds at once, and how they went."""
+    """Play all rounds at once; also returns the observed rounds."""
     domain, driver, start = listener.domain, listener.driver, listener.start
     channels, number = Channels(domain), start.action_noise.shape[1]
     tally, seconds, log = Tally(domain, channels, number), 0.0, []
@@ -255,16 +255,16 @@ def _play(listener: Listener, say: Say, keep_log: bool) -> tuple[Played, list[Ro
 
 
 def _now(domain: Domain, state: Any, number: int) -> list[Observation]:
-    """What there is to observe in each of R rounds."""
+    """Current observation in each of R rounds."""
     observation = domain.observe(state)
     return [{name: value[0, r] for name, value in observation.items()} for r in range(number)]
 
 
 def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
-    """A planner's decision as data: gain, sentence, what mattered, the best alternatives.
+    """Convert a planner's decision to data: gain, sentence, what mattered, best alternatives.
 
-    Of the alternatives the chosen one is always there, too. Not the one of the largest gain is
-    chosen, but that of the largest gain after some standard errors.
+    The alternatives always include the chosen one: it has the largest lower bound, gain - k SE, not
+    necessarily the largest gain.
     """
     low, high = decision.gain.interval
     columns = ["message", "later", "cost", "gain", "standard_error", "chosen"]

@@ -1,4 +1,4 @@
-"""The work of pairing people with communicators, in cells that can be done beside each other."""
+"""Pairings of people with communicators, as cells that can run in parallel."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from mirror_ppl.version import __version__
 
 @dataclass(frozen=True)
 class Pairing:
-    """Who is paired in which rounds; enough for any process to do a cell.
+    """Description of pairings and rounds, from which any process can run a cell.
 
     Attributes:
         posterior: file of the people's posterior.
-        human_model, self_model: what it was fitted with; the package's own unless given.
-        draws: posterior draws that are planned with.
-        setting, population, people_seed, people: who the people are.
-        rounds: rounds of each.
+        human_model, self_model: those of the fit; the package's own unless given.
+        draws: posterior draws to plan with.
+        setting, population, people_seed, people: arguments that simulate the people.
+        rounds: number of rounds of each person.
         planner: settings of the planners.
         seed: of the rounds and of everything random.
-        keep_log: whether to keep every decision.
+        keep_log: True to keep every decision.
     """
 
     posterior: Path
@@ -79,10 +79,10 @@ class Pairing:
         return load_human_model(self.human_model, self_model)
 
     def check(self) -> None:
-        """Find out what cannot work before any work is done.
+        """Check that posterior, human model and self-model match, before any work is done.
 
         Raises:
-            MirrorError: the posterior, the human model and the self-model do not go together.
+            MirrorError: they do not match.
         """
         check_contract(self.human)
         self.file.draws(self.human, self.draws)
@@ -94,7 +94,7 @@ class Pairing:
             )
 
     def listener(self, number: int, inferred: bool = True) -> Listener:
-        """The person of that number, with their rounds, and what was inferred of them."""
+        """Return a person by number, with their rounds and their posterior."""
         everybody = simulated_people(
             self.domain.name,
             self.setting,
@@ -112,13 +112,13 @@ class Pairing:
         return replace(listener, person=person)
 
     def play(self, number: int, name: str, rates: dict[str, float] | None) -> Played:
-        """Rounds of the person of that number with one communicator."""
+        """Play a person's rounds, by number, with one communicator."""
         listener = self.listener(number, name.startswith("mirror"))
         say = speaker(name, listener, self.planner, self.seed + number, rates)
         return play(listener, say, self.keep_log)
 
     def identity(self) -> str:
-        """What results belong to: a hash of everything that they depend on."""
+        """Hash of everything that results depend on."""
         settings = {
             name: value if isinstance(value, (int, str, type(None))) else str(value)
             for name, value in asdict(self).items()
@@ -137,8 +137,8 @@ class Turn:
     """One person with one communicator, or with several of which one depends on another.
 
     Attributes:
-        person: their number.
-        communicators: by name; ``random`` comes after the one whose rates it has.
+        person: number of the person.
+        communicators: by name; ``random`` comes after the communicator whose rates it has.
     """
 
     person: int
@@ -146,16 +146,16 @@ class Turn:
 
     @property
     def label(self) -> str:
-        """What it is, for people who wait."""
+        """Name in progress messages."""
         return f"{' and '.join(self.communicators)}, person {self.person + 1}"
 
 
 def turns(communicators: Sequence[str], people: int) -> list[Turn]:
-    """Every communicator with every person, slowest first, so that processes end together.
+    """List every communicator with every person, slowest first, so that processes end together.
 
     Args:
         communicators: by name.
-        people: how many of the people, from the first on.
+        people: number of people, from the first on.
     """
     first: list[tuple[str, ...]] = [
         (name,) for name in communicators if name not in (RATES_FROM, "random")
@@ -169,12 +169,12 @@ def turns(communicators: Sequence[str], people: int) -> list[Turn]:
 
 
 def play_all(pairing: Pairing, chosen: Sequence[Turn], runner: Runner) -> dict[str, list[Played]]:
-    """What each person played with each communicator.
+    """Play all turns, and return each communicator's results.
 
     Args:
-        pairing: who is paired in which rounds.
-        chosen: everything that is played.
-        runner: does the work and keeps what is finished.
+        pairing: description of the pairings.
+        chosen: turns that are played.
+        runner: does the work and keeps finished results.
     """
     identity = pairing.identity()
     form = JsonFormat(lambda content: {name: Played(**one) for name, one in content.items()})

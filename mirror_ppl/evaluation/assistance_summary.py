@@ -1,4 +1,4 @@
-"""What pairings of communicators and people show: means, differences, intervals."""
+"""Summaries of pairings of communicators with people: means, differences, intervals."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ LEVELS = (0.05, 0.95)
 def summarize_assistance(
     played: Mapping[str, Sequence[Played]], seed: int = 0
 ) -> dict[str, dict[str, Any]]:
-    """One entry a communicator.
+    """Summarize each communicator's rounds.
 
     Args:
-        played: of each communicator the rounds of each of P people, R each; the same rounds.
+        played: for each communicator the R rounds of each of P people, the same for all.
         seed: of the bootstrap.
 
     Returns:
-        By name: means a round of ``task``, ``cost``, ``net`` and ``mishaps``; ``net_se``, the
+        By name: means per round of ``task``, ``cost``, ``net`` and ``mishaps``; ``net_se``, the
         standard error of ``net`` given these people (rounds are the sample); by modality ``items``
         a step; ``relevant``, the share of relevant items by notion, over all items and by modality
         (``None`` where none were communicated); ``milliseconds`` a decision; ``over_none`` and
@@ -77,7 +77,7 @@ def summarize_assistance(
 def compare(
     played: Mapping[str, Sequence[Played]], one: str, other: str, seed: int = 0
 ) -> dict[str, float | None]:
-    """By how much one communicator's net return is above another's, with its interval."""
+    """Mean difference of two communicators' net returns, with its interval."""
     difference = np.stack([a.net - b.net for a, b in zip(played[one], played[other], strict=True)])
     people, rounds = difference.shape
     drawn = np.random.default_rng(seed).integers(rounds, size=(RESAMPLES, people, rounds))
@@ -90,7 +90,7 @@ def _mean(parts: Sequence[Played], name: str) -> float:
 
 
 def _interval(mean: float, resampled: np.ndarray, rounds: int) -> dict[str, float | None]:
-    if rounds == 1:  # which cannot be drawn in two ways
+    if rounds == 1:  # the bootstrap of a single round has no spread
         return {"mean": mean, "low": None, "high": None}
     low, high = np.quantile(resampled, LEVELS)
     return {"mean": mean, "low": float(low), "high": float(high)}

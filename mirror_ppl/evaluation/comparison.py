@@ -1,4 +1,4 @@
-"""Human models compared by what their posteriors predict of the same recordings.
+"""Comparison of human models by their posteriors' predictions of the same recordings.
 
 Two measures of a round b of T actions, in nats; higher is better::
 
@@ -7,12 +7,12 @@ Two measures of a round b of T actions, in nats; higher is better::
 
 Leave-one-out is estimated by Pareto-smoothed importance sampling, in ArviZ (Vehtari, Gelman and
 Gabry, *Practical Bayesian model evaluation using leave-one-out cross-validation and WAIC*, 2017).
-Its estimate for a round is doubtful where few draws get most of the weight. Held-out rounds need no
-such care; each of their actions is predicted by the average over draws, as in ``nll`` of
+Its estimate for a round is doubtful where few draws get most of the weight. Held-out rounds do not
+have this problem: each action is predicted by the average over draws, as in ``nll`` of
 ``summary.json``.
 
-Rounds are the sample: differences are taken round by round, and the standard error of their sum is
-``sqrt(rounds * variance)``, as in ``arviz.compare``. Sums and their errors are told an action.
+Rounds are the sample: differences are paired by round, and the standard error of their sum is
+``sqrt(rounds * variance)``, as in ``arviz.compare``. Sums and their errors are given per action.
 
 Shapes: M models, S draws, P people, B rounds, T steps, A actions, N rounds of all people without
 padding.
@@ -39,35 +39,35 @@ from mirror_ppl.inference.results.posterior_file import read_results
 from mirror_ppl.models.loading import model_name
 
 FILE = "posterior.nc"
-"""What a fit calls its posterior."""
+"""File name of a fit's posterior."""
 GROUPS = {
     "loo": ("log_likelihood", "observed_data", "constant_data"),
     "heldout": ("predictions", "observed_data", "constant_data", "predictions_constant_data"),
 }
-"""Groups of a posterior file that each measure reads; the first is there if it can be taken."""
+"""Groups of a posterior file that each measure reads; the measure needs the first."""
 LACKS = {
     "loo": "has no log-likelihoods of the rounds that were learned from (group log_likelihood)",
     "heldout": "has no held-out rounds; leave some out of the fit (--train-rounds)",
 }
-"""The measures, and what is said of a file that has nothing to measure."""
+"""The measures, and the message for a file without the data that they need."""
 SOURCE = "recorded_"
-"""What attributes begin with that tell where recordings come from."""
+"""Prefix of attributes that hold the provenance of recordings."""
 LEAST_DRAWS = 2
-"""Fewer draws cannot be weighted against each other."""
+"""Fewest draws for importance weights."""
 
 
 @dataclass(frozen=True)
 class FitFile:
-    """What a posterior file holds that is compared.
+    """Content of a posterior file that is compared.
 
     Attributes:
         path: the file.
-        attributes: what it says of itself.
-        people: names of the P people.
-        recorded: arrays that are of the recordings, not of the model, by group and variable.
+        attributes: of the posterior.
+        people: ids of the P people.
+        recorded: arrays of the recordings, not of the model, by group and variable.
         actions: of the rounds that are compared ``[P, B, T]``; -1 in padding.
         draws: for leave-one-out log-likelihoods of whole rounds ``[S, P, B]``; for held-out rounds
-            probabilities of what was done ``[S, P, B, T]``.
+            probabilities of the actions taken ``[S, P, B, T]``.
     """
 
     path: Path
@@ -80,16 +80,16 @@ class FitFile:
 
 @dataclass(frozen=True)
 class Score:
-    """How well some rounds are predicted, in nats an action.
+    """Predictive scores of some rounds, in nats per action.
 
     Attributes:
-        rounds: how many.
-        actions: how many in these rounds.
-        elpd: log predictive density.
-        elpd_se: its standard error; ``None`` of a single round.
-        difference: to that of the best model of all.
-        difference_se: standard error of the difference, paired; ``None`` of a single round.
-        doubtful: rounds whose leave-one-out estimate is not to be trusted; ``None`` if held out.
+        rounds: number of rounds.
+        actions: number of actions in these rounds.
+        elpd: mean log predictive density per action.
+        elpd_se: its standard error; ``None`` for a single round.
+        difference: to the ``elpd`` of the best model.
+        difference_se: standard error of the difference, paired; ``None`` for a single round.
+        doubtful: number of rounds with a doubtful leave-one-out estimate; ``None`` if held out.
     """
 
     rounds: int
@@ -103,16 +103,16 @@ class Score:
 
 @dataclass(frozen=True)
 class RankedModel:
-    """Where a model stands among those it is compared with.
+    """Result of one model in a comparison.
 
     Attributes:
-        label: what it is called.
+        label: its name in the comparison.
         path: its posterior.
-        human_model: what commands call it.
+        human_model: its name in commands.
         weight: by stacking; the weights of all models sum to 1.
         good_k: Pareto k up to which leave-one-out is trusted; ``None`` if held out.
         total: over all rounds.
-        people: over the rounds of each of the P people; ``None`` of those without any.
+        people: over the rounds of each of the P people; ``None`` for those without any.
     """
 
     label: str
@@ -126,12 +126,12 @@ class RankedModel:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Models from the best to the worst.
+    """A comparison of models, from the best to the worst.
 
     Attributes:
         by: the measure, a key of `LACKS`.
-        attributes: the domain, the setting and where the recordings come from.
-        people: names of the P people.
+        attributes: the domain, the setting and the provenance of the recordings.
+        people: ids of the P people.
         models: M of them.
     """
 
@@ -154,7 +154,7 @@ class Comparison:
         ).astype({"difference_se": float})
 
     def as_data(self) -> dict[str, Any]:
-        """The comparison as JSON holds it, people by name."""
+        """The comparison as plain values for JSON, people by id."""
         return {
             "by": self.by,
             "unit": "nats an action",
@@ -176,7 +176,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Rounds:
-    """A model's N rounds: log predictive density, and whether it is to be doubted."""
+    """A model's N rounds: log predictive densities, and which of them are doubtful."""
 
     values: np.ndarray
     doubtful: np.ndarray | None = None
@@ -184,19 +184,19 @@ class _Rounds:
 
 
 def posterior_path(path: Path) -> Path:
-    """The posterior file that a file or a fit's folder stands for."""
+    """Path of the posterior file, given the file or a fit's folder."""
     return path / FILE if os.path.isdir(path) else path
 
 
 def read_fit(path: Path, by: str = "loo") -> FitFile:
-    """Read what is compared of a posterior file.
+    """Read the compared content of a posterior file.
 
     Args:
         path: a file that ``python -m mirror_ppl.fit`` wrote, or the folder that holds it.
         by: the measure, a key of `LACKS`.
 
     Raises:
-        PosteriorError: the file is missing or damaged, or lacks what is measured.
+        PosteriorError: the file is missing or damaged, or lacks the data of the measure.
     """
     path = posterior_path(path)
     data = read_results(path, "posterior", *GROUPS[by])
@@ -241,7 +241,7 @@ def _joined(values: xr.DataArray) -> np.ndarray:
 
 
 def _constants(data: Mapping[str, xr.Dataset], group: str) -> dict[str, np.ndarray]:
-    """What there was to see, was told and was done; not what is known of simulated people."""
+    """Recorded observations, messages and actions, without the truth of simulated people."""
     if group not in data:
         return {}
     return {
@@ -252,10 +252,10 @@ def _constants(data: Mapping[str, xr.Dataset], group: str) -> dict[str, np.ndarr
 
 
 def label_models(files: Sequence[FitFile]) -> tuple[str, ...]:
-    """What commands call the models, and of their path as much as tells them apart."""
+    """Label models by their names in commands and as much of their paths as distinguishes them."""
     models = [_model(file) for file in files]
     paths = [file.path.resolve() for file in files]
-    # A fit's folder says more than the file in it, which is called the same in all of them.
+    # A fit's folder is used in place of the file in it, whose name is always the same.
     shown = [(path.parent if path.name == FILE else path).parts[1:] for path in paths]
     alike, labels = Counter(models), models
     for depth in range(1, 1 + max(map(len, shown))):
@@ -265,7 +265,7 @@ def label_models(files: Sequence[FitFile]) -> tuple[str, ...]:
             f"{model} {'/'.join(parts[-depth:])}" if alike[model] > 1 else model
             for model, parts in zip(models, shown, strict=True)
         ]
-    # Only the same file, given more than once, is left without a name of its own.
+    # Only the same file, given more than once, still has no label of its own.
     again = Counter(labels)
     return tuple(
         f"{label} ({1 + labels[:place].count(label)})" if again[label] > 1 else label
@@ -278,11 +278,11 @@ def compare_fits(files: Sequence[FitFile], labels: Sequence[str], by: str = "loo
 
     Args:
         files: one of each model, read for the same measure.
-        labels: different names of the models.
+        labels: distinct names of the models.
         by: the measure, a key of `LACKS`.
 
     Raises:
-        PosteriorError: files are of different recordings, or give what was done no probability.
+        PosteriorError: files are of different recordings, or give recorded actions probability 0.
     """
     for file in files[1:]:
         _check_same(files[0], file)
@@ -292,7 +292,7 @@ def compare_fits(files: Sequence[FitFile], labels: Sequence[str], by: str = "loo
     person, actions = np.nonzero(real)[0], steps[real]
     measure = _leave_one_out if by == "loo" else _held_out
     measured = {label: measure(file, real) for label, file in zip(labels, files, strict=True)}
-    # By name where equal, so that the order of the arguments makes no difference.
+    # Ties are ordered by name, so that the order of the arguments makes no difference.
     order = sorted(measured, key=lambda label: (-measured[label].values.sum(), label))
     weights = _stacking(np.stack([measured[label].values for label in order])).tolist()
     best = measured[order[0]].values
@@ -327,8 +327,8 @@ def _source(file: FitFile) -> dict[str, str]:
 
 def _check_same(first: FitFile, other: FitFile) -> None:
     expected, given = _source(first), _source(other)
-    # Short values say in few words what the command that recorded says in many.
-    # Where domains differ all else does, too.
+    # The shortest difference is reported, rather than that of the command that recorded.
+    # Where domains differ, everything else does, too.
     names = sorted(
         {*expected, *given},
         key=lambda name: (name != "domain", len(expected.get(name, "")), name),
@@ -344,7 +344,7 @@ def _check_same(first: FitFile, other: FitFile) -> None:
             f"{different} people are {', '.join(other.people)}, expected {', '.join(first.people)}"
         )
     for name, value in first.recorded.items():
-        # What one of the files leaves out cannot contradict the other.
+        # A variable that one of the files lacks cannot contradict the other.
         own = other.recorded.get(name, value)
         if own.shape != value.shape:
             raise PosteriorError(
@@ -356,7 +356,7 @@ def _check_same(first: FitFile, other: FitFile) -> None:
 
 
 def _check_possible(file: FitFile, values: np.ndarray, real: np.ndarray) -> None:
-    """Make sure that the logs ``[N]`` or ``[S, N]`` of probabilities are numbers."""
+    """Check that log-probabilities ``[N]`` or ``[S, N]`` are finite."""
     wrong = ~np.isfinite(values).reshape(-1, values.shape[-1]).all(0)
     if wrong.any():
         person, number = np.argwhere(real)[wrong.argmax()]
@@ -372,12 +372,12 @@ def _leave_one_out(file: FitFile, real: np.ndarray) -> _Rounds:
     draws = xr.DataArray(likelihood[None], dims=("chain", "draw", "one"))
     data = az.InferenceData(log_likelihood=draws.to_dataset(name="action"))
     with warnings.catch_warnings():
-        # It warns of doubtful rounds, which are counted here, and where there is but one round.
+        # ArviZ warns of doubtful rounds, which are counted here, and of a single round.
         warnings.simplefilter("ignore")
-        # Draws are independent, so none of them counts for less.
+        # Draws are independent, so their relative efficiency is 1.
         loo = az.loo(data, pointwise=True, reff=1.0, scale="log")
-    # Where all draws agree there is nothing to weight, though ArviZ finds no tail and gives up. A
-    # k that is not a number is no good one.
+    # Where all draws agree there is nothing to weight, though ArviZ finds no tail and gives up.
+    # Elsewhere a k that is not a number counts as doubtful.
     doubtful = ~(loo.pareto_k.values <= loo.good_k) & (np.ptp(likelihood, axis=0) > 0)
     return _Rounds(loo.loo_i.values, doubtful, float(loo.good_k))
 
@@ -391,8 +391,8 @@ def _held_out(file: FitFile, real: np.ndarray) -> _Rounds:
 
 
 def _stacking(values: np.ndarray) -> np.ndarray:
-    """Weights ``[M]`` of the mixture that predicts rounds ``[M, N]`` best."""
-    # A factor for all models changes no weight, and keeps densities of long rounds above 0.
+    """Stacking weights ``[M]`` of the mixture that predicts rounds ``[M, N]`` best."""
+    # A common factor changes no weight, and keeps densities of long rounds above 0.
     shifted = values - values.max(0)
     unused = {"se": np.nan, "p_loo": np.nan, "warning": False, "scale": "log"}
     elpd: dict[str, Any] = {

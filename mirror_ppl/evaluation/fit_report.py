@@ -1,4 +1,4 @@
-"""What `python -m mirror_ppl.fit` prints of people."""
+"""The report that `python -m mirror_ppl.fit` prints."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from mirror_ppl.models.implants import NOTICES
 from mirror_ppl.models.loading import MIRROR, model_name
 
 OTHERS = "-"
-"""In the place of implants of another model than the person's."""
+"""Entry for implants of a model that is not the person's most probable one."""
 FEW = 20
 """Effective draws below which a pooled posterior is coarse."""
 MOST_DOUBTED = 20
-"""People for whom reasons are printed."""
+"""Most people for whom reasons are printed."""
 WIDTH = 184
-"""Characters, where nobody says how many there are."""
+"""Characters of a line, where the terminal's width is unknown."""
 BORDER = 3
 """Characters between columns."""
 
 
 def show_fit(summary: dict[str, Any], unit: str) -> None:
-    """Print what was found.
+    """Print the report of a fit.
 
     Args:
-        summary: as it is in `summary.json`.
-        unit: of what people see.
+        summary: as in `summary.json`.
+        unit: of people's sight.
     """
     sites = summary["people"][0]["implants"]
     what = f"sees ({unit})"
@@ -83,7 +83,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
 
 
 def _show_checks(people: Sequence[dict[str, Any]], model: str) -> None:
-    """Whom the model does not explain, and why."""
+    """Print the people whom the model does not explain, with reasons."""
     checked = [person for person in people if person["check"]["verdict"] != UNCHECKED]
     if not checked:
         print("Model check: none without training rounds")
@@ -99,7 +99,7 @@ def _show_checks(people: Sequence[dict[str, Any]], model: str) -> None:
 
 
 def _served(people: Sequence[dict[str, Any]]) -> str:
-    """Which engine inferred whom; by name, but of the one that inferred most."""
+    """Describe who was inferred by which engine; the most frequent one without people's ids."""
     by_engine: dict[str, list[str]] = {}
     for person in people:
         by_engine.setdefault(person["engine"], []).append(person["id"])
@@ -109,7 +109,7 @@ def _served(people: Sequence[dict[str, Any]]) -> str:
 
 
 def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
-    """What was inferred of each person."""
+    """Print what was inferred of each person."""
     people, newcomer = summary["people"], summary.get("newcomer")
     columns = []
     for name in sorted(people[0]["implants"], key=lambda name: name != KIND):
@@ -127,7 +127,7 @@ def _show_people(summary: dict[str, Any], title: str, caption: str) -> None:
 
 
 def _is_own(site: str, person: dict[str, Any]) -> bool:
-    """Whether a site is not one of a model that is less probable of a person than another."""
+    """True unless a site is of a model that is not a person's most probable one."""
     kind = person["implants"].get(KIND, {}).get("most_probable")
     return kind is None or model_of(site) in ("", kind)
 
@@ -139,7 +139,7 @@ def _show_blocks(
     caption: str,
     ends: int | None,
 ) -> None:
-    """A table, or several below each other if it would be too wide.
+    """Print a table, or several below each other if it would be too wide.
 
     Args:
         title: above it.
@@ -149,7 +149,7 @@ def _show_blocks(
         ends: number of the row after which there is a line.
     """
     console = console_for_tables(WIDTH)
-    # Not by tables, which would make them as narrow as they are.
+    # Printed apart, as tables would wrap them to their own width.
     console.print(title, style="italic", markup=False, highlight=False)
     for block in _side_by_side(who, columns, console.width):
         table = Table()
@@ -163,7 +163,7 @@ def _show_blocks(
 
 
 def _show_predictions(people: Sequence[dict[str, Any]]) -> None:
-    """How held-out actions are predicted, and whether the model explains each person."""
+    """Print each person's scores of held-out actions and verdict of the model check."""
     scores: dict[str, list[str]] = {}
     if any(person["test"] for person in people):
         for name in ("NLL", "floor", "accuracy"):
@@ -177,8 +177,8 @@ def _show_predictions(people: Sequence[dict[str, Any]]) -> None:
         "How held-out actions are predicted, and whether the model explains each person",
         ["person", *(person["id"] for person in people)],
         [[name, *cells] for name, cells in scores.items()],
-        "NLL in nats an action; floor: their own entropy; base rate: NLL by how often they did "
-        "each before; no implants: if they were the robot",
+        "NLL in nats an action; floor: entropy of the person's own choices; base rate: NLL of the "
+        "frequencies of their actions in training; no implants: NLL if the person were the robot",
         ends=None,
     )
 
@@ -186,7 +186,7 @@ def _show_predictions(people: Sequence[dict[str, Any]]) -> None:
 def _side_by_side(
     who: Sequence[str], columns: Sequence[Sequence[str]], width: int
 ) -> list[list[Sequence[str]]]:
-    """Columns in as few blocks as fit, each beside the names."""
+    """Split columns into as few blocks as fit, each beside the names."""
     blocks: list[list[Sequence[str]]] = []
     left = 0
     for column in columns:
@@ -200,7 +200,7 @@ def _side_by_side(
 
 
 def _show_entropy(people: list[dict[str, Any]], sites: Iterable[str]) -> None:
-    """Posterior entropy of perceptual implants, and the most informative next scenario."""
+    """Print the posterior entropy of perceptual implants and the most informative scenario."""
     if not people:
         return
     entropy, shared = (

@@ -1,4 +1,4 @@
-"""The human model of somebody of whom it is known what they see: what inference can add at most."""
+"""The human model of a person whose sight is known: an upper bound on what inference can add."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from mirror_ppl.models.implants import ASSUMES, SIGHT
 from mirror_ppl.models.self_model import SelfModel
 
 ROUNDING = 1e-4
-"""Distances that differ by less are the same."""
+"""Distances that differ by less are equal."""
 
 
 class KnownSight(HumanModel):
-    """Somebody of whom it is known what they see and take for granted, by site; see `truth`."""
+    """A human model with perceptual implants fixed at ``known`` values, by site."""
 
     known: Mapping[str, Tensor] = MappingProxyType({})
 
     def prior(self) -> dict[str, Tensor]:
-        """As of everybody, but for what is known."""
+        """Sample the implants of every person, known ones fixed."""
         with FixedSites(self.known):
             return super().prior()
 
 
 class FixedSites(Messenger):
-    """Sites with finite support have one value for certain, the index of it ``[]`` by name."""
+    """Fixes sites with finite support at one value, given by name as its index ``[]``."""
 
     def __init__(self, values: Mapping[str, Tensor]) -> None:
         super().__init__()
@@ -49,10 +49,10 @@ class FixedSites(Messenger):
 
 
 def known_sight(self_model: SelfModel, person: Demonstrations) -> KnownSight:
-    """The human model of one simulated person, given what they truly see and take for granted.
+    """Make the human model of a simulated person, given their true perceptual implants.
 
     Raises:
-        InputError: the recording does not tell.
+        InputError: the recording lacks the true values.
     """
     truth = {
         name: value
@@ -60,14 +60,14 @@ def known_sight(self_model: SelfModel, person: Demonstrations) -> KnownSight:
         if name.startswith((SIGHT, ASSUMES)) and not bool(value.isnan().any())
     }
     if not truth:
-        raise InputError(f"of people of {person.domain} it is not known what they see")
+        raise InputError(f"recordings of {person.domain} lack the truth of what people see")
     human = KnownSight(self_model)
     human.known = {name: _place_of(human.domain, name, value[0]) for name, value in truth.items()}
     return human
 
 
 def _place_of(domain: Domain, site: str, value: Tensor) -> Tensor:
-    """Which of its values a site has."""
+    """Index of a site's value among its possible values."""
     if not site.startswith(SIGHT):
         return value.long()
     bins = torch.tensor(domain.reach_bins).to(value)

@@ -1,4 +1,4 @@
-"""What was learned of people: it predicts rounds, and may stand for them in a communicator."""
+"""Results of learners: they predict rounds, and may stand for people in a communicator."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 
 SAME_DRAWS = 16
-"""Most draws that are planned with where all are the same: they differ in chance alone, of which
-each has several courses. To a network whatever is told is something new, so that its messages are
-many and planning with it takes longest."""
+"""Most draws to plan with where all are the same: they differ in noise alone, of which each has
+several realizations. To a network any message is informative, so that it has many candidates and
+planning with it takes longest."""
 
 
 class Learned(Protocol):
-    """What was learned of P people."""
+    """Result of a learner, for P people."""
 
     def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Log-probabilities of actions in rounds of theirs, ``[P, B, T, A]``."""
+        """Log-probabilities of actions in their rounds, ``[P, B, T, A]``."""
         ...
 
 
 class Plannable(Learned, Protocol):
-    """What was learned, with which messages can be planned."""
+    """Result of a learner with which messages can be planned."""
 
     def person(self, number: int, draws: int) -> Person:
-        """One of the people, with so many draws."""
+        """Return one of the people, with at most ``draws`` draws."""
         ...
 
 
@@ -49,11 +49,11 @@ class Posterior:
     draws: Mapping[str, Tensor]
 
     def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Of the mean over draws."""
+        """Log of the mean probabilities over draws."""
         return predictive(predict_rounds(self.human, rounds, self.draws))
 
     def person(self, number: int, draws: int) -> Person:
-        """Draws from all over the posterior."""
+        """Return one of the people, with evenly spaced posterior draws."""
         first = next(iter(self.draws.values()))
         some = torch.linspace(0, len(first) - 1, min(draws, len(first))).long()
         own = {name: value[some, number : number + 1] for name, value in self.draws.items()}
@@ -65,10 +65,10 @@ class Trained:
     """Networks of P people.
 
     Attributes:
-        ensemble: theirs, from each of E beginnings.
-        self_model: the robot's, for what it knows of the world.
-        setting: which lets people see what they see by themselves.
-        world: in which the robot plans, with what it learned of rewards.
+        ensemble: their networks, from each of E initializations.
+        self_model: the robot's, for its knowledge of the world.
+        setting: the setting, which limits unaided sight.
+        world: in which the robot plans, with inferred rewards.
     """
 
     ensemble: tuple[RecurrentNetworks, ...]
@@ -77,12 +77,12 @@ class Trained:
     world: Domain
 
     def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Of the mean over each person's networks."""
+        """Log of the mean probabilities over each person's networks."""
         each = [networks.log_probabilities(rounds) for networks in self.ensemble]
         return torch.stack(each).logsumexp(0) - math.log(len(each))
 
     def person(self, number: int, draws: int) -> Person:
-        """One of the people, each of whose networks is as probable."""
+        """Return one of the people, whose networks are equally probable."""
         human = NetworkPerson(
             self.self_model,
             RecurrentNetworks.ensemble(self.ensemble, number),
@@ -99,16 +99,16 @@ class Regressed:
     model: PooledLogistic
 
     def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """Of each person's weights."""
+        """Log-probabilities by each person's weights."""
         return self.model.log_probabilities(rounds)
 
 
 @dataclass(frozen=True)
 class BaseRates:
-    """How often P people did each thing, whatever the state: ``[P, A]``."""
+    """Frequencies of P people's actions, whatever the state: ``[P, A]``."""
 
     shares: Tensor
 
     def log_predictive(self, rounds: Demonstrations) -> Tensor:
-        """The same at every step."""
+        """Log-frequencies, the same at every step."""
         return self.shares.log()[:, None, None].expand(*rounds.shape, -1)

@@ -1,7 +1,7 @@
-"""Models of people that are compared: one interface for MIRROR, its parts, and its baselines.
+"""Learners: one interface for MIRROR, its ablations and its baselines.
 
-A learner gets rounds of people and their robot's self-model. What it learned predicts other rounds
-of the same people and, if it can be planned with, stands for a person in a communicator.
+A learner gets rounds of people and the robot's self-model. Its result predicts other rounds of the
+same people and, if messages can be planned with it, stands for a person in a communicator.
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ from mirror_ppl.people import simulate, simulated_people
 from mirror_ppl.training.guide_file import network_for
 
 TRAINING = 20
-"""Rounds that there are to learn from, the first ones."""
+"""Number of training rounds, the first ones."""
 VALIDATION, TEST = slice(20, 30), slice(30, 36)
-"""Rounds by which baselines stop their training, and held-out ones, as in the supplement."""
+"""Validation rounds of baselines, and held-out rounds, as in the supplement."""
 RECORDED = 36
 OTHERS = 100_000
-"""Seed of the others from whom a population is learned."""
+"""Seed of the other people from whom a population is learned."""
 EACH = 1_000_000
-"""Seeds of the networks of an ensemble are as far apart."""
+"""Distance between the seeds of an ensemble's networks."""
 Fit = Callable[..., RecurrentNetworks]
 OptionsOf = Callable[..., Any]
 
 
 @dataclass(frozen=True)
 class Group:
-    """Simulated people in whom learners are tried.
+    """Simulated people on whom learners are evaluated.
 
     Attributes:
         domain: the world.
         setting: its setting.
-        population: of whom there are more.
-        people: how many, P.
+        population: from which the people are drawn.
+        people: number of people, P.
         seed: of the people and their rounds.
-        told: chance that an item that can be communicated is told, at each step of their rounds.
+        told: probability that a communicable item is communicated, at each step of their rounds.
     """
 
     domain: str
@@ -78,7 +78,7 @@ class Group:
 
     @lru_cache(maxsize=4)  # noqa: B019 - groups are values
     def recordings(self, rounds: int = RECORDED) -> Demonstrations:
-        """Rounds of these people."""
+        """Simulate rounds of these people."""
         return simulate(
             self.domain,
             self.setting,
@@ -90,7 +90,7 @@ class Group:
         )
 
     def listeners(self, rounds: int) -> list[Listener]:
-        """These people, and other rounds of theirs in which they can be spoken to."""
+        """Return these people with other rounds, to be played with messages."""
         everybody = simulated_people(
             self.domain, self.setting, self.population, self.people, self.seed
         )
@@ -98,13 +98,13 @@ class Group:
 
     @property
     def self_model(self) -> SelfModel:
-        """The robot's, as it ships."""
+        """The robot's self-model, as it ships."""
         return load_self_model(shipped_weights(self.domain), self.domain)[0]
 
 
 Learn = Callable[[Group, int, int, int], Learned]
-"""Learns of a group from their first rounds, with a seed of everything random, and so many networks
-of each person."""
+"""Learns from a group's first rounds: arguments are the group, the number of rounds, a seed of
+everything random, and the number of networks of each person."""
 
 
 def _mirror(
@@ -128,7 +128,7 @@ def _mirror(
 
 
 def _known_sight(group: Group, rounds: int, seed: int, members: int) -> Posterior:
-    """The human model of each person, given what they truly see and take for granted."""
+    """Infer each person's policy implants, given their true perceptual implants."""
     del members
     train, each = group.recordings().select_rounds(slice(rounds)), []
     for person in train.people:
@@ -141,7 +141,7 @@ def _known_sight(group: Group, rounds: int, seed: int, members: int) -> Posterio
 
 @cache
 def population_of(group: Group) -> Population:
-    """The population that a group is from, as far as all their training rounds tell."""
+    """Infer the population of a group from all their training rounds."""
     human = load_human_model(None, group.self_model)
     rounds = group.recordings(TRAINING)
     fit_world(human, rounds)
@@ -158,21 +158,21 @@ def _parts(group: Group, rounds: int) -> tuple[Demonstrations, Demonstrations]:
 def _trained(
     group: Group, train: Demonstrations, ensemble: tuple[RecurrentNetworks, ...]
 ) -> Trained:
-    # What rewards say of the world is nothing about people, so baselines get to know it, too.
+    # World parameters inferred from rewards say nothing about people, so baselines get them, too.
     human = load_human_model(None, group.self_model)
     fit_world(human, train)
     return Trained(ensemble, human.self_model, group.setting, planning_domain(human, {}))
 
 
 def _networks(fit: Fit, options: OptionsOf, sight: Sight, pooled: bool = False) -> Learn:
-    """Recurrent networks, of each person or, pooled, the same ones of everybody."""
+    """Make a learner of recurrent networks, one for each person or, pooled, one for all."""
 
     def learn(group: Group, rounds: int, seed: int, members: int) -> Trained:
         train, validation = own = _parts(group, rounds)
         if pooled:
             own = (as_one_person(train), as_one_person(validation))
         settings = options(group.domain, sight=sight)
-        # Seeds of the members of an ensemble, that of the first one being the group's.
+        # The first member of an ensemble has the group's seed.
         found = [fit(*own, settings, seed + EACH * member) for member in range(members)]
         if pooled:
             found = [networks.shared_by(train.people) for networks in found]
@@ -215,18 +215,18 @@ LEARNERS: dict[str, Learn] = {
     "logistic": _logistic,
     "base-rate": _base_rate,
 }
-"""Everything that can be compared, in the order in which it is shown. Engines are ``importance``
-but for those of other names; ``mirror-pooled`` infers the population of the same people with them,
-``mirror-population`` has a prior learned from others, and ``mirror-known-sight`` is told what the
-people see. Baselines get what the setting lets people see, which MIRROR has to find out, but for
-those that read ``everything``, as the human model is given it; ``informed`` ones are given what a
-message means, too. Pooled ones have one network for all people."""
+"""Learners, in the order in which they are shown. The engine is ``importance`` unless the name has
+another. ``mirror-pooled`` infers the population jointly with the people, ``mirror-population`` has
+a prior learned from other people, ``mirror-known-sight`` is given the true sight. Baselines are
+given what the setting shows, which MIRROR has to infer; those with ``everything`` read all that
+could be seen, as the human model does, those with ``informed`` also get the meaning of messages,
+and those with ``pooled`` have one network for all people."""
 ASKED_FOR = ("mirror-known-sight", "bc-informed", "bc-informed-pooled", "sqil-informed")
-"""Of these what is compared in prediction on request only: it is given what nobody has, or what
-messages mean where there are none."""
+"""Learners compared in prediction on request only: they are given the true sight, or the meaning of
+messages where there are none."""
 SLOW = ("mirror-nuts",)
-"""Of these what is compared on request only, besides what is slow in a world by its record: a chain
-of each person takes minutes."""
+"""Learners compared on request only, besides those that a world's record names as slow: a chain of
+each person takes minutes."""
 PLANNABLE = (
     "mirror",
     "perceptual-only",
@@ -236,7 +236,7 @@ PLANNABLE = (
     "bc-informed",
     "sqil",
 )
-"""Of these what drives a communicator in the comparison of assistance."""
+"""Learners that drive a communicator in the assistance study."""
 ALSO_PLANNABLE = (
     "mirror-pooled",
     "mirror-population",
@@ -246,29 +246,29 @@ ALSO_PLANNABLE = (
     "sqil-informed",
     "sqil-pooled",
 )
-"""And what does so on request."""
+"""Learners that do so on request."""
 
 
 def is_own(name: str) -> bool:
-    """Whether it names a human model in a file, ``path/to/file.py:Class``."""
+    """True if a name is that of a human model in a file, ``path/to/file.py:Class``."""
     return ".py:" in name
 
 
 def learns_from_nothing(name: str) -> bool:
-    """Whether a learner has something to say without any round: human models have a prior."""
+    """True if a learner predicts without any round: human models have a prior."""
     return is_own(name) or not name.startswith(("bc", "sqil", "logistic", "base-rate"))
 
 
 def learn(name: str, group: Group, rounds: int, seed: int, members: int = 1) -> Learned:
-    """What a learner makes of the first rounds of a group.
+    """Train a learner on the first rounds of a group.
 
     Args:
-        name: in ``LEARNERS``, or ``path/to/file.py:Class``, a human model of somebody's own, with
-            the engine ``importance``.
+        name: in ``LEARNERS``, or ``path/to/file.py:Class``, a user's human model, with the engine
+            ``importance``.
         group: the people.
-        rounds: how many are learned from; none only where :func:`learns_from_nothing`.
+        rounds: number of training rounds; 0 only where :func:`learns_from_nothing`.
         seed: of everything random.
-        members: networks of each person, where there are any.
+        members: number of networks of each person, for learners that have networks.
 
     Raises:
         UnknownNameError: there is no such learner.

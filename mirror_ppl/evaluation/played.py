@@ -1,4 +1,4 @@
-"""Rounds that somebody played while they were spoken to: rewards, messages, what was relevant."""
+"""Results of rounds that a person played with a communicator: rewards, messages, relevance."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Played:
     Attributes:
         task: reward of the task, ``[R]``.
         cost: of the messages, ``[R]``.
-        mishaps: steps in which went wrong what the domain calls a mishap, ``[R]``.
-        items: communicated items by modality, ``[R]`` each.
-        relevant: those of them that were relevant, by notion of relevance and modality, ``[R]``.
-        chances: items that could have been communicated, by modality, summed over rounds.
-        steps: of all rounds, as long as they were under way: decisions.
+        mishaps: number of steps with the domain's mishap, ``[R]``.
+        items: number of communicated items by modality, ``[R]`` each.
+        relevant: number of relevant ones, by notion of relevance and modality, ``[R]``.
+        chances: number of communicable items, by modality, summed over rounds.
+        steps: number of decisions: steps of all rounds before their ends.
         milliseconds: mean time of a decision.
-        log: what was decided, one entry a decision, if asked for.
-        hears: in the end, probability that messages of each modality reach the person; nothing of
-            who does not ask.
+        log: one entry per decision, if requested.
+        hears: final probability that messages of each modality reach the person; empty for
+            communicators that do not infer it.
     """
 
     task: list[float]
@@ -45,7 +45,7 @@ class Played:
 
     @classmethod
     def joined(cls, parts: Sequence[Played]) -> Played:
-        """Rounds that were played one after the other."""
+        """Join rounds that were played one after the other."""
         first, steps = parts[0], sum(one.steps for one in parts)
 
         def listed(name: str) -> list:
@@ -79,7 +79,7 @@ class Played:
 
 
 class Tally:
-    """What R rounds add up to, see `Played`."""
+    """Accumulates the results of R rounds, see `Played`."""
 
     def __init__(self, domain: Domain, channels: Channels, rounds: int) -> None:
         self.domain, self.channels = domain, channels
@@ -91,7 +91,7 @@ class Tally:
         self.steps = 0
 
     def add_messages(self, observation: Observation, flags: Tensor, under_way: Tensor) -> None:
-        """Count messages ``[R, N]`` of a step, and what could have been communicated."""
+        """Count messages ``[R, N]`` and communicable items of a step."""
         self.steps += int(under_way.sum())
         self.cost += self.channels.cost(flags)
         messages, may = self.channels.split(flags), self.domain.communicable(observation)
@@ -111,7 +111,7 @@ class Tally:
         self.mishaps += (terms[self.domain.mishap[0]][0] < 0).long()
 
     def played(self, seconds: float, log: list[dict[str, Any]]) -> Played:
-        """The rounds, of which decisions took so many seconds."""
+        """Return the results of the rounds, whose decisions took ``seconds`` in all."""
         return Played(
             self.task.tolist(),
             self.cost.tolist(),

@@ -1,10 +1,10 @@
-"""The oracle for worlds of few states: the best that could be said, by everything within reach.
+"""The oracle for worlds of few states: optimal messages by backward induction.
 
-Like `mirror_ppl.domains.driving.oracle`, for domains in which the world and what a person has in
-mind take few enough states together to list them all, whatever the time: which states can be
-reached under any messages and actions is worked out once, and backward induction over the steps of
-a round goes over that list. What a person will have in mind next may be chance; the oracle knows
-what they have in mind, and how likely what comes next is.
+Like `mirror_ppl.domains.driving.oracle`, for domains whose joint states of world and mind are few
+enough to be listed. The states that are reachable under any messages and actions are listed once,
+whatever the time, and backward induction over the steps of a round runs over that list. A person's
+next state of mind may be random; the oracle knows their present one and the probabilities of the
+next.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from mirror_ppl.people.base import SimulatedPeople
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, row_numbers
 
 MOST_ITEMS = 2
-"""Items of the largest messages that are looked at: there is always another step to say more."""
+"""Items of the largest messages considered: later steps can communicate more."""
 CHUNK = 256
-"""States that are looked at at once; bounds memory."""
+"""States that are expanded at once; bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class _Wave:
     Attributes:
         node: the state of each choice ``[C]``, from 0 within the wave.
         message: flags ``[C, items]``.
-        chance: of what they have in mind then ``[C, G]``.
-        probability: of their actions ``[C, G, A]``.
+        chance: probability of each state of mind then ``[C, G]``.
+        probability: of the person's actions ``[C, G, A]``.
         reward: of the actions in each state ``[n, A]``.
-        following: names of the states that follow, ``[C, G, A]``.
-        name: of each of these states, once ``[m]``; ``state`` and ``memory`` ``[m]`` are they.
+        following: names of the next states, ``[C, G, A]``.
+        name: of each distinct next state ``[m]``; ``state`` and ``memory`` ``[m]`` hold them.
     """
 
     node: Tensor
@@ -52,10 +52,10 @@ class _Wave:
 
 
 class ReachableOracle:
-    """The best messages for one person in given rounds.
+    """Optimal messages for one person in given rounds.
 
     Args:
-        person: exactly as they are, P = 1.
+        person: the true person, P = 1.
         start: states ``[R]`` in which rounds begin.
 
     Attributes:
@@ -75,7 +75,7 @@ class ReachableOracle:
         self.value = self._value[self._place(begin)]
 
     def messages(self, step: int, state: Any, memory: Any) -> Tensor:
-        """Flags ``[R, items]`` of what to say to people ``[1, R]`` at a step."""
+        """Flags ``[R, items]`` of the optimal messages in states ``[1, R]`` at a step."""
         names = _names(self.person, *(map_state(lambda p: p[0], part) for part in (state, memory)))
         return self._flags[self._best[step, self._place(names)]]
 
@@ -83,7 +83,7 @@ class ReachableOracle:
         return self._order[torch.searchsorted(self._sorted, names)]
 
     def _everything(self, state: Any, memory: Any, names: Tensor) -> tuple[Tensor, list[_Wave]]:
-        """Names of all states that can be reached, and what can be said in each, in that order."""
+        """Names of all reachable states, and the choices in each, in that order."""
         first, _ = distinct_rows(names[:, None])
         waiting = [(names[first], _at(state, first), _at(memory, first))]
         order, waves = [names[first]], []
@@ -102,7 +102,7 @@ class ReachableOracle:
         return torch.cat(order), waves
 
     def _look(self, state: Any, memory: Any) -> _Wave:
-        """What can be said in states ``[n]``, and what follows."""
+        """Expand states ``[n]``: their choices and the next states."""
         domain, person, number = self.domain, self.person, len(self.domain.actions)
         observation = domain.observe(state)
         over = domain.over(state)
@@ -116,7 +116,7 @@ class ReachableOracle:
             part[0] if isinstance(part, Tensor) else map_state(lambda each: each[0], part)
             for part in person.branches(before, seen, told)
         )
-        # Of messages after which they know and want the same, the cheapest is enough.
+        # Of messages with the same effect on the person's mind, the cheapest is enough.
         minds = _numbers(person.kept(after), 1)
         effect = torch.cat([node[:, None], minds, as_whole_numbers(chance)], -1)
         order = self.channels.cost(message).argsort(stable=True)
@@ -184,7 +184,7 @@ class ReachableOracle:
 
 
 def _small_messages(domain: Domain) -> Tensor:
-    """Messages of few items, flags ``[M, items]``, silence first; nothing that everybody knows."""
+    """Messages of few items, flags ``[M, items]``, silence first; no items that all people know."""
     channels = Channels(domain)
     known = channels.join(domain.known(domain.nothing_known()))
     single = torch.eye(len(channels), dtype=torch.bool)[~known]
@@ -206,18 +206,18 @@ def _at(parts: Any, rows: Tensor | int) -> Any:
 
 
 def _within(known: Tensor, names: Tensor) -> Tensor:
-    """Which names are among sorted ones."""
+    """True for names that are among the sorted ones."""
     place = torch.searchsorted(known, names).clamp(max=len(known) - 1)
     return known[place] == names
 
 
 def _numbers(parts: Any, dimensions: int) -> Tensor:
-    """All there is of tensors as whole numbers ``[..., N]``, behind so many dimensions."""
+    """Flatten all tensors to whole numbers ``[..., N]``, but for their leading dimensions."""
     rows = [as_whole_numbers(part[..., None]).flatten(dimensions) for part in vars(parts).values()]
     return torch.cat(rows, -1)
 
 
 def _names(person: SimulatedPeople, state: Any, memory: Any) -> Tensor:
-    """A whole number ``[n]`` for each state of world and mind, equal where both are."""
+    """A whole number ``[n]`` for each state of world and mind, equal for equal states."""
     rows = torch.cat([_numbers(state, 1), _numbers(person.kept(memory), 1)], -1)
     return row_numbers(rows, 2)

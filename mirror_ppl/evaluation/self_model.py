@@ -1,9 +1,9 @@
-"""How good a self-model is: its returns, and its agreement with exact planners in any view.
+"""Quality of a self-model: its returns, and its agreement with exact planners in any view.
 
-In full view the yardstick is the exact planner that knows everything. In partial view it is the
-exact planner of the world as somebody with that view believes it to be who remembers everything
-and makes every assumption (see `mirror_ppl.training.views`). Where these leave something
-open, the return of somebody who assumes nothing is all there is to compare.
+In full view the reference is the exact planner that knows everything. In partial view it is the
+exact planner of the world as believed by an observer with that view who remembers everything and
+makes every assumption (see `mirror_ppl.training.views`). Where assumptions do not settle the world,
+only the return of an observer who assumes nothing is measured.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mirror_ppl.training.views import ViewPlan
 CLEAR_DECISION = 0.2
 """Difference of action values, in units of reward, above which a decision counts as clear."""
 TIE = 1e-4
-"""Difference of action values up to which one is as good as the other."""
+"""Difference of action values up to which they count as equal."""
 
 
 def fixed_views(
@@ -33,17 +33,17 @@ def fixed_views(
     reach: tuple[float, ...] | None = None,
     speech: bool = False,
 ) -> ViewPlan:
-    """The same view of B rounds: up to ``reach`` in each direction (everything unless given).
+    """Make one view for B rounds: up to ``reach`` in each direction (everything unless given).
 
     The observer remembers: what follows from earlier observations counts as visible.
 
     Args:
         domain: the world.
         batch: number of rounds B.
-        generator: source of the numbers that a plan needs; they decide nothing here.
-        reach: distance for each direction; given, the observer makes every assumption where that
-            leaves nothing open, and none elsewhere.
-        speech: whether everything is also told.
+        generator: source of the numbers that a plan needs; they have no effect here.
+        reach: distance for each direction; if given, the observer makes every assumption where
+            assumptions settle the world, and none elsewhere.
+        speech: True if everything is also communicated.
     """
     farthest = (domain.reach_bins[-1],) * len(domain.directions)
     some = torch.ones(batch, device=generator.device)
@@ -101,20 +101,19 @@ def self_model_quality(
         rounds: number of rounds B.
         seed: seed of the rounds.
         discount: the discount that the self-model was trained with.
-        progress: told how many views are done, and of how many.
+        progress: called with the number of views that are done, and of all views.
 
     Returns:
-        By name: mean returns of the exact planner, of random actions and of the self-model in
-        ``full`` view (everything shown and told), where there is such a setting in ``clear`` view
-        (everything shown, nothing told), where assumptions leave something open also in its
-        partial views;
-        without an exact planner all that does not need it;
-        where the robot was taught wrong, in ``full`` view as it really is (``return_as_it_is``) and
-        of the planner there (``return_exact_as_it_is``); ``share_*``, how far these
-        are on the way from random to exact; and for several views ``agreement_*``, the share of
-        decisions that agree with the exact planner of that view, and ``clear_agreement_*``, of
-        those in which more than ``CLEAR_DECISION`` is at stake. Decisions are compared along
-        rounds with one random action in five.
+        Numbers by name; those that need an exact planner only where there is one.
+        ``return_*``: mean returns of the exact planner, of random actions, and of the self-model
+        in ``full`` view (everything shown and communicated), in ``clear`` view (nothing
+        communicated) if it is a setting, in partial views if assumptions do not settle the world.
+        ``return_as_it_is`` and ``return_exact_as_it_is``, where the robot believes in a wrong
+        world: returns of the self-model in ``full`` view and of the planner in the true world.
+        ``share_*``: these returns as a share of the way from random to exact.
+        ``agreement_*``: share of decisions that agree with the exact planner of a view;
+        ``clear_agreement_*``: of those in which more than ``CLEAR_DECISION`` is at stake. Decisions
+        are compared along rounds with one random action in five.
     """
     domain = self_model.domain.as_believed
     device = next(self_model.parameters()).device
@@ -180,7 +179,7 @@ def _agreement(
 def _exact_values(
     domain: Domain, start: Any, actions: Tensor, plan: ViewPlan, discount: float
 ) -> Tensor:
-    """Values ``[B, T, A]`` of the world as the observer believes it to be."""
+    """Exact action values ``[B, T, A]`` of the world as the observer believes it to be."""
     states = roll_out(domain, start, actions)
     _, knowledge = follow(domain, plan, domain.observe(states))
     believed = supposed(domain, plan, states, knowledge)

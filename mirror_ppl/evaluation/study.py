@@ -1,4 +1,4 @@
-"""What is compared: how learners predict people, and how much those help who plan with them.
+"""Studies: how well learners predict people, and how much planning with them helps.
 
 Rows are tidy: one person, one model, one number of rounds in each.
 """
@@ -47,25 +47,25 @@ CODE = (
     "row_hashing.py",
     "data/assets/*guide*.safetensors",
 )
-"""Files whose change makes earlier results worthless."""
+"""Files whose change invalidates earlier results."""
 BEGINNINGS = 100
-"""Rounds whose beginnings tell whether a setting hides anything."""
+"""Initial states that are drawn to test if a setting hides anything."""
 EVERYTHING = "-everything"
-"""How learners end that read all that could be seen."""
+"""Suffix of learners that read everything that could be seen."""
 MEMBERS = 5
-"""Networks of each person with which messages are planned, so that their planner is unsure, too."""
+"""Networks of each person to plan messages with, so that their planner is uncertain, too."""
 UTILITY, KL = "mirror", "mirror-kl"
-"""The planner by expected utility, and that which makes beliefs alike: of ``mirror`` alone."""
+"""The planner by expected utility, and that by KL of beliefs, which only ``mirror`` has."""
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """A learner in a group.
+    """A learner in a group, as a cell of the prediction study.
 
     Attributes:
         group: the people.
         model: the learner.
-        rounds: how many it learns from.
+        rounds: number of training rounds.
     """
 
     group: Group
@@ -74,15 +74,15 @@ class Prediction:
 
     @property
     def label(self) -> str:
-        """What it is, for people who wait."""
+        """Name in progress messages."""
         return _label(self)
 
 
 def predict(cell: Prediction) -> Rows:
-    """How well a learner predicts held-out rounds: a row for each person.
+    """Score a learner's predictions of held-out rounds: a row for each person.
 
-    Columns of their own: ``nll`` in nats an action, ``accuracy``, ``floor`` (the person's own
-    entropy).
+    Additional columns: ``nll`` in nats an action, ``accuracy``, ``floor`` (entropy of the person's
+    own choices).
     """
     group = cell.group
     test = group.recordings().select_rounds(TEST)
@@ -97,14 +97,14 @@ def predict(cell: Prediction) -> Rows:
 
 @dataclass(frozen=True)
 class Assistance:
-    """Communicators that plan with what a learner made of some rounds, or that learn nothing.
+    """Communicators that plan with a learner, or a reference, as a cell of the assistance study.
 
     Attributes:
         group: the people.
         model: the learner, or one of ``REFERENCES``.
-        rounds: how many it learns from; 0 of references.
-        played: rounds of each person in which they are spoken to.
-        draws: posterior draws that are planned with; 0 of references.
+        rounds: number of training rounds; 0 for references.
+        played: rounds of each person that are played with messages.
+        draws: posterior draws to plan with; 0 for references.
     """
 
     group: Group
@@ -115,21 +115,21 @@ class Assistance:
 
     @property
     def label(self) -> str:
-        """What it is, for people who wait."""
+        """Name in progress messages."""
         return _label(self)
 
 
 def assist(cell: Assistance) -> Rows:
-    """What people gain and are told: a row for each person and communicator.
+    """Measure returns and messages: a row for each person and communicator.
 
-    Columns of their own: means a round of ``task``, ``cost``, ``net`` and ``mishaps``; in all
-    rounds ``items`` of each modality, and how many were relevant by each notion. The rounds are the
-    same for all communicators, and others than those that were learned from.
+    Additional columns: means per round of ``task``, ``cost``, ``net`` and ``mishaps``; totals of
+    ``items`` of each modality, and of those that were relevant by each notion. The rounds are the
+    same for all communicators, and were not learned from.
     """
     group, learned = cell.group, None
     if cell.model not in REFERENCES:
         learned = cast(Plannable, learn(cell.model, group, cell.rounds, group.seed, MEMBERS))
-    # Networks learn from recordings whether people react to messages, and get no more to find out.
+    # Networks learn from recordings if people react to messages, so this is not inferred.
     taken_for_granted = 1.0 if isinstance(learned, Trained) else None
     options, rows = PlannerOptions.of(group.domain, hears=taken_for_granted), []
     for number, listener in enumerate(group.listeners(cell.played)):
@@ -159,18 +159,18 @@ def assist(cell: Assistance) -> Rows:
 def prediction_cells(
     group: Group, models: Sequence[str], rounds: Sequence[int]
 ) -> list[Prediction]:
-    """What is to be predicted of a group.
+    """List the prediction cells of a group.
 
     Args:
         group: the people.
-        models: learners, and human models in files of their own, ``path/to/file.py:Class``; all
-            learners that can learn there unless given, but for slow ones.
-        rounds: numbers of rounds that are learned from.
+        models: learners, or human models in files, ``path/to/file.py:Class``; all applicable
+            learners except slow ones unless given.
+        rounds: numbers of training rounds.
 
     Raises:
         UnknownNameError: there is no such learner.
-        HumanModelError: a file has no such human model, or it does not keep to the contract.
-        AssetError: one needs a trained guide, which there is not.
+        HumanModelError: a file has no such human model, or the model breaks its contract.
+        AssetError: a learner needs a trained guide that does not ship.
     """
     chosen, guide = _known(models, tuple(LEARNERS), group), _has_guide(group.domain)
     if "mirror-amortized" in chosen and not guide:
@@ -179,7 +179,7 @@ def prediction_cells(
         left_out = {*SLOW, *get_domain(group.domain).record.slow, *ASKED_FOR}
         if not guide:
             left_out.add("mirror-amortized")
-        # Who reads everything is somebody else only where something is hidden.
+        # Learners that read everything differ from others only where something is hidden.
         ends = (EVERYTHING,) if _shows_everything(group) else ()
         chosen = [name for name in LEARNERS if name not in left_out and not name.endswith(ends)]
     return [Prediction(group, name, number) for name in chosen for number in sorted({*rounds})]
@@ -188,7 +188,7 @@ def prediction_cells(
 def assistance_cells(
     group: Group, models: Sequence[str], rounds: Sequence[int], played: int, draws: int
 ) -> list[Assistance]:
-    """Who is to speak to a group; arguments as above and of `Assistance`."""
+    """List the assistance cells of a group; arguments as above and of `Assistance`."""
     known = (*PLANNABLE, *ALSO_PLANNABLE, *REFERENCES)
     chosen = _known(models, known, group)
     if not chosen:
@@ -203,14 +203,14 @@ def assistance_cells(
 
 
 def _objectives(model: str) -> tuple[str, ...]:
-    """Whose messages are played: of a learner the planners, of a reference itself."""
+    """Communicators that are played: a learner's planners, or the reference itself."""
     if model in REFERENCES:
         return (model,)
     return (UTILITY, KL) if model == UTILITY else (UTILITY,)
 
 
 def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], str]:
-    """What results of a cell depend on besides the cell: the code, and the self-model's weights."""
+    """Return a function of a cell that identifies the code and weights its results depend on."""
     digest, root = hashlib.sha256(torch.__version__.encode()), Path(__file__).parents[1]
     for part in CODE:
         for path in sorted(root.glob(part)):
@@ -231,7 +231,7 @@ def identities(domains: Iterable[str]) -> Callable[[Prediction | Assistance], st
 
 
 def _known(models: Sequence[str], known: Sequence[str], group: Group) -> list[str]:
-    """Each of the models once, in the order in which they are shown; then people's own."""
+    """Each model once, in the order in which they are shown; then those in users' files."""
     own = [name for name in dict.fromkeys(models) if is_own(name)]
     for name in models:
         if name not in known and name not in own:
@@ -242,7 +242,7 @@ def _known(models: Sequence[str], known: Sequence[str], group: Group) -> list[st
 
 
 def _shows_everything(group: Group) -> bool:
-    """Whether the setting hides nothing that could be seen as rounds begin."""
+    """True if the setting hides nothing visual at the beginning of rounds."""
     domain = get_domain(group.domain)
     begin = domain.observe(domain.initial(BEGINNINGS, torch.Generator().manual_seed(0)))
     return bool(domain.visibility(group.setting, begin)["visual"].all())

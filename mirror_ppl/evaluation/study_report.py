@@ -1,4 +1,4 @@
-"""What a study says: tables and sentences to read, data to keep, and a picture."""
+"""Reports of studies: tables, sentences, data and a picture."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from mirror_ppl.plots.study import plot_curves, plot_relevance
 
 @dataclass(frozen=True)
 class Report:
-    """What a study says.
+    """Report of a study.
 
     Attributes:
-        tables: to read.
-        sentences: to read, too.
-        data: all that is in them, and more.
-        picture: of it.
+        tables: to print.
+        sentences: to print below the tables.
+        data: all numbers of the tables and sentences, and more.
+        picture: figure of the results.
     """
 
     tables: list[TextTable]
@@ -116,7 +116,7 @@ def _claimed(claim: Claim) -> str:
 def _tables(
     results: Sequence[ModelResult], title: str, floor: Mapping[Place, float]
 ) -> list[TextTable]:
-    """One a place."""
+    """One table per place."""
     tables = []
     for place in dict.fromkeys(one.place for one in results):
         here = [one for one in results if one.place == place]
@@ -148,7 +148,7 @@ def _entry(one: ModelResult | None, people: int) -> str:
     if one is None:
         return ""
     text = f"{one.measured.mean:.3f}"
-    if one.people < people:  # Something failed: it is not of the same people as the others.
+    if one.people < people:  # Something failed, so the people differ from those of the others.
         text += f" ({one.people} of {people} people)"
     if one.mirror is None:
         return text
@@ -161,13 +161,13 @@ def _ahead(mirror: Paired, digits: int) -> str:
 
 
 def difference(ahead: Interval, digits: int) -> str:
-    """The advantage of one over another, and below it its interval."""
+    """Format an advantage, with its interval on the next line."""
     low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
     return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]"
 
 
 def _ways(ways: Sequence[Way]) -> list[TextTable]:
-    """One a place."""
+    """One table per place."""
     tables = []
     for place in dict.fromkeys(one.place for one in ways):
         here = [one for one in ways if one.place == place]
@@ -234,4 +234,4 @@ REPORTS: dict[str, Callable[[Rows], Report]] = {
     "assistance": _assistance,
     "relevance": _relevance,
 }
-"""By study."""
+"""Makers of reports, by study."""

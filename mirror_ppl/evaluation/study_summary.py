@@ -1,9 +1,9 @@
-"""What a study shows: means, paired differences with intervals, and how often one is better.
+"""Summaries of studies: means, paired differences and probabilities of improvement.
 
-People are the sample: differences are taken person by person, intervals are of the bootstrap over
+People are the sample: differences are paired by person, intervals are from the bootstrap over
 people (of all seeds), and the probability of improvement is the share of people in whom the first
-of two does better, ties counting half (Agarwal et al., *Deep reinforcement learning at the edge of
-the statistical precipice*, 2021, with people in the place of runs).
+of two models is better, ties counting half (Agarwal et al., *Deep reinforcement learning at the
+edge of the statistical precipice*, 2021, with people in the place of runs).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from mirror_ppl.evaluation.tables import Rows
 RESAMPLES = 2000
 LEVELS = (0.05, 0.95)
 FIRST, POOLED = "mirror", "mirror-pooled"
-"""What others are compared with; the second where they pool people, too."""
+"""Models that others are compared with; the second for those that pool people."""
 POOLING = ("bc-pooled", "bc-informed-pooled", "sqil-pooled", "logistic")
-"""What learns of a person from others."""
+"""Baselines that learn about a person from others."""
 NONE, ORACLE = "none", "oracle"
-"""Where the way to the oracle begins and ends."""
+"""Communicators at the beginning and the end of the way to the oracle."""
 BASELINES = ("bc", "bc-everything", "sqil", "sqil-everything", "logistic")
-"""With whom MIRROR is compared: those of the paper, and pooled logistic regression."""
+"""Baselines that MIRROR is compared with: the paper's, and pooled logistic regression."""
 
 
 class Place(NamedTuple):
-    """Where people are compared."""
+    """Domain, setting and population of a comparison."""
 
     domain: str
     setting: str
@@ -49,12 +49,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Paired:
-    """How much better one does than another in the same people.
+    """Paired comparison of two models in the same people.
 
     Attributes:
-        ahead: by how much; above 0 the first is better.
-        improvement: share of people in whom it is better.
-        people: how many.
+        ahead: mean difference; above 0 the first is better.
+        improvement: share of people in whom the first is better.
+        people: number of people.
     """
 
     ahead: Interval
@@ -64,15 +64,15 @@ class Paired:
 
 @dataclass(frozen=True)
 class ModelResult:
-    """A model that learned from some rounds.
+    """Result of a model that learned from some rounds.
 
     Attributes:
-        place: where.
+        place: of the comparison.
         model: its name.
-        rounds: how many; 0 if it learns nothing.
-        measured: the mean over people.
-        people: how many.
-        mirror: how far MIRROR with the same rounds is ahead (``mirror-pooled`` of models that pool
+        rounds: number of training rounds; 0 if it learns nothing.
+        measured: mean over people.
+        people: number of people.
+        mirror: advantage of MIRROR with the same rounds (of ``mirror-pooled`` over models that pool
             people, if it is there), or with the most where the model learns nothing; ``None`` where
             there is none.
     """
@@ -98,16 +98,15 @@ class Claim:
 
 @dataclass(frozen=True)
 class Way:
-    """How far a model comes on the way from silence to the oracle.
+    """Share of the way from silence to the oracle that a model reaches.
 
     Attributes:
-        place: where.
+        place: of the comparison.
         model: its name.
-        rounds: that it learned from.
-        people: how many.
-        share: of the way, 1 for all of it, of mean net returns; ``None`` without these two.
-        learned: net return that learning from rounds gained over its prior alone; ``None`` of what
-            has none.
+        rounds: number of training rounds.
+        people: number of people.
+        share: of the way in mean net return, 1 for all of it; ``None`` without silence or oracle.
+        learned: net return gained over the model's prior alone; ``None`` without a prior.
     """
 
     place: Place
@@ -120,18 +119,18 @@ class Way:
 
 @dataclass(frozen=True)
 class Share:
-    """How much of what a communicator sent was relevant.
+    """Share of a communicator's items that was relevant.
 
     Attributes:
-        place: where.
-        model: what it planned with.
-        rounds: that this learned from.
-        modality: of the communicated items; ``all`` together.
-        items: how many were communicated.
-        share: of them that was relevant; ``None`` if there were none.
-        mirror: how much larger MIRROR's share is, with as many rounds or, for a model that learns
-            nothing, with the most; over people who got messages from both. ``None`` for itself,
-            and where there are no such people.
+        place: of the comparison.
+        model: with which messages were planned.
+        rounds: number of training rounds.
+        modality: of the communicated items; ``all`` for all together.
+        items: number of communicated items.
+        share: of the items that was relevant; ``None`` if there were none.
+        mirror: advantage of MIRROR's share, with as many rounds or, for a model that learns
+            nothing, with the most; over people with messages from both. ``None`` for MIRROR, and
+            where there are no such people.
     """
 
     place: Place
@@ -144,7 +143,7 @@ class Share:
 
 
 def interval(values: np.ndarray) -> Interval:
-    """Of the mean of ``[n]`` people."""
+    """Mean of ``[n]`` people's values, with its bootstrap interval."""
     low, high = np.quantile(values[_drawn(len(values))].mean(1), LEVELS)
     return Interval(float(values.mean()), float(low), float(high))
 
@@ -157,7 +156,7 @@ def paired(first: np.ndarray, second: np.ndarray) -> Paired:
 
 
 def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[ModelResult]:
-    """How each model does at each number of rounds, and how far MIRROR is ahead of it.
+    """Summarize each model at each number of rounds, with MIRROR's advantage over it.
 
     Args:
         rows: of a study.
@@ -176,7 +175,7 @@ def summarize_study(rows: Rows, measure: str, sign: int = 1) -> list[ModelResult
 def few_against_many(
     rows: Rows, measure: str, sign: int = 1, baselines: Iterable[str] = BASELINES
 ) -> list[Claim]:
-    """MIRROR with the fewest rounds against its baselines with the most, where there are both."""
+    """Compare MIRROR with the fewest rounds to baselines with the most, where there are both."""
     values = _by_model(rows, measure)
     found = []
     for place in dict.fromkeys(place for place, _, _ in values):
@@ -195,7 +194,7 @@ def few_against_many(
 
 
 def ways_to_oracle(rows: Rows) -> list[Way]:
-    """How far each model comes on the way to the oracle; the bootstrap draws people.
+    """Compute each model's share of the way to the oracle; the bootstrap draws people.
 
     Args:
         rows: of a study of assistance.
@@ -221,10 +220,9 @@ def ways_to_oracle(rows: Rows) -> list[Way]:
 
 
 def relevance(rows: Rows, notion: str, modalities: Sequence[str]) -> list[Share]:
-    """Share of the communicated items that was relevant; the bootstrap draws people.
+    """Compute the share of communicated items that was relevant; the bootstrap draws people.
 
-    A share is of the items that all people got together. MIRROR is ahead by the mean of the
-    differences person by person.
+    A share pools the items of all people. MIRROR's advantage is the mean of paired differences.
 
     Args:
         rows: of a study of assistance, of one domain.
@@ -271,7 +269,7 @@ def means_table(results: Sequence[ModelResult]) -> pd.DataFrame:
 
 
 def shares_table(shares: Sequence[Share]) -> pd.DataFrame:
-    """Shares and intervals as columns, with place, model, rounds and modality; NaN of nothing."""
+    """Shares and intervals as columns, with place, model, rounds and modality; NaN if missing."""
     nothing = Interval(np.nan, np.nan, np.nan)
     return pd.DataFrame(
         [
@@ -284,7 +282,7 @@ def shares_table(shares: Sequence[Share]) -> pd.DataFrame:
 
 
 def floors(rows: Rows) -> dict[Place, float]:
-    """Mean entropy of people's own choices, where it is known of everybody."""
+    """Mean entropy of people's own choices, where it is known for all people."""
     found = {}
     for place in dict.fromkeys(_place(row) for row in rows):
         own = {_who(row): row["floor"] for row in rows if _place(row) == place}
@@ -296,7 +294,7 @@ def floors(rows: Rows) -> dict[Place, float]:
 def _by_model(
     rows: Rows, measure: str
 ) -> dict[tuple[Place, str, int], dict[tuple[int, str], float]]:
-    """Values of each person."""
+    """Each person's value, by place, model and number of rounds."""
     found: dict[tuple[Place, str, int], dict[tuple[int, str], float]] = {}
     for row in rows:
         key = (_place(row), row["model"], row["rounds"])
@@ -339,5 +337,5 @@ def _both(
 
 
 def _drawn(number: int) -> np.ndarray:
-    """Whom each resample is of, ``[RESAMPLES, n]``; always the same."""
+    """Indices of each resample's people, ``[RESAMPLES, n]``; always the same."""
     return np.random.default_rng(0).integers(number, size=(RESAMPLES, number))

@@ -1,4 +1,4 @@
-"""Tables of text, for a terminal and for a page."""
+"""Tables of text, for terminals and for Markdown pages."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table to be read.
+    """A table of text.
 
     Attributes:
-        title: what is in it.
-        caption: what entries mean.
-        heads: of its columns; all but the first have numbers.
+        title: above the table.
+        caption: meaning of the entries, below the table.
+        heads: of the columns; all but the first have numbers.
         rows: entries, which may have several lines.
     """
 
@@ -43,14 +43,14 @@ class TextTable:
         for row in self.rows:
             table.add_row(*map(Text, row))
         console = console_for_tables(WIDTH)
-        # Not by the table, which would make them as narrow as it is.
+        # Printed apart, as the table would wrap them to its own width.
         console.print(self.title, style="italic", markup=False, highlight=False)
         console.print(table, end="")
         console.print(f"({self.caption})\n", style="dim", markup=False, highlight=False)
 
     @property
     def markdown(self) -> str:
-        """The same for a page."""
+        """The table as Markdown."""
         lines = [
             self.heads,
             ("---", *("---:" for _ in self.heads[1:])),

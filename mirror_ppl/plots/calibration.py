@@ -1,4 +1,4 @@
-"""Whether posteriors are right about people of whom everything is known, as pictures."""
+"""Figures of simulation-based calibration: ranks and coverage."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE, PURPLE
 
 BARS = 0.999
-"""Share of the bars of right posteriors that end inside of the band."""
+"""Share of the bars of calibrated posteriors that end inside of the band."""
 ERRORS = 2
-"""Standard errors to which bars of coverage reach on either side."""
+"""Standard errors that bars of coverage show on either side."""
 RIGHT, REJECTED, BAND = BLUE, ORANGE, "#d4d4d4"
 EDGE = "#555555"
 LEVEL_STYLES = tuple(zip(LEVELS, (PURPLE, ORANGE, BLUE), ("s", "^", "o"), strict=True))
 LETTERS = 24
-"""Of the name of a site in one line."""
+"""Most characters of a site's name in one line."""
 COLUMNS = 4
 
 
 def plot_ranks(calibration: Calibration) -> Picture:
     """Draw histograms of the truth's rank among the draws: rows are sites, columns rounds.
 
-    Right posteriors give a flat histogram, 99.9% of whose bars end inside of the grey band. Those
-    that are too narrow give one that is high at both ends, too wide ones a hill, and shifted ones a
-    slope. The bars are those of
-    :func:`mirror_ppl.inference.calibration.uniformity.histogram_p_value`, relative to what is
-    expected.
+    Calibrated posteriors give a flat histogram, 99.9% of whose bars end inside of the grey band.
+    Too narrow ones give a histogram that is high at both ends, too wide ones a hill, and shifted
+    ones a slope. The bars are those of
+    :func:`mirror_ppl.inference.calibration.uniformity.histogram_p_value`, relative to their
+    expectation.
     """
     edges = rank_edges(calibration.people, calibration.draws)
     expected = calibration.people * np.diff(edges) / edges[-1]
@@ -62,7 +62,7 @@ def plot_ranks(calibration: Calibration) -> Picture:
     _title(
         figure,
         "Are ranks of the truth uniform?",
-        f"grey: where {BARS:.1%} of the bars of right posteriors end; orange: rejected",
+        f"grey: where {BARS:.1%} of the bars of calibrated posteriors end; orange: rejected",
     )
     figure.supxlabel("rank of the truth among the draws", fontsize=11)
     figure.supylabel("people, relative to expected", fontsize=11)
@@ -70,11 +70,11 @@ def plot_ranks(calibration: Calibration) -> Picture:
 
 
 def plot_ecdf(calibration: Calibration) -> Picture:
-    """Draw which share of people has ranks below each, minus what is expected: rows are sites.
+    """Draw the empirical distribution function of ranks, minus a uniform one's: rows are sites.
 
-    Of right posteriors the whole line stays inside of the grey band, but for half of the failure
-    rate; the other half is for histograms. Lines that stay above 0 belong to posteriors that are
-    too high, lines that rise and then fall below 0 to too narrow ones.
+    For calibrated posteriors the whole line stays inside of the grey band, except for half of the
+    failure rate; the other half is for histograms. Lines that stay above 0 indicate posteriors that
+    are too high, lines that rise and then fall below 0 too narrow ones.
     """
     # Each of the two tests fails half as often, where there are people enough for both.
     both = np.isfinite(calibration.table()["p_histogram"].to_numpy()).all()
@@ -92,7 +92,7 @@ def plot_ecdf(calibration: Calibration) -> Picture:
     _title(
         figure,
         "Are ranks of the truth uniform?",
-        f"grey: {100 * (1 - rate):g}% of lines of right posteriors stay inside; orange: rejected",
+        f"grey: holds {100 * (1 - rate):g}% of calibrated posteriors' lines; orange: rejected",
     )
     figure.supxlabel("rank of the truth among the draws, as a share", fontsize=11)
     figure.supylabel("share below, minus expected", fontsize=11)
@@ -100,10 +100,9 @@ def plot_ecdf(calibration: Calibration) -> Picture:
 
 
 def plot_coverage(calibration: Calibration) -> Picture:
-    """Draw how often central intervals hold the truth, against the number of rounds.
+    """Draw the coverage of central intervals against the number of rounds, one panel per site.
 
-    One panel a site. Bars are two binomial standard errors to either side; dotted lines are what
-    right posteriors have.
+    Bars are two binomial standard errors to either side; dotted lines are the nominal coverage.
     """
     coverage, error = calibration.coverage, calibration.coverage_error
     sites = coverage["site"].values.tolist()
@@ -119,7 +118,7 @@ def plot_coverage(calibration: Calibration) -> Picture:
         for level, colour, marker in LEVEL_STYLES:
             ax.axhline(level, color=colour, lw=1.2, ls=":")
             handles[f"{level:.0%} interval"] = ax.errorbar(
-                # Side by side, so that bars of neighbouring levels can be told apart.
+                # Side by side, so that bars of neighbouring levels can be distinguished.
                 place + 0.08 * (LEVELS.index(level) - 1),
                 coverage.sel(site=site, level=level).values,
                 ERRORS * error.sel(site=site, level=level).values,
@@ -141,7 +140,7 @@ def plot_coverage(calibration: Calibration) -> Picture:
     _title(
         figure,
         "How often do intervals hold the truth?",
-        f"{calibration.people} people; bars: two standard errors; dotted: right posteriors",
+        f"{calibration.people} people; bars: two standard errors; dotted: nominal coverage",
     )
     figure.supylabel("share of people", fontsize=11)
     figure.legend(

@@ -1,4 +1,4 @@
-"""Decisions to speak: what messages are worth, and what they lead people to do."""
+"""Figures of communication decisions: gains of messages, and predicted actions."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from mirror_ppl.plots.reading import BLACK, BLUE, GREY
 
 PALE = "#b9bec4"
 WORDS = {"visual": "shown", "verbal": "said"}
-"""What is done with items of a modality; its name where there is no word for it."""
+"""Verb for items of a modality; the modality's name where there is none."""
 MOST = 12
-"""Candidates that are drawn unless another number is asked for."""
+"""Default number of candidates that are drawn."""
 WRAP = 46
 """Characters in a line of a candidate's name."""
 
 
 def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
-    """Draw what candidates of a decision gain over silence, with 90% intervals.
+    """Draw the gains of a decision's candidates over silence, with 90% intervals.
 
-    Silence is a square at 0. As far as there is room these are drawn: silence and the chosen
-    candidate; the two best of the others; everything at once; each item by itself; and of what is
-    left the best.
+    Silence is a square at 0. Candidates are drawn in this order of preference: silence and the
+    chosen one; the two best of the others; everything at once; each item by itself; the best of the
+    rest.
 
     Args:
         decision: with candidates to choose from.
-        most: how many candidates are drawn, at least 2.
+        most: most candidates that are drawn, at least 2.
 
     Raises:
-        ValueError: there was nothing to choose from, or too few are to be drawn.
+        ValueError: the decision has no candidates to choose from, or ``most`` is below 2.
     """
     if most < 2:  # noqa: PLR2004 - silence and the chosen one
         raise ValueError(f"at least 2 candidates have to be drawn, not {most}")
@@ -58,7 +58,7 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
     ax = figure.subplots()
     place = np.arange(len(drawn))
     ax.barh(place, means, 0.66, color=colours)
-    # Silence gains nothing over itself, and is not uncertain about that.
+    # The gain of silence over itself is 0, without uncertainty.
     spread = [row for row, index in enumerate(drawn) if index != 0]
     ax.errorbar(
         np.array(means)[spread],
@@ -77,7 +77,7 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
     ax.set_xlabel("gain over silence in units of reward, cost taken off")
     ax.spines[["top", "right", "left"]].set_visible(False)
     ax.tick_params(axis="y", length=0, pad=8)
-    title = f"What could be said, and what it is worth: {len(drawn)} of {len(gains)} candidates"
+    title = f"Gains of candidate messages over silence: {len(drawn)} of {len(gains)} candidates"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     handles = [
         Patch(fc=BLUE),
@@ -121,7 +121,7 @@ def _columns(ax: Axes, means: Sequence[float], costs: Sequence[float]) -> None:
 
 
 def _drawn(candidates: Tensor, chosen: int, order: list[int], most: int) -> list[int]:
-    """Which of the candidates ``[C, L, N]`` to draw, in the given order of their gains."""
+    """Select the candidates ``[C, L, N]`` to draw, in the given order of their gains."""
     now, later = candidates[:, 0], candidates[:, 1:].flatten(1).any(1)
     everything = ((now == now.any(0)).all(1) & ~later).tolist()
     alone = ((now.sum(1) == 1) & ~later).tolist()
@@ -138,7 +138,7 @@ def _drawn(candidates: Tensor, chosen: int, order: list[int], most: int) -> list
 
 
 def plot_action(decision: Decision, action: str = "switch") -> Picture:
-    """Draw how probable an action is in the steps ahead, without and with what was chosen.
+    """Draw an action's predicted probability in steps ahead, for silence and the chosen message.
 
     Args:
         decision: of an objective that predicts actions.
@@ -146,7 +146,7 @@ def plot_action(decision: Decision, action: str = "switch") -> Picture:
 
     Raises:
         UnknownNameError: there is no such action.
-        ValueError: there was nothing to choose from, or the objective predicts no actions.
+        ValueError: the decision has no candidates, or the objective predicts no actions.
     """
     found, actions = _found(decision), decision.domain.actions
     number = actions.index(require_known(action, "action", actions))
@@ -173,7 +173,7 @@ def plot_action(decision: Decision, action: str = "switch") -> Picture:
 
 
 def candidate_name(channels: Channels, candidate: Tensor) -> str:
-    """A candidate ``[L, N]`` in words: what is communicated now, and what in the steps after."""
+    """Describe a candidate ``[L, N]``: items communicated now, and in the steps after."""
     parts = []
     for step, flags in enumerate(candidate):
         message = channels.message(flags)
@@ -184,8 +184,8 @@ def candidate_name(channels: Channels, candidate: Tensor) -> str:
 
 
 def in_words(message: Message) -> str:
-    """A message in words, such as "said rear-right, shown front-left"."""
-    # Modalities that tell more come last in domains, and first here.
+    """Describe a message, such as "said rear-right, shown front-left"."""
+    # More informative modalities come last in domains, and first here.
     parts = [
         f"{WORDS.get(name, name)} {' + '.join(items)}"
         for name, items in reversed(list(message.items.items()))

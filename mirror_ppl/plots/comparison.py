@@ -1,4 +1,4 @@
-"""How far human models are behind the best of them, person by person."""
+"""Figure of a comparison of human models: differences to the best one, also by person."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ MEASURES = {"loo": "leave-one-out", "heldout": "held-out rounds"}
 
 
 def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
-    """Draw each model's difference to the best one: of all rounds, and of each person's.
+    """Draw each model's difference to the best one, over all rounds and over each person's.
 
-    Models are rows, the best on top. Bars are one standard error to either side; where there is
-    but one round there is no bar.
+    Models are rows, the best on top. Bars are one standard error to either side; a single round has
+    no bar.
 
     Args:
         table: a row for each ``model``, the best first, over all rounds (``person`` is missing) and
             for each person, in one order: number of ``rounds``, ``elpd``, ``difference`` to the
             best and its standard error ``difference_se``, NaN where there is none.
-        by: what is predicted, a key of `MEASURES`.
+        by: the measure, a key of `MEASURES`.
     """
     totals = table.loc[table["person"].isna()].set_index("model")
     models = {str(model): own for model, own in table.groupby("model", sort=False)}
@@ -39,7 +39,7 @@ def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
     step = min(PERSON, MOST / len(people))
     below = [0.7 * LINE + step * place for place in range(len(people))]
     names = ["\n".join(textwrap.wrap(model, WRAP, break_on_hyphens=False)) for model in models]
-    # Down the picture in inches: a model's own line, and below it one person after the other.
+    # Positions from the top in inches: a model's own line, and below it one line per person.
     tops, down = [], 0.0
     for model, name in zip(models, names, strict=True):
         tops.append(down)

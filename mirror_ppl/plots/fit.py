@@ -1,4 +1,4 @@
-"""The pictures of a fit."""
+"""Figures of a fit."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 OPEN, CHECK = "open.png", "check.png"
 FILES = (*sight.FILES, CHECK, OPEN)
-"""Names of the files of all pictures that there may be."""
+"""Names of all picture files that a fit may write."""
 
 
 class FitPlots:
-    """Draws what was inferred of people; notebooks show what its methods return.
+    """Draws figures of a fit; notebooks show what its methods return.
 
     Args:
         data: the fit.
@@ -32,7 +32,7 @@ class FitPlots:
         self.data = data
 
     def sight(self) -> Picture:
-        """What each person sees: the road, the house, or how probably they notice what is there.
+        """Draw what each person sees: the road, the house, or probabilities of noticing items.
 
         Raises:
             InputError: there is no such picture of this world and human model.
@@ -40,7 +40,7 @@ class FitPlots:
         return self._of_sight("sight.png", "notices.png")
 
     def samples(self) -> Picture:
-        """Posterior samples of what each person sees, beside the truth where it is known.
+        """Draw posterior samples of what each person sees, beside the truth where it is known.
 
         Raises:
             InputError: there is no such picture of this world and human model.
@@ -48,26 +48,25 @@ class FitPlots:
         return self._of_sight("samples.png")
 
     def implants(self, person: str) -> Picture:
-        """Each implant of a person that is one number: posterior beside prior.
+        """Draw each implant of a person that is one number: posterior beside prior.
 
         Raises:
-            UnknownNameError: there is nobody of that id.
+            UnknownNameError: no person has that id.
         """
         return plot_implants(self.data, person)
 
     def identifiability(self) -> Picture:
-        """Posterior entropy of what people see, and the most informative scenarios.
+        """Draw posterior entropy of the perceptual implants, and the most informative scenarios.
 
         Raises:
-            InputError: the data identify everything, or the human model has nothing discrete to
-                see.
+            InputError: the data identify all perceptual implants, or none of them is discrete.
         """
         if not self._has_identifiability():
             raise InputError("nothing about what these people see is left to identify")
         return plot_identifiability(self.data)
 
     def check(self) -> Picture:
-        """Whether the model explains each person, see :func:`plot_model_check`.
+        """Draw the model check of each person, see :func:`plot_model_check`.
 
         Raises:
             InputError: there were no training rounds, so nothing was checked.
@@ -77,7 +76,7 @@ class FitPlots:
         return plot_model_check(self.data)
 
     def predictive_check(self) -> Picture:
-        """What people did beside what the model says that they do; of drivers, changes of lane.
+        """Draw people's actions beside the model's predictions; for drivers, changes of lane.
 
         Raises:
             InputError: there is no such picture of this world.
@@ -85,21 +84,21 @@ class FitPlots:
         return self._of_rounds("predictive_check")(self.data)
 
     def round(self, person: str, number: int, *, held_out: bool = False) -> Picture:
-        """One round over time; see :func:`mirror_ppl.domains.driving.rounds.plot_round`.
+        """Draw one round over time, see :func:`mirror_ppl.domains.driving.rounds.plot_round`.
 
         Raises:
             InputError: there is no such picture of this world.
-            UnknownNameError: there is nobody of that id, or no such round.
+            UnknownNameError: no person has that id, or there is no such round.
         """
         return self._of_rounds("round")(self.data, person, number, held_out=held_out)
 
     def files(self) -> dict[str, tuple[Picture, str]]:
-        """Every picture that a fit writes, with what it shows, by file name."""
+        """Draw all pictures that a fit writes; each with its description, by file name."""
         pictures = dict(sight.sight_pictures(self.data))
         if self.data["model_check"].sizes["check"]:
             pictures[CHECK] = self.check(), "whether the model explains each person"
         if self._has_identifiability():
-            shows = "what is open about what they see, and what would tell"
+            shows = "posterior entropy of what they see, and the most informative scenarios"
             pictures[OPEN] = plot_identifiability(self.data), shows
         return pictures
 

@@ -1,4 +1,4 @@
-"""Posterior entropy of the perceptual implants, and the expected information gain of rounds."""
+"""Figure of the posterior entropy of perceptual implants, and of rounds' information gain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Posteriors of a person's implants beside their priors, of any domain and human model."""
+"""Figure of a person's posteriors beside their priors, for any domain and human model."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ TITLES = {
     "consistency": "consistency of choices",
     "lapse": "lapses: choices at random",
 }
-"""What the implants of the package's own human model are called."""
+"""Titles of the implants of the package's own human model."""
 UNITS = {"consistency": "1 / unit of reward", "lapse": "probability"}
 WHOLE_ROAD = {12: "all"}
 VALUES = {name: WHOLE_ROAD for name in TITLES if name.startswith(SIGHT)}
 VALUES |= {name: {0: "no", 1: "yes"} for name in TITLES if name.startswith(ASSUMES)}
-"""What single values of implants are called."""
+"""Labels of single values of implants."""
 MOST_BARS = 25
-"""Whole numbers of more different values than this are drawn as a density."""
+"""Most distinct whole numbers that are drawn as bars; more are drawn as a density."""
 GRID = 400
 TAIL = 0.025
-"""Share of the draws at either end that the picture of a density leaves out."""
+"""Share of the draws at either end that a density's range leaves out."""
 
 
 def scalar_implants(data: az.InferenceData) -> list[str]:
@@ -63,7 +63,7 @@ def plot_implants(data: az.InferenceData, person: str) -> Picture:
         person: id of the person.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     posterior = of_person(data, "posterior", person)
     names = scalar_implants(data)
@@ -88,7 +88,7 @@ def plot_implants(data: az.InferenceData, person: str) -> Picture:
     for ax in grid.flat[len(names) :]:
         ax.set_axis_off()
     figure.suptitle(
-        f"What is known of {person}, before and after seeing them act",
+        f"Implants of {person}: prior and posterior",
         fontsize=13,
         fontweight="bold",
     )
@@ -112,7 +112,7 @@ def _bars(
     true: float | None,
     names: dict[int, str],
 ) -> None:
-    """Probabilities of each value, side by side; values take even steps, whatever lies between."""
+    """Draw probabilities of each value as bars; values are evenly spaced."""
     values = np.union1d(before, after)
     places = np.arange(len(values))
     for label, numbers, colour, shift in (
@@ -130,13 +130,13 @@ def _bars(
 
 
 def _densities(ax: Axes, before: np.ndarray, after: np.ndarray, true: float | None) -> None:
-    """Smoothed densities, over the range of all but the outermost draws."""
+    """Draw smoothed densities, over the range of all but the outermost draws."""
     known = [] if true is None else [true]
     ends = np.concatenate([np.quantile(numbers, [TAIL, 1 - TAIL]) for numbers in (before, after)])
     low, high = min(*ends, *known), max(*ends, *known)
     margin = 0.1 * (high - low) or 0.5
     low, high = low - margin, high + margin
-    # What is never negative is drawn down to 0, and what is not above 1 either, up to 1.
+    # Nonnegative quantities are drawn down to 0; those that are at most 1, too, up to 1.
     bounds = []
     if min(before.min(), after.min()) >= 0:
         bounds, low = [0], max(low, 0)
@@ -161,9 +161,9 @@ def kernel_density(numbers: np.ndarray, grid: np.ndarray, bounds: Iterable[float
     Args:
         numbers: the draws.
         grid: points, ``[G]``.
-        bounds: where the quantity ends; what the kernel puts beyond is reflected.
+        bounds: of the quantity; the density is reflected there.
     """
-    # Draws may come in groups that share a value; smoothed as if they were apart, they would show.
+    # The bandwidth counts repeated draws once; otherwise groups of equal draws would show as peaks.
     different = len(np.unique(numbers))
     spread = min(numbers.std(), np.subtract(*np.quantile(numbers, [0.75, 0.25])) / 1.34)
     # Draws that are (nearly) all the same become a narrow peak.
@@ -175,7 +175,7 @@ def kernel_density(numbers: np.ndarray, grid: np.ndarray, bounds: Iterable[float
 
 
 def _mark(ax: Axes, x: float) -> None:
-    """The truth: a line, and a triangle at its upper end."""
+    """Mark the truth by a line, with a triangle at its upper end."""
     top = ax.get_ylim()[1]
     ax.axvline(x, color=TRUE, lw=1.6, ls=(0, (4, 2)), zorder=3)
     ax.plot(

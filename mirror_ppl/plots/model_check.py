@@ -1,4 +1,4 @@
-"""Whether the human model explains each person."""
+"""Figure of the model check of each person."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ LIKELIHOODS = 3.6
 LEAST_WIDTH, CHARACTER = 1.4, 0.09
 """Inches of the left panel without ids, and of a character of an id."""
 WRAP, DARK = 12, 1.8
-"""Characters in a line of a name, and how deep a colour is that asks for white letters."""
+"""Characters in a line of a name, and the depth of a colour above which letters are white."""
 MOST_PEOPLE = 60
 
 
 def plot_model_check(data: az.InferenceData) -> Picture:
-    """Draw the posterior predictive checks of each person, and how held-out actions are predicted.
+    """Draw each person's posterior predictive checks and likelihoods of held-out actions.
 
-    Left: two-sided p-values, those blue of which there is more than the model says, those red of
-    which there is less; in frames those by which a person is suspect. Right, if rounds were held
-    out: nats an action by the model, by how often they did each before, and without implants.
+    Left: two-sided p-values, blue where there is more than the model predicts, red where there is
+    less; frames mark those that make a person suspect. Right, if rounds were held out: NLL in nats
+    an action of the model, of the base rate of each action, and of the model without implants.
 
     Args:
         data: with the group ``model_check``; of more than 60 people the first are drawn.
@@ -62,7 +62,7 @@ def plot_model_check(data: az.InferenceData) -> Picture:
 def _p_values(ax, group: xr.Dataset) -> None:
     values = group["p_value"].values
     tails = 2 * np.minimum(values, 1 - values)
-    # In powers of ten, to either side.
+    # As powers of ten, with the sign of the deviation.
     depth = -np.log10(tails.clip(1 / REPLICATES, 1))
     ax.imshow(
         np.where(values < 0.5, depth, -depth),

@@ -1,4 +1,4 @@
-"""How probably people notice each item at a step, in samples (supplement, Table II)."""
+"""Figure of people's probabilities to notice items, as samples (supplement, Table II)."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
 
 SAMPLES = 5
 MOST_PEOPLE = 12
-"""More people than this do not fit on one picture."""
+"""Most people on one picture."""
 ACROSS = 3
-"""Panels beside each other."""
+"""Panels in a row."""
 LEAST, MOST = 0.01, 0.5
 """Probabilities beyond which colours stay the same."""
 COLOURS = "YlGnBu"
 DARK = 0.55
-"""Where the colours get so dark that numbers on them have to be white."""
+"""Place on the colour scale above which numbers are white."""
 
 
 def has_notices(data: az.InferenceData) -> bool:
-    """Whether the posterior says of any item how probably it is noticed."""
+    """True if the posterior has probabilities of noticing items."""
     return bool(_sites(data))
 
 
 def notices_picture(data: az.InferenceData) -> Picture:
-    """A table for each person: posterior samples, and the truth where it is known.
+    """Draw a table for each person: posterior samples, and the truth where it is known.
 
     Of more than 12 people the first 12 are shown.
 
@@ -62,9 +62,9 @@ def notices_picture(data: az.InferenceData) -> Picture:
     explain(
         figure,
         data,
-        "How probably each person notices an item at a step",
+        "Probability that a person notices an item at a step",
         len(shown),
-        "Samples are of the posterior. The darker, the sooner it is noticed.",
+        "Samples are of the posterior. Darker items are noticed sooner.",
     )
     return figure
 
@@ -74,7 +74,7 @@ def _sites(data: az.InferenceData) -> list[str]:
 
 
 def _draw(ax: Axes, rows: dict[str, np.ndarray], items: list[str], first: bool) -> None:
-    """A table with a row of probabilities for each name; items are named in the first ones."""
+    """Draw a table with a row of probabilities for each name; ``first`` ones name the items."""
     values = np.stack(list(rows.values()))
     scale = LogNorm(LEAST, MOST)
     ax.imshow(values.clip(LEAST, MOST), cmap=COLOURS, norm=scale, aspect="auto")

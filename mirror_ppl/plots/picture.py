@@ -1,4 +1,4 @@
-"""Figures that notebooks show."""
+"""The figure class of the package, which notebooks show."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ LONGEST = 40
 
 
 class Picture(Figure):
-    """A matplotlib figure that belongs to no backend, and that a notebook shows all the same.
+    """A matplotlib figure without a backend, which notebooks can show.
 
-    It need not be closed: nothing but its user refers to it. All text is shown as it is, dollars
-    and backslashes too; characters that no font has are shown by their number.
+    It need not be closed, as pyplot does not refer to it. Text is shown literally, including
+    dollars and backslashes; characters that no font has are shown by their number.
     """
 
     def draw(self, renderer: Any) -> None:
-        """Draw it; see `matplotlib.figure.Figure.draw`."""
+        """Draw the figure, see `matplotlib.figure.Figure.draw`."""
         numbers = self._numbers()
         for text in self.findobj(Text):
             assert isinstance(text, Text)
@@ -41,7 +41,7 @@ class Picture(Figure):
                 text.set_parse_math(False)
                 text.set_text(displayable(text.get_text(), text.get_fontproperties()))
         with warnings.catch_warnings():
-            # Of labels of ticks, whose texts are made while they are drawn.
+            # For labels of ticks, whose texts are made while they are drawn.
             warnings.filterwarnings("ignore", "Glyph .* missing from font")
             super().draw(renderer)
 
@@ -57,7 +57,7 @@ class Picture(Figure):
         return {label for tick in ticks for label in (tick.label1, tick.label2)}
 
     def save(self, path: Path) -> None:
-        """Write it in the format of the path's suffix, whole or not at all.
+        """Write the figure atomically, in the format of the path's suffix.
 
         Raises:
             OutputError: the file cannot be written.
@@ -65,7 +65,7 @@ class Picture(Figure):
         write_whole(path, self.content(path.suffix[1:]))
 
     def content(self, kind: str = "png") -> bytes:
-        """What a file of that kind (png, pdf, svg) would hold."""
+        """Return the content of a file of that kind (png, pdf, svg)."""
         content = BytesIO()
         self.savefig(content, dpi=DOTS_PER_INCH, format=kind)
         return content.getvalue()
@@ -81,9 +81,9 @@ class SightPicture:
     """A picture of what people see.
 
     Attributes:
-        possible: whether a posterior can be drawn so.
+        possible: returns True if a posterior can be drawn this way.
         draw: draws it.
-        shows: what is to be seen, in words.
+        shows: description in words.
     """
 
     possible: Callable[[az.InferenceData], bool]
@@ -92,7 +92,7 @@ class SightPicture:
 
 
 def displayable(text: str, font: font_manager.FontProperties | None = None) -> str:
-    """The text with characters that the font lacks as their numbers, such as [U+1F600]."""
+    """Replace characters that the font lacks by their numbers, such as [U+1F600]."""
     if text.isascii():
         return text
     font = font or font_manager.FontProperties()
@@ -108,7 +108,7 @@ def displayable(text: str, font: font_manager.FontProperties | None = None) -> s
 
 
 def label_of(name: str) -> str:
-    """A person's id, or another name, as the label of a tick; of a long one the beginning."""
+    """Label of a tick for a person's id or another name, of which a long one is cut."""
     return displayable(
         name if len(name) <= LONGEST else name[: LONGEST - 1] + "\N{HORIZONTAL ELLIPSIS}"
     )

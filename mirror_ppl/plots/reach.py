@@ -1,4 +1,4 @@
-"""How far each person sees, in any world: probabilities of thresholds of sight, by distance."""
+"""Figure of the probability that a person sees items at a distance, for any world."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     import arviz as az
 
 MOST_PEOPLE = 40
-"""More people than this do not fit on one picture."""
+"""Most people on one picture."""
 COLOURS = "Blues"
 DARK = 0.6
-"""Where the colours get so dark that numbers on them have to be white."""
+"""Place on the colour scale above which numbers are white."""
 
 
 def has_reach(data: az.InferenceData) -> bool:
-    """Whether the world is known and the posterior says how far people see in each direction."""
+    """True if the world is known and the posterior has thresholds of sight in each direction."""
     try:
         directions = _domain(data).directions
     except UnknownNameError:
@@ -32,10 +32,10 @@ def has_reach(data: az.InferenceData) -> bool:
 
 
 def reach_picture(data: az.InferenceData) -> Picture:
-    """A table for each direction: the probability that a person sees what is that far away.
+    """Draw a table for each direction: the probability that a person sees an item at a distance.
 
-    A frame is around all distances that they really see, where that is known. Of more than 40
-    people the first 40 are shown.
+    A frame marks the distances that they truly see, where that is known. Of more than 40 people the
+    first 40 are shown.
 
     Args:
         data: with sites ``sight_*``, see :func:`has_reach`.
@@ -74,9 +74,9 @@ def reach_picture(data: az.InferenceData) -> Picture:
     explain(
         figure,
         data,
-        "Who sees how far",
+        "How far each person sees",
         len(shown),
-        "Probability that a thing at this distance is seen.\nFramed: what they really see.",
+        "Probability that an item at this distance is seen.\nFramed: the true distances.",
     )
     return figure
 

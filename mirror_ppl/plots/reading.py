@@ -1,4 +1,4 @@
-"""What figures read of an ``InferenceData`` of :mod:`mirror_ppl.inference.results.export`."""
+"""Access of figures to an ``InferenceData`` of :mod:`mirror_ppl.inference.results.export`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 SAMPLE = ("chain", "draw")
 TRUTH = "truth_"
 
-# Okabe and Ito's colours, which people of any colour vision tell apart.
+# Okabe and Ito's colours, which people of any colour vision can distinguish.
 BLUE, ORANGE, PURPLE, BLACK, GREY = "#0072B2", "#E69F00", "#CC79A7", "#000000", "#8a8a8a"
 POSTERIOR, PRIOR, TRUE, OBSERVED = BLUE, GREY, ORANGE, BLACK
 
@@ -30,17 +30,17 @@ def people(data: az.InferenceData) -> list[str]:
 
 
 def of_person(data: az.InferenceData, group: str, person: str) -> xr.Dataset:
-    """One group's variables of one person.
+    """Select one person's variables of a group.
 
     Raises:
-        UnknownNameError: there is nobody of that id.
+        UnknownNameError: no person has that id.
     """
     known = people(data)
     return data[group].isel(person=known.index(require_known(person, "person", known)))
 
 
 def draws(values: xr.DataArray) -> np.ndarray:
-    """Draws of a variable, chains one after the other, ``[S, ...]``."""
+    """Join the draws of a variable, chains one after the other, ``[S, ...]``."""
     ordered = values.transpose(*SAMPLE, ...).values
     return ordered.reshape(-1, *ordered.shape[len(SAMPLE) :])
 
@@ -55,7 +55,7 @@ def truth(data: az.InferenceData, name: str, person: str) -> float | None:
 
 
 def round_of(dataset: xr.Dataset, dimension: str, number: int) -> xr.Dataset:
-    """One round of a person.
+    """Select one round of a person.
 
     Args:
         dataset: the person's, with ``observed_action``, which is -1 in padding.
@@ -75,19 +75,19 @@ def round_of(dataset: xr.Dataset, dimension: str, number: int) -> xr.Dataset:
 
 
 def label_columns(axes: Iterable[Axes], titles: Iterable[str]) -> None:
-    """Titles above the first row of panels."""
+    """Set titles above the first row of panels."""
     for ax, title in zip(axes, titles, strict=True):
         ax.set_title(title, fontsize=10, loc="left")
 
 
 def explain(figure: Figure, data: az.InferenceData, title: str, shown: int, legend: str) -> None:
-    """What a figure of people shows, above it, and what its colours mean, below it.
+    """Set the title above a figure of people, and the legend of its colours below it.
 
     Args:
         figure: the figure.
-        data: what it shows people of.
-        title: what it shows of them.
-        shown: how many of them, from the first on.
+        data: the fit that it shows.
+        title: its title.
+        shown: number of people that it shows, from the first on.
         legend: of its colours.
     """
     setting = data["posterior"].attrs.get("setting")

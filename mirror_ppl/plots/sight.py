@@ -1,4 +1,4 @@
-"""The pictures of what people see, in whatever domain has some."""
+"""Figures of what people see, for every domain that has some."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 
 FILES = ("notices.png", "samples.png", "sight.png")
-"""Names that pictures of what people see may have."""
+"""File names that pictures of what people see may have."""
 OF_ANY_WORLD: Mapping[str, SightPicture] = {
     "sight.png": SightPicture(reach.has_reach, reach.reach_picture, "how far each person sees"),
     "notices.png": NOTICES_PICTURE,
 }
-"""By file name, of worlds that have no pictures of their own."""
+"""Pictures by file name, for worlds that have none of their own."""
 
 
 def sight_pictures(data: az.InferenceData) -> dict[str, tuple[Picture, str]]:
-    """What each person sees, and that in words, by file name; nothing of sight of other kinds."""
+    """Draw what each person sees; with descriptions, by file name, empty if none is possible."""
     return {
         name: (picture.draw(data), picture.shows)
         for name, picture in pictures_of(data).items()
@@ -34,12 +34,12 @@ def sight_pictures(data: az.InferenceData) -> dict[str, tuple[Picture, str]]:
 
 
 def pictures_of(data: az.InferenceData) -> Mapping[str, SightPicture]:
-    """The pictures of sight that there are of the world of a posterior, by file name."""
+    """Pictures of sight for a posterior's world, by file name."""
     return record_of(data).part("pictures") or OF_ANY_WORLD
 
 
 def record_of(data: az.InferenceData) -> Record:
-    """What is known of the world of a posterior; nothing of one that is not known here."""
+    """Record of a posterior's world; an empty one if the world is unknown here."""
     try:
         return get_domain(str(data["posterior"].attrs.get("domain", ""))).record
     except UnknownNameError:

@@ -1,4 +1,4 @@
-"""Learning curves and relevance: the figures of `python -m mirror_ppl.evaluate`."""
+"""Figures of `python -m mirror_ppl.evaluate`: learning curves and relevance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY, ORANGE, PURPLE
 
 PLACE = ["domain", "setting", "population"]
-"""Columns that say where people are compared."""
+"""Columns that identify a place: domain, setting and population."""
 Place = tuple[str, str, str]
 GREEN, VERMILION, SKY = "#009E73", "#D55E00", "#56B4E9"
 STYLES: dict[str, tuple[str, str, str]] = {
@@ -49,17 +49,17 @@ STYLES: dict[str, tuple[str, str, str]] = {
 }
 """Colour, line and mark of each model."""
 OTHER_LINES, OTHER_MARK = ("-", "--", "-.", ":"), "."
-"""Of models of one's own."""
+"""Lines and mark of users' models."""
 OFF_SCALE = 4.0
-"""Spans of the curves beyond which a level is named in words."""
+"""Distance from the curves, in their spans, beyond which a level is named in words."""
 NO_ROUNDS = 0.4
-"""Where on the logarithmic scale no rounds are."""
+"""Position of 0 rounds on the logarithmic scale."""
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
 
 
 class Look(NamedTuple):
-    """How a model is called and drawn."""
+    """Label and style of a model."""
 
     label: str
     colour: str
@@ -73,19 +73,18 @@ def plot_curves(
     floor: Mapping[Any, float] | None = None,
     by_ratio: bool = False,
 ) -> Picture:
-    """Draw a measure against the number of rounds, one panel a place; bands are 90% intervals.
+    """Draw a measure against the number of rounds, one panel per place; bands are 90% intervals.
 
-    A model that learns nothing and does so much better or worse that all others would look alike is
-    named in words.
+    A model that learns nothing and is so far from all others that these could not be distinguished
+    is named in words.
 
     Args:
         means: a row for each place (``domain``, ``setting``, ``population``), ``model`` and number
             of ``rounds``, with columns ``mean``, ``low`` and ``high``; models that learn from no
             rounds at all are level lines.
-        label: what is measured.
-        floor: what cannot be surpassed, by place (a tuple of the three), if it is known.
-        by_ratio: the measure is shown by its logarithm, so that what is near the floor can be told
-            apart beside what is far from it.
+        label: of the measure.
+        floor: bound that cannot be surpassed, by place (a tuple of the three), where it is known.
+        by_ratio: True for a logarithmic scale, which resolves values near the floor.
     """
     figure, panels = _panels(means)
     looks = _looks(means["model"])
@@ -123,12 +122,12 @@ def _panels(table: pd.DataFrame) -> tuple[Picture, Sequence[Axes]]:
 
 
 def _is_level(here: pd.DataFrame) -> np.ndarray:
-    """Which rows are of models that learn from no rounds whatever there are."""
+    """True for rows of models that learn from no rounds."""
     return here.groupby("model")["rounds"].transform("max").to_numpy() == 0
 
 
 def _far(here: pd.DataFrame) -> pd.DataFrame:
-    """Which levels are farther from the curves than ``OFF_SCALE`` times their span."""
+    """Levels that are farther from the curves than ``OFF_SCALE`` times their span."""
     level = _is_level(here)
     curves, levels = here.loc[~level], here.loc[level]
     low, high = curves["low"].min(), curves["high"].max()
@@ -138,7 +137,7 @@ def _far(here: pd.DataFrame) -> pd.DataFrame:
 
 
 def _logarithmic(ax: Axes) -> None:
-    """Show heights by their logarithm, with numbers that are read as such."""
+    """Set a logarithmic scale with plain numbers."""
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 4, 6, 8)))
     ax.yaxis.set_minor_locator(NullLocator())
@@ -157,7 +156,7 @@ def _curve(ax: Axes, own: pd.DataFrame, look: Look) -> None:
 
 
 def plot_relevance(shares: pd.DataFrame) -> Picture:
-    """Draw which share of messages was relevant, one panel a place, after all rounds.
+    """Draw the share of relevant messages after all rounds, one panel per place.
 
     Args:
         shares: columns as of `plot_curves` and ``modality``; NaN where nothing was communicated.
@@ -192,7 +191,7 @@ def _title(ax: Axes, place: Place) -> None:
 
 
 def _looks(models: Iterable[str]) -> dict[str, Look]:
-    """How each model looks; those of one's own are called by file and class if that is enough."""
+    """Label and style of each model; users' ones are labelled by file and class if unambiguous."""
     names = list(dict.fromkeys(models))
     own = [name for name in names if name not in STYLES]
     short = [name.rsplit("/", 1)[-1] for name in own]
@@ -204,7 +203,7 @@ def _looks(models: Iterable[str]) -> dict[str, Look]:
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One for all panels, each name once, models in the order of `STYLES`."""
+    """Draw one legend for all panels, models in the order of `STYLES`."""
     entries = {}
     for ax in panels:
         for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):

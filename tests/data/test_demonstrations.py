@@ -229,7 +229,7 @@ BAD = {
         f"id is '{'b' * 40}'..., expected {A_NAME}",
     ),
     "ids that are one text": (put(["people"], None, "abc"), "must be a list of ids, not 'abc'"),
-    "nobody": (put(["people"], None, ()), "there is nobody in it, expected at least one person"),
+    "nobody": (put(["people"], None, ()), "there are no people, expected at least one person"),
     "truth that files cannot name": (
         put(["truth"], None, {"a/b": torch.ones(3)}),
         f"truth has 'a/b', expected {A_NAME}, no /",
@@ -248,7 +248,7 @@ BAD = {
     ),
     "provenance that is a description": (
         put(["provenance"], None, {"domain": "x"}),
-        "provenance has domain, which is not a matter of origin",
+        "provenance has domain, which describes the file itself",
     ),
     "provenance that is a list": (
         put(["provenance"], None, {"seed": [1]}),
@@ -353,7 +353,7 @@ def test_select_people_refuses_what_is_not_there(ragged):
         ragged.select_people([3])
     with pytest.raises(DemonstrationsError, match="two people have the id 'a'"):
         ragged.select_people([0, 0])
-    with pytest.raises(DemonstrationsError, match="there is nobody"):
+    with pytest.raises(DemonstrationsError, match="there are no people"):
         ragged.select_people([])
 
 

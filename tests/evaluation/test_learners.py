@@ -78,4 +78,4 @@ def test_of_whom_it_is_not_known_what_they_see_is_refused():
     one = simulate("bomb_defusal", None, "paper", 1, 1, 100)
     with pytest.raises(InputError) as error:
         known_sight(Group("bomb_defusal", "unlabelled", "paper", 1, 0).self_model, one)
-    assert str(error.value) == "of people of bomb_defusal it is not known what they see"
+    assert str(error.value) == "recordings of bomb_defusal lack the truth of what people see"
