@@ -1,4 +1,4 @@
-"""The console script `mirror-ppl` and `python -m mirror_ppl`: the commands, and the list of them."""
+"""The console script `mirror-ppl`, and `python -m mirror_ppl`: every command, and their list."""
 
 import sys
 from collections.abc import Sequence

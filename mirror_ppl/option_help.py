@@ -106,9 +106,8 @@ def word_of(name: str, hint: Any) -> str | None:
 def description_of(text: str) -> str:
     """A description in lines that fit the terminal, indented: tyro would join others again."""
     columns = min(shutil.get_terminal_size().columns, MOST_COLUMNS)
-    return textwrap.indent(
-        textwrap.fill(" ".join(text.split()), columns - 2, break_on_hyphens=False), "  "
-    )
+    lines = textwrap.fill(" ".join(text.split()), columns - 2, break_on_hyphens=False)
+    return textwrap.indent(lines, "  ")
 
 
 def examples_of(prog: str, examples: Mapping[str, str]) -> str:
