@@ -2,10 +2,10 @@
 
 Sphinx with MyST rather than MkDocs Material, after a look at both:
 
-- The root of the repository is the folder of sources. README.md, CHANGELOG.md, docs/ and notebooks/
-  become pages where they are, so links that are written for a code host work here unchanged and are
-  checked; files that are no pages become downloads. MkDocs knows only one folder of pages, and needs
-  code that rewrites such links.
+- The root of the repository is the folder of sources. README.md, CHANGELOG.md, docs/ and
+  notebooks/ become pages where they are, so links that are written for a code host work here
+  unchanged and are checked; files that are no pages become downloads. MkDocs knows one folder of
+  pages, and needs code that rewrites such links.
 - MyST reads CommonMark as code hosts do, so lists and tables look the same in both places.
 - Roles in docstrings, such as :func:`infer`, are links without further code; stored outputs of
   notebooks have the look of the other pages.
@@ -31,7 +31,7 @@ version = release = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 include_patterns = ["README.md", "CHANGELOG.md", "docs/**", "notebooks/*.ipynb"]
-exclude_patterns = ["docs/_site"]
+exclude_patterns = [".*", "build", "docs/_site", "runs"]
 root_doc = "README"
 
 SITE = {
