@@ -50,5 +50,9 @@ def default_of(value: Any) -> str:
 
 
 def escaped(text: str) -> str:
-    """Plain text as Markdown, but for its code."""
-    return re.sub(r"([\\|<>*_\[\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)", r"\\\1", text)
+    """Plain text as Markdown, but for its code; options become code."""
+    parts = re.split(r"(`[^`]*`|(?<!\S)--[a-z]+(?:-[a-z]+)*)", text)
+    return "".join(
+        re.sub(r"([\\|<>*_\[\]])", r"\\\1", part) if place % 2 == 0 else f"`{part.strip('`')}`"
+        for place, part in enumerate(parts)
+    )

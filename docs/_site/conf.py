@@ -75,7 +75,6 @@ BELOW = {
 }
 """Pages below a page."""
 
-smartquotes = False  # they would take options for dashes
 # Notebooks are stored with their outputs.
 nb_execution_mode = "off"
 # Anchors of headings, as code hosts make them.
@@ -83,7 +82,7 @@ myst_heading_anchors = 4
 copybutton_exclude = ".linenos, .gp, .go"
 
 autodoc_default_options = {"members": True}
-autodoc_member_order = "groupwise"
+autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 napoleon_use_ivar = True

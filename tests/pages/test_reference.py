@@ -108,7 +108,8 @@ def test_commands_are_in_the_reference_as_their_help_tells_them(commands_page):
 
 
 def test_text_is_escaped_but_not_its_code(commands_page):
-    assert commands_page.escaped("a_b | `a_b` <c>") == r"a\_b \| `a_b` \<c\>"
+    told = commands_page.escaped("a_b | `a_b --c` <c> of --some-one, --two.")
+    assert told == r"a\_b \| `a_b --c` \<c\> of `--some-one`, `--two`."
 
 
 def test_every_page_is_in_the_site():
