@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import get_domain
-from mirror_ppl.domains.search_rescue import MOVES, walkable
+from mirror_ppl.domains.search_rescue import MOVES
+from mirror_ppl.domains.search_rescue.house import walkable
 
 ROAD_END, STAGES = 12, 3
 

@@ -1,10 +1,10 @@
-"""What this package's own choices are worth, in drivers in fog.
+"""Ablations of this package's own choices, for drivers in fog.
 
     python -m benchmarks.ablations
 
-Each row gives up one choice. Shown are held-out NLL in nats an action, net return of a round with
-the communicator ``mirror``, of ten people a seed with 20 rounds each, and how far the package is
-ahead in the same people. The table is printed and, for a page, written to ``ablations.md``.
+Each row replaces one choice. Shown are held-out NLL (nats per action) and net return per round with
+the communicator ``mirror``, for ten people a seed with 20 rounds each, and the advantage of the
+package in the same people. The table is printed and, for a page, written to ``ablations.md``.
 
 - ``relaxed``: sight thresholds on a continuous scale by a mean-field guide, where beliefs are the
   encoder's means, reparameterized draws, or draws without gradients (``benchmarks._relaxed``).
@@ -145,11 +145,11 @@ def table(found: Mapping[str, Measured], options: Options) -> TextTable:
     """All rows."""
     people = options.people * len(options.seeds)
     return TextTable(
-        f"{DOMAIN}, {SETTING}: what this package's own choices are worth",
-        f"mean over people ({people}), each with {TRAINING} rounds to learn from; below it how far "
-        f"what it is compared with is ahead, and the 90% interval of that: {REFERENCE} for "
-        f"self-models that were trained otherwise, {PACKAGE} for all others",
-        ("choice", "NLL (nats an action)", "net return of a round"),
+        f"{DOMAIN}, {SETTING}: ablations of this package's own choices",
+        f"mean over {people} people with {TRAINING} training rounds each; below it the advantage "
+        f"of the reference with its 90% interval; the reference is {REFERENCE} for self-models "
+        f"that were trained otherwise, and {PACKAGE} for all others",
+        ("choice", "NLL (nats per action)", "net return per round"),
         tuple(row(found, name) for name in found),
     )
 

@@ -3,9 +3,9 @@
     python -m benchmarks.regret
 
 The oracle's values say exactly what every message is worth to a simulated person, so what a planner
-loses is known for each of its decisions, without the luck of the round. Losses are units of reward
-a round, costs included: by silence where something should have been said, and by messages that were
-not the best. For people in fog of whom the posterior knows 20 rounds.
+loses is known for each of its decisions, without the chance of the round. Losses are in units of
+reward a round, costs included: by silence where something should have been said, and by messages
+that were not the best. For people in fog of whom the posterior knows 20 rounds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 from mirror_ppl.commands import fit
 from mirror_ppl.communication import RoundSoFar
 from mirror_ppl.domains.driving.oracle import Oracle
-from mirror_ppl.domains.driving.people import Drivers
+from mirror_ppl.domains.driving.people import SimulatedDrivers
 from mirror_ppl.evaluation.assistance import PlannerOptions, Truth, play, speaker
 from mirror_ppl.evaluation.assistance_cells import Pairing
 from mirror_ppl.training.experience import map_state
@@ -91,7 +91,7 @@ def lost(pairing: Pairing, number: int) -> Tensor:
     said = torch.stack(flags, 1)
     # What the last action was does not matter any more.
     actions = torch.nn.functional.pad(actions, [0, 1])
-    assert isinstance(listener.driver, Drivers)
+    assert isinstance(listener.driver, SimulatedDrivers)
     oracle = Oracle(listener.driver, map_state(lambda part: part[0], listener.start.state))
     losses = oracle.losses(said, actions)
     spoke = said.any(-1)

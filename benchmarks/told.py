@@ -23,7 +23,7 @@ from mirror_ppl.domains import Observation, Visibility, get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import DrivingState
 from mirror_ppl.domains.driving.participants import simulated_drivers
-from mirror_ppl.domains.driving.people import Drivers
+from mirror_ppl.domains.driving.people import SimulatedDrivers
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import at_step, messages_at
@@ -108,7 +108,7 @@ def main(options: Options) -> None:
 
 
 def tell(
-    driver: Drivers,
+    driver: SimulatedDrivers,
     state: DrivingState,
     modalities: Sequence[str],
     rate: float,
@@ -166,7 +166,7 @@ def divergence(person: Person, rounds: Told) -> Tensor:
     return (true * (true.clamp(min=1e-9).log() - predicted)).sum(-1).mean()
 
 
-def known_person(human: HumanModel, driver: Drivers, changed: dict[str, int]) -> Person:
+def known_person(human: HumanModel, driver: SimulatedDrivers, changed: dict[str, int]) -> Person:
     """The person whose implants are a driver's own."""
     domain = human.domain
     bins = torch.tensor(domain.reach_bins)

@@ -229,7 +229,7 @@ plt.show()
 # `held-out` is the negative log-likelihood of the actions in rounds that were not learned from,
 # in nats an action: lower is better, and guessing costs 0.69. `floor` is the entropy of the
 # simulated person's own choices: nobody can expect to predict better. (Over a few rounds one may,
-# by luck.)
+# by chance.)
 #
 # `leave-one-out` estimates the same from the rounds that were learned from, by ArviZ's PSIS-LOO
 # with a round as the unit; `its floor` is that of these rounds. It weights the draws as if one

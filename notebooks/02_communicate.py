@@ -109,8 +109,8 @@ print(decision.why())
 
 # %% [markdown]
 # Below, somebody acts: the simulated person of these recordings. We know what they really think,
-# which with real people nobody does. `luck` are the random numbers by which they choose. With the
-# same start and the same luck, rounds differ only in what was said.
+# which is unknown for real people. `action_noise` holds the random numbers that choose actions.
+# With the same start and the same noise, rounds differ only in what was said.
 
 # %%
 from mirror_ppl.domains.driving.participants import simulated_drivers
@@ -150,7 +150,7 @@ def drive(number, communicator=None):
         told = decision.told if decision else silence
         heard = {name: mask[None, None] for name, mask in told.items()}
         chances, memory = driver.step(memory, domain.observe(state), heard)
-        action = (starts.luck[0, number, step] < chances[..., 1]).long()
+        action = (starts.action_noise[0, number, step] < chances[..., 1]).long()
         following = domain.transition(state, action)
         terms = domain.rewards(state, action, following)
         rewards.append({name: float(value) for name, value in terms.items()})
@@ -176,12 +176,12 @@ def collides(played):
 # more with the communicator.
 
 # %%
-alone = {number: drive(number) for number in range(starts.luck.shape[1])}
+alone = {number: drive(number) for number in range(starts.action_noise.shape[1])}
 alone = {number: played for number, played in alone.items() if collides(played)}
 aided = {number: drive(number, communicator) for number in alone}
 prevented = [number for number in aided if not collides(aided[number])]
 print(
-    f"{len(alone)} of {starts.luck.shape[1]} rounds have a collision if nothing is said;",
+    f"{len(alone)} of {starts.action_noise.shape[1]} rounds have a collision if nothing is said;",
     f"the communicator prevents it in {len(prevented)} of these {len(alone)}",
 )
 
@@ -330,7 +330,7 @@ pd.DataFrame(
 # %% [markdown]
 # ## Is it worth it?
 #
-# New rounds, which nobody selected, each with the same start and the same luck for all. `none` is
+# New rounds, which nobody selected, each with the same start and the same action noise for all. `none` is
 # silence, `all` tells everything at every step, `mirror` is the communicator. `oracle` is the
 # ceiling: it knows the person and the world exactly. `net` is the task's reward less the cost of
 # messages, on average over rounds; `above none` is how much more that is than with silence, and
@@ -365,6 +365,6 @@ pd.DataFrame(rows).T.round(2)
 # - The communicator is as good as the posterior. If the model is sure of something wrong about a
 #   person, it will be sure of a wrong message. Look at the person first, as in notebook 01.
 # - `gain` is what the model expects, not what happens. Its interval is that of a mean over
-#   posterior draws: it shrinks with more draws, and does not say how lucky a round will be.
+#   posterior draws: it shrinks with more draws, and does not say how below a round will be.
 # - These people listen, understand and remember perfectly, and act on what they hear. Real people
 #   do not always. To them messages cost attention; the costs here are those of the paper.

@@ -44,7 +44,7 @@ class Unlocking(GymnasiumWorld):
     """Reach the goal; behind the door only with the key."""
 
     modalities = (
-        Modality("visual", ("key", "goal"), ("down", "right"), ("cells",) * 2, (4.0, 5.0), 0.01),
+        Modality("visual", ("key", "goal"), ("ahead", "right"), ("cells",) * 2, (4.0, 4.0), 0.01),
     )
     ego_features = ("row", "column", "heading", "has_key", "door_open")
     actions = ("turn left", "turn right", "go ahead", "pick up", "use the door")
@@ -53,7 +53,7 @@ class Unlocking(GymnasiumWorld):
     horizon = 24
     settings = ("bright", "dim")
     reward_terms = ("goal", "step")
-    positions = ("down", "right")
+    positions = ("ahead", "right")
     directions = ("here", "beyond")
     direction_groups = ((0,), (1,))
     levels = {
@@ -62,7 +62,7 @@ class Unlocking(GymnasiumWorld):
         "heading": range(4),
         "has_key": range(2),
         "door_open": range(2),
-        "down": range(-3, 4),
+        "ahead": range(-4, 5),
         "right": range(-4, 5),
     }
     reach_bins = (0.0, 1.0, 2.0, 3.0, 4.0)
@@ -94,15 +94,13 @@ class Unlocking(GymnasiumWorld):
         return env.carrying is None and env.grid.get(WALL, DOOR_ROW).is_locked
 
     def look(self, env):
-        """Key and goal by how far they are down and to the right of the person."""
+        """Key and goal by how far they are ahead, and to the right, of the person."""
         column, row = (int(part) for part in env.agent_pos)
-        places = {"Key": (0, 0)}  # in their hands
+        (across, down), places = env.dir_vec, {"Key": (0, 0)}  # in their hands
         for place, thing in enumerate(env.grid.grid):
+            x, y = place % WIDTH - column, place // WIDTH - row
             if thing is not None:
-                places[type(thing).__name__] = (
-                    place // WIDTH - row,
-                    place % WIDTH - column,
-                )
+                places[type(thing).__name__] = (x * across + y * down, y * across - x * down)
         door = env.grid.get(WALL, DOOR_ROW)
         ego = (row, column, int(env.agent_dir), env.carrying is not None, door.is_open)
         return {"ego": [float(part) for part in ego], "visual": [places["Key"], places["Goal"]]}
@@ -114,8 +112,10 @@ class Unlocking(GymnasiumWorld):
     def distance(self, observation):
         """Things in the same room, and beyond the wall."""
         _, far = super().distance(observation)
-        column = observation["ego"][..., None, 1]
-        thing = column + observation["visual"][..., 1]
+        column, heading = observation["ego"][..., 1:2], observation["ego"][..., 2:3].long()
+        across, down = (torch.tensor(part)[heading] for part in ((1, 0, -1, 0), (0, 1, 0, -1)))
+        ahead, right = observation["visual"].unbind(-1)
+        thing = column + ahead * across - right * down
         return ((column > WALL) != (thing > WALL)).long(), far
 
     def visibility(self, setting, observation):

@@ -130,8 +130,8 @@ class SoftQ(RecurrentNetworks):
             heard = {name: torch.zeros_like(may) for name, may in can_be.items()}
             if told is not None and told.any():
                 for name, may in can_be.items():
-                    luck = [torch.rand(may.shape[1:], generator=own) for own in generators]
-                    heard[name] = may & (torch.stack(luck) < told[:, None, None])
+                    noise = [torch.rand(may.shape[1:], generator=own) for own in generators]
+                    heard[name] = may & (torch.stack(noise) < told[:, None, None])
             seen, heard, knowledge = look(
                 domain, self.sight, setting, knowledge, observation, heard
             )

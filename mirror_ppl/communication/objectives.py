@@ -261,8 +261,8 @@ class _Tree:
             # kept as their weights ask for, give or take a fraction.
             total = torch.where(small, chances, 0.0).cumsum(-1) / threshold
             place = torch.full_like(self.draw, step)
-            luck = uniform_of(seed, place, self.draw, rollouts.names(step)[self.path])
-            shifted = total + luck[:, None]
+            noise = uniform_of(seed, place, self.draw, rollouts.names(step)[self.path])
+            shifted = total + noise[:, None]
             passed = shifted.floor()
             before = torch.cat([torch.zeros_like(passed[:, :1]), passed[:, :-1]], -1)
             weight = torch.where(small, threshold * (passed - before), chances)

@@ -103,7 +103,7 @@ def listeners(
     """
     domain = everybody.domain
     starts = draw_starts(
-        people, rounds, seed, "assist", setting, domain=domain, fates=everybody.fates
+        people, rounds, seed, "assist", setting, domain=domain, mind_noises=everybody.mind_noises
     )
     return [
         Listener(
@@ -209,7 +209,7 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
     if not isinstance(say, Planning):
         return _play(listener, say, keep_log)[0]
     parts = []
-    for number in range(listener.start.luck.shape[1]):
+    for number in range(listener.start.action_noise.shape[1]):
         played, (past,) = _play(listener.round(number), say, keep_log)
         say.learn(past)
         parts.append(played)
@@ -219,9 +219,9 @@ def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
 def _play(listener: Listener, say: Say, keep_log: bool) -> tuple[Played, list[RoundSoFar]]:
     """All rounds at once, and how they went."""
     domain, driver, start = listener.domain, listener.driver, listener.start
-    channels, number = Channels(domain), start.luck.shape[1]
+    channels, number = Channels(domain), start.action_noise.shape[1]
     tally, seconds, log = Tally(domain, channels, number), 0.0, []
-    state, memory = start.state, driver.start(number, fate=start.fate)
+    state, memory = start.state, driver.start(number, mind_noise=start.mind_noise)
     now = _now(domain, state, number)
     rounds = [RoundSoFar.begin(domain, one) for one in now]
     for step in range(domain.horizon):
@@ -235,7 +235,7 @@ def _play(listener: Listener, say: Say, keep_log: bool) -> tuple[Played, list[Ro
         flags = flags & under_way[:, None]
         messages = channels.split(flags)
         probability, memory = driver.step(memory, observation, channels.split(flags[None]))
-        action = act(probability, start.luck[..., step])[0]
+        action = act(probability, start.action_noise[..., step])[0]
         memory = driver.acted(memory, action[None])
         following = domain.transition(state, action[None])
         tally.add_messages(observation, flags, under_way)

@@ -12,6 +12,7 @@ from pathlib import Path
 from mirror_ppl.communication.person import Person
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.domains.registry import code_of
+from mirror_ppl.errors import PosteriorError
 from mirror_ppl.evaluation.assistance import (
     RATES_FROM,
     Listener,
@@ -26,8 +27,9 @@ from mirror_ppl.jobs import JsonFormat, Runner
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
-from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
 from mirror_ppl.people import simulated_people
+from mirror_ppl.people.robot_like import SELF_MODEL
 from mirror_ppl.version import __version__
 
 
@@ -84,6 +86,12 @@ class Pairing:
         """
         check_contract(self.human)
         self.file.draws(self.human, self.draws)
+        simulated = self.file.attributes.get(f"recorded_{SELF_MODEL}")
+        if simulated not in (None, fingerprint(self.human.self_model)):
+            raise PosteriorError(
+                f"{self.posterior}: its people were simulated with another self-model "
+                f"({simulated}); simulate and fit them anew with this one"
+            )
 
     def listener(self, number: int, inferred: bool = True) -> Listener:
         """The person of that number, with their rounds, and what was inferred of them."""

@@ -63,8 +63,8 @@ def _prediction(rows: Rows) -> Report:
     data = {"nll": results, "accuracy": accuracy, "few_against_many": claims}
     return Report(
         [
-            *_tables(results, "NLL of held-out actions, nats an action: less is better", floor),
-            *_tables(accuracy, "accuracy of held-out actions: more is better", {}),
+            *_tables(results, "NLL of held-out actions (nats per action; lower is better)", floor),
+            *_tables(accuracy, "accuracy of held-out actions (higher is better)", {}),
         ],
         [_claimed(claim) for claim in claims],
         data,
@@ -77,7 +77,7 @@ def _prediction(rows: Rows) -> Report:
 def _assistance(rows: Rows) -> Report:
     results, ways = summarize_study(rows, "net"), ways_to_oracle(rows)
     return Report(
-        [*_tables(results, "net return of a round: more is better", {}), *_ways(ways)],
+        [*_tables(results, "net return per round (higher is better)", {}), *_ways(ways)],
         [],
         {"net": results, "way_to_oracle": ways},
         plot_curves(means_table(results), "net return of a round"),
@@ -108,8 +108,8 @@ def _claimed(claim: Claim) -> str:
     ahead, better = claim.paired.ahead, claim.paired.improvement
     return (
         f"{claim.place.domain}, {claim.place.setting}: mirror with {_counted(claim.rounds)} "
-        f"against {claim.baseline} with {_counted(claim.baseline_rounds)}: ahead by {_text(ahead)} "
-        f"nats an action, in {100 * better.mean:.0f}% of people"
+        f"against {claim.baseline} with {_counted(claim.baseline_rounds)}: advantage of mirror "
+        f"{_text(ahead)} nats per action; mirror is better in {100 * better.mean:.0f}% of people"
     )
 
 
@@ -125,17 +125,16 @@ def _tables(
         number = max(one.people for one in here)
         names = dict.fromkeys(one.model for one in here)
         pooling = [name for name in names if name in POOLING and POOLED in names]
-        caption = f"mean over people ({number}), by rounds learned from"
+        caption = f"mean over {number} people, by number of training rounds"
         if any(one.mirror for one in here):
             caption += (
-                "; below it how far mirror is ahead with as many (of who learns nothing: with "
-                "the most"
-                + (f"; of {', '.join(pooling)}: {POOLED}" if pooling else "")
-                + "), the 90% interval of that over people, and in how many of them (ties "
-                "count half)"
+                "; below it the advantage of mirror, its 90% interval over people, and the share "
+                "of people in whom mirror is better (ties count half); mirror has as many training "
+                "rounds as the model that it is compared with, and the most if that learns nothing"
+                + (f"; {', '.join(pooling)}: advantage of {POOLED}" if pooling else "")
             )
         if place in floor:
-            caption += f"; people's own entropy: {floor[place]:.3f}"
+            caption += f"; entropy of people's own choices: {floor[place]:.3f} nats"
         rows = tuple(
             (model, *(_entry(by.get((model, rounds)), number) for rounds in numbers))
             for model in names
@@ -162,7 +161,7 @@ def _ahead(mirror: Paired, digits: int) -> str:
 
 
 def difference(ahead: Interval, digits: int) -> str:
-    """How far one is ahead of another, and below it the interval of that."""
+    """The advantage of one over another, and below it its interval."""
     low, high = (f"{value:+.{digits}f}" for value in (ahead.low, ahead.high))
     return f"{ahead.mean:+.{digits}f}\n[{low}, {high}]"
 
@@ -179,8 +178,8 @@ def _ways(ways: Sequence[Way]) -> list[TextTable]:
             for model in dict.fromkeys(one.model for one in here)
         )
         caption = (
-            f"share [90% interval over people, {max(one.people for one in here)}] by rounds "
-            "learned from; below it the net return that was gained by learning from them"
+            f"share of the way [90% interval over {max(one.people for one in here)} people], by "
+            "number of training rounds; below it the net return gained over the model's prior"
         )
         title = f"{', '.join(place)}: way from silence to the oracle, in net return"
         tables.append(TextTable(title, caption, ("model", *map(_counted, numbers)), rows))
@@ -212,11 +211,12 @@ def _shares(shares: Sequence[Share], title: str) -> TextTable:
         (model, "-" if model in REFERENCES else str(rounds), *(own[name] for name in names))
         for (model, rounds), own in cells.items()
     )
-    caption = "relevant share [90% interval over people] of the communicated items"
+    caption = "share of the communicated items that is relevant [90% interval over people]"
     if any(one.mirror for one in shares):
         caption += (
-            "; below it how far mirror's share (of 1) is ahead person by person, the 90% interval "
-            "of that, and in how many it is (ties count half), over people with messages from both"
+            "; below it, over people with messages from both, the mean difference of mirror's "
+            "share (of 1), its 90% interval, and the share of people in whom mirror's is larger "
+            "(ties count half)"
         )
     return TextTable(title, caption, ("model", "rounds", *names), rows)
 

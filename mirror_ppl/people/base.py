@@ -43,11 +43,11 @@ class SimulatedPeople(ABC):
     with the dimensions of the rounds.
 
     Attributes:
-        fates: how many uniform numbers decide, at the beginning of a round, what is chance in a
+        mind_noises: how many uniform numbers, drawn as a round begins, decide what is random in a
             person's mind; choices of actions are not among them.
     """
 
-    fates: ClassVar[int] = 0
+    mind_noises: ClassVar[int] = 0
 
     @property
     @abstractmethod
@@ -55,12 +55,13 @@ class SimulatedPeople(ABC):
         """The world that they act in."""
 
     @abstractmethod
-    def start(self, *batch: int, fate: Tensor | None = None) -> Any:
+    def start(self, *batch: int, mind_noise: Tensor | None = None) -> Any:
         """Memory ``[P, *batch, ...]`` before a round begins.
 
         Args:
             batch: rounds.
-            fate: uniform numbers ``[P, *batch, fates]``; the likeliest happens unless given.
+            mind_noise: uniform numbers ``[P, *batch, mind_noises]``; unless given, the most
+                probable happens.
         """
 
     @abstractmethod
@@ -121,6 +122,10 @@ class SimulatedPeople(ABC):
     def truth(self) -> dict[str, Tensor]:
         """What is true of each ``[P]``, by the names of the sites that infer it."""
 
+    def provenance(self) -> dict[str, str]:
+        """What recordings say of how these people were made, besides population and seed."""
+        return {}
+
     def modelled(self) -> tuple[HumanModel, dict[str, Tensor]] | None:
         """A human model, and values ``[1, P, 1, ...]`` of its sites with which it is these people.
 
@@ -131,7 +136,7 @@ class SimulatedPeople(ABC):
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
     ) -> Tensor:
-        """Probabilities ``[P, B, T, A]`` of actions to somebody who knows everything but luck.
+        """Probabilities ``[P, B, T, A]`` of actions given everything but the action noise.
 
         They differ from those of `step` where people have something in mind that cannot be seen.
 
@@ -155,13 +160,13 @@ class SimulatedPeople(ABC):
         )
 
 
-def act(probability: Tensor, luck: Tensor) -> Tensor:
+def act(probability: Tensor, action_noise: Tensor) -> Tensor:
     """Actions ``[...]`` that uniform numbers ``[...]`` choose with probabilities ``[..., A]``.
 
-    Small numbers choose late actions: of two, the second where luck is less than its probability.
+    Small numbers choose late actions: of two, the second where the noise is below its probability.
     """
     beyond = probability.flip(-1).cumsum(-1).flip(-1)[..., 1:]
-    return (luck[..., None] < beyond).sum(-1)
+    return (action_noise[..., None] < beyond).sum(-1)
 
 
 def each(value: Tensor, dimensions: int) -> Tensor:

@@ -23,26 +23,27 @@ class Start:
     Attributes:
         state: states ``[P, B]``.
         scenario: indices into the domain's scenarios ``[P, B]``.
-        luck: uniform numbers ``[P, B, T]`` that choose actions, see `mirror_ppl.people.base.act`.
-        fate: uniform numbers ``[P, B, L]`` that decide what is chance in a person's mind.
-        gossip: uniform numbers ``[P, B, T, N]`` that decide which of the domain's items are told,
+        action_noise: uniform numbers ``[P, B, T]`` that choose actions, see
+            `mirror_ppl.people.base.act`.
+        mind_noise: uniform numbers ``[P, B, L]`` that decide what is chance in a person's mind.
+        message_noise: uniform numbers ``[P, B, T, N]`` that decide which items are communicated,
             if any are.
     """
 
     state: Any
     scenario: Tensor
-    luck: Tensor
-    fate: Tensor | None = None
-    gossip: Tensor | None = None
+    action_noise: Tensor
+    mind_noise: Tensor | None = None
+    message_noise: Tensor | None = None
 
     def select(self, people: slice) -> Start:
         """The rounds of some of the people."""
         return Start(
             map_state(lambda part: part[people], self.state),
             self.scenario[people],
-            self.luck[people],
-            None if self.fate is None else self.fate[people],
-            None if self.gossip is None else self.gossip[people],
+            self.action_noise[people],
+            None if self.mind_noise is None else self.mind_noise[people],
+            None if self.message_noise is None else self.message_noise[people],
         )
 
     def round(self, number: int) -> Start:
@@ -51,9 +52,9 @@ class Start:
         return Start(
             map_state(lambda part: part[:, own], self.state),
             self.scenario[:, own],
-            self.luck[:, own],
-            None if self.fate is None else self.fate[:, own],
-            None if self.gossip is None else self.gossip[:, own],
+            self.action_noise[:, own],
+            None if self.mind_noise is None else self.mind_noise[:, own],
+            None if self.message_noise is None else self.message_noise[:, own],
         )
 
 
@@ -87,7 +88,7 @@ def draw_starts(
     *purpose: str,
     device: torch.device | str = "cpu",
     domain: Domain | None = None,
-    fates: int = 0,
+    mind_noises: int = 0,
 ) -> Start:
     """Draw how the rounds ``[P, B]`` begin, for each person from a generator of their own.
 
@@ -98,10 +99,10 @@ def draw_starts(
         purpose: what they are for; other words give other rounds.
         device: where they are drawn and live.
         domain: the world; driving unless given.
-        fates: numbers L of a round that decide what is chance in a person's mind.
+        mind_noises: numbers L of a round that decide what is chance in a person's mind.
     """
     domain = domain or get_domain("driving")
-    scenarios, states, luck, fate = [], [], [], []
+    scenarios, states, action_noise, mind_noise = [], [], [], []
     for person in range(people):
         generator = derived_generator(seed, *purpose, person, device=device)
         scenario = torch.randint(
@@ -109,13 +110,13 @@ def draw_starts(
         )
         scenarios.append(scenario)
         states.append(domain.initial(rounds, generator, scenario))
-        luck.append(torch.rand(rounds, domain.horizon, generator=generator, device=device))
-        fate.append(torch.rand(rounds, fates, generator=generator, device=device))
+        action_noise.append(torch.rand(rounds, domain.horizon, generator=generator, device=device))
+        mind_noise.append(torch.rand(rounds, mind_noises, generator=generator, device=device))
     return Start(
         map_state(lambda *parts: torch.stack(parts), *states),
         torch.stack(scenarios),
-        torch.stack(luck),
-        torch.stack(fate),
+        torch.stack(action_noise),
+        torch.stack(mind_noise),
     )
 
 
@@ -131,19 +132,22 @@ def record(
         told: chance that an item that can be communicated is, at each step; by chance alone.
     """
     domain = people.domain
-    state, memory = start.state, people.start(start.luck.shape[1], fate=start.fate)
+    state, memory = (
+        start.state,
+        people.start(start.action_noise.shape[1], mind_noise=start.mind_noise),
+    )
     observations, actions, rewards = [domain.observe(state)], [], []
     probabilities, memories = [], []
     lengths = torch.zeros_like(start.scenario)
     under_way = lengths == 0
     heard = []
-    for step, luck in enumerate(start.luck.unbind(-1)):
+    for step, action_noise in enumerate(start.action_noise.unbind(-1)):
         under_way &= ~domain.over(state)
         lengths += under_way
-        gossip = None if start.gossip is None else start.gossip[:, :, step]
-        heard.append(_told(domain, observations[-1], gossip, under_way, told))
+        message_noise = None if start.message_noise is None else start.message_noise[:, :, step]
+        heard.append(_told(domain, observations[-1], message_noise, under_way, told))
         probability, memory = people.step(memory, observations[-1], heard[-1])
-        action = act(probability, luck)
+        action = act(probability, action_noise)
         memory = people.acted(memory, action)
         following = domain.transition(state, action)
         rewards.append(total_reward(domain.rewards(state, action, following)))
@@ -168,16 +172,20 @@ def record(
 
 
 def _told(
-    domain: Domain, observation: Observation, gossip: Tensor | None, under_way: Tensor, rate: float
+    domain: Domain,
+    observation: Observation,
+    message_noise: Tensor | None,
+    under_way: Tensor,
+    rate: float,
 ) -> Visibility:
     """Which items ``[P, B, K]`` are told, by numbers ``[P, B, N]``; none without those."""
     can_be = domain.communicable(observation)
-    if gossip is None:
+    if message_noise is None:
         return {name: torch.zeros_like(mask) for name, mask in can_be.items()}
-    lucky = (gossip < rate).split([len(part.items) for part in domain.modalities], -1)
+    below = (message_noise < rate).split([len(part.items) for part in domain.modalities], -1)
     return {
         part.name: can_be[part.name] & own & under_way[..., None]
-        for part, own in zip(domain.modalities, lucky, strict=True)
+        for part, own in zip(domain.modalities, below, strict=True)
     }
 
 
@@ -202,10 +210,12 @@ def recorded(
         setting,
         device=device,
         domain=domain,
-        fates=people.fates,
+        mind_noises=people.mind_noises,
     )
     if told > 0:
-        start = replace(start, gossip=_gossip(number, rounds, seed, setting, domain, device))
+        start = replace(
+            start, message_noise=_message_noise(number, rounds, seed, setting, domain, device)
+        )
     recording = record(people, start, progress, told)
     chances = people.predictive(
         recording.probabilities, recording.observation, recording.actions, recording.told
@@ -225,11 +235,12 @@ def recorded(
         truth=truth,
         action_entropy=torch.special.entr(chances).sum(-1),
         provenance={"population": population, "seed": seed, "version": __version__}
+        | people.provenance()
         | ({"told": told} if told > 0 else {}),
     )
 
 
-def _gossip(
+def _message_noise(
     people: int,
     rounds: int,
     seed: int,

@@ -25,8 +25,11 @@ from mirror_ppl.models.implants import (
 )
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.people.base import SimulatedPeople, derived_generator
 
+SELF_MODEL = "self_model"
+"""What recordings call the fingerprint of the robot that people are like."""
 POPULATIONS = ("diverse", "paper")
 
 
@@ -66,9 +69,9 @@ class RobotLike(SimulatedPeople):
         """The world that they act in."""
         return self.self_model.domain
 
-    def start(self, *batch: int, fate: Tensor | None = None) -> Mind:
+    def start(self, *batch: int, mind_noise: Tensor | None = None) -> Mind:
         """Nothing was seen or done yet."""
-        del fate
+        del mind_noise
         shape, like = (len(self.consistency), *batch), self.consistency
         return Mind(
             like.new_zeros(*shape, self.self_model.latent),
@@ -119,6 +122,10 @@ class RobotLike(SimulatedPeople):
                 for place, name in enumerate(self.domain.directions)
             }
         return own
+
+    def provenance(self) -> dict[str, str]:
+        """The fingerprint of the robot whose networks they have."""
+        return {SELF_MODEL: fingerprint(self.self_model)}
 
     def modelled(self) -> tuple[HumanModel, dict[str, Tensor]] | None:
         """The human model of the paper, which they are but for sight that a setting limits."""

@@ -1,4 +1,4 @@
-"""What a fit leaves open about what people see, and which rounds would tell."""
+"""Posterior entropy of the perceptual implants, and the expected information gain of rounds."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ MOST_PEOPLE = 60
 
 
 def plot_identifiability(data: az.InferenceData) -> Picture:
-    """Draw what is open about each person's sight, and what a round in each scenario would tell.
+    """Draw posterior entropy of each person's sight, and information gain of a round per scenario.
 
-    Left: nats that are open about each implant of sight, stacked; hatched is what hangs on how they
-    decide. Right, if rounds were played: nats that one more round in a scenario should tell.
+    Left: posterior entropy of each implant of sight, stacked; hatched is the part shared with the
+    policy implants. Right, if rounds were played: expected information gain of one more round.
 
     Args:
         data: with the group ``identifiability``; of more than 60 people the first are drawn.
@@ -57,15 +57,17 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
     axes[0].set_yticks(rows, labels)
     axes[0].set_ylim(len(people) - 0.5, -0.5)
     axes[0].set_xlim(0, max(0.1, 1.05 * float(left.max())))
-    axes[0].set_xlabel("nats open, of each by itself")
-    axes[0].set_title("What is open about what they see", fontsize=12)
+    axes[0].set_xlabel("posterior entropy of each implant, nats")
+    axes[0].set_title("Posterior entropy of sight", fontsize=12)
     axes[0].spines[["top", "right"]].set_visible(False)
     handles = [
         Patch(color=COLOURS[number % len(COLOURS)], label=TITLES.get(site, site.replace("_", " ")))
         for number, site in enumerate(sites)
     ]
     handles.append(
-        Patch(facecolor="none", hatch="//////", edgecolor=BLACK, label="hangs on how they decide")
+        Patch(
+            facecolor="none", hatch="//////", edgecolor=BLACK, label="shared with policy implants"
+        )
     )
     if scenarios:
         _scenarios(axes[1], group["information"].values.clip(min=0), scenarios)
@@ -85,5 +87,5 @@ def _scenarios(ax, information: np.ndarray, scenarios: list[str]) -> None:
     names = [textwrap.fill(name, WRAP, break_on_hyphens=False) for name in scenarios]
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9)
     ax.set_yticks([])
-    ax.set_title("What one more round would tell (nats)", fontsize=12)
+    ax.set_title("Expected information gain of one more round (nats)", fontsize=12)
     ax.spines[:].set_visible(False)

@@ -103,7 +103,7 @@ def _likelihoods(ax, group: xr.Dataset) -> None:
     for name, colour, marker, size, label in (
         ("nll_no_implants", ORANGE, "D", 7, "no implants"),
         ("nll", BLUE, "o", 7, "the model"),
-        ("nll_base_rate", BLACK, "|", 14, "base rate: how often each action before"),
+        ("nll_base_rate", BLACK, "|", 14, "base rate of each action"),
     ):
         ax.plot(group[name].values, rows, marker, color=colour, label=label, mew=2, ms=size)
     values = [group[name].values for name in ("nll_base_rate", "nll_no_implants", "nll")]

@@ -151,7 +151,7 @@ def simulate_examples(
     done = sum(len(part) for part in parts)
     while done < options.people:
         report("simulate", done, options.people, "people")
-        # Of each group its own luck, so that a run that goes on is the same as one never stopped.
+        # Of each group its own seed, so that a run that goes on is the same as one never stopped.
         generator = torch.Generator().manual_seed(seed * 1_000_003 + done)
         number = min(options.together, options.people - done)
         implants = prior_people(human, number, generator)

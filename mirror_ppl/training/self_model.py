@@ -61,6 +61,8 @@ class SelfModelOptions:
             themselves. What people choose hangs on differences alone.
         kinds: share of rounds that are seen in full, with items dropped, and by limited sight; see
             `mirror_ppl.training.views`.
+        at_means: whether values are learned at the encoder's means in every step, and not at draws
+            of the guide in every other one: sooner exact, where what counts is clear to see.
         exact: whether somebody who knows all that counts learns the values of the exact planner,
             where there is one, and not what a step leads to.
     """
@@ -83,6 +85,7 @@ class SelfModelOptions:
     stride: int = 1
     difference_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
+    at_means: bool = False
     exact: bool = False
 
     @classmethod
@@ -348,9 +351,8 @@ class _Trainer:
                 options.stride,
                 options.discount if exact else None,
             )
-            loss = self_model_loss(
-                self.self_model, self.target, lived, options, on_means=step % 2 == 1
-            )
+            means = options.at_means or step % 2 == 1
+            loss = self_model_loss(self.self_model, self.target, lived, options, means)
             self.optimizer.zero_grad()
             loss.total.backward()
             torch.nn.utils.clip_grad_norm_(self.self_model.parameters(), 5.0)

@@ -80,8 +80,8 @@ class ViewPlan:
         communicable = domain.communicable(observation)
         visible = self.sees(domain, observation, first, stride)
         for name, seen in visible.items():
-            luck = self.noise[name][:, first : first + stride * seen.shape[1] : stride, :, 1]
-            visible[name] = seen | (communicable[name] & (luck < self.told[name][:, None, None]))
+            noise = self.noise[name][:, first : first + stride * seen.shape[1] : stride, :, 1]
+            visible[name] = seen | (communicable[name] & (noise < self.told[name][:, None, None]))
         return visible
 
     def look(

@@ -268,7 +268,7 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
     args = ["--people", 1, "--seeds", 1, "--rounds", 1, "--played", 1, "--draws", 2]
     args += ["--models", "none", "all", "bc", "--jobs", 1, "--out", tmp_path]
     assert command(evaluate, "assistance", *args) == 0
-    assert "net return of a round" in capsys.readouterr().out
+    assert "net return per round" in capsys.readouterr().out
     assert command(evaluate, "relevance", *args) == 0
     out, err = capsys.readouterr()
     assert "3 were done before" in err
@@ -378,7 +378,7 @@ def result(model, rounds, mean, place=Place("driving", "fog", "paper")):  # noqa
 
 
 def test_tables_say_where_somebody_is_missing():
-    """A cell of bc failed: its mean is of one person, and what is ahead of it, too."""
+    """A cell of bc failed: its mean is of one person, and the advantage over it, too."""
     rows = [
         Place("driving", "fog", "paper")._asdict()
         | {"seed": seed, "person": "a", "model": model, "rounds": 1}
@@ -386,7 +386,7 @@ def test_tables_say_where_somebody_is_missing():
         for seed, model, nll in ((0, "mirror", 0.2), (1, "mirror", 0.4), (1, "bc", 0.5))
     ]
     nll, accuracy = REPORTS["prediction"](rows).tables
-    assert "mean over people (2)" in nll.caption
+    assert "mean over 2 people" in nll.caption
     assert dict(nll.rows) == {
         "mirror": "0.300",
         "bc": "0.500 (1 of 2 people)\n+0.100\n[+0.100, +0.100]\n100%",

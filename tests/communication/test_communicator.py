@@ -136,7 +136,7 @@ def test_it_asks_for_the_steps_that_are_left_and_the_items_that_may_be_sent():
             assert torch.equal(decision.flags, allowed)  # the more, the better
             seeds.add(given["seed"])
             later = later.then(CHANNELS.split(flags()), 0, past.now)
-    # Each step of a round has luck of its own, and so has each communicator.
+    # Each step of a round has noise of its own, and so has each communicator.
     assert len(seeds) == 3 * DOMAIN.horizon
 
 

@@ -271,7 +271,7 @@ def test_silence_after_a_message_is_the_message_alone(generator):
 
 @pytest.mark.parametrize("branch", [0.1, 0.2, 0.4, 1.0])
 def test_keeping_some_courses_by_chance_is_right_on_average(seed, branch):
-    """Draws that are alike differ in their luck alone: their mean is within 4.5 standard errors.
+    """Draws that are alike differ in their noise alone: their mean is within 4.5 standard errors.
 
     Of 20 comparisons one fails in about 7,000 seeds.
     """
@@ -294,7 +294,7 @@ def test_keeping_some_courses_by_chance_is_right_on_average(seed, branch):
         assert (error > 1e-3).any()
     # A draw's weight on an action is from 0 to about 1: its variance is at most about a quarter.
     assert (valued.actions - exact.actions).abs().max() < 4.5 * 0.5 / number**0.5
-    # The luck is the same for the same seed, and another for another.
+    # The noise is the same for the same seed, and another for another.
     assert torch.equal(value(number, branch, seed)(candidates).utility, valued.utility)
     assert not torch.equal(value(number, branch, seed + 1)(candidates).utility, valued.utility)
 

@@ -253,8 +253,8 @@ def random_rounds(number, generator, rate=0.05):
     states, messages = [DOMAIN.initial(number, generator)], []
     for _ in range(DOMAIN.horizon + 1):
         allowed = DOMAIN.communicable(DOMAIN.observe(states[-1]))
-        luck = {name: torch.rand(number, 4, generator=generator) < rate for name in NAMES}
-        messages.append({name: allowed[name] & luck[name] for name in NAMES})
+        action_noise = {name: torch.rand(number, 4, generator=generator) < rate for name in NAMES}
+        messages.append({name: allowed[name] & action_noise[name] for name in NAMES})
         action = torch.randint(2, (number,), generator=generator)
         states.append(DOMAIN.transition(states[-1], action))
     return states[:-1], messages

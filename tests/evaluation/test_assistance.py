@@ -41,7 +41,7 @@ def listener(rounds=20, seed=0):
 
 # --- one scene by hand ------------------------------------------------------------------------
 
-# Two rounds of three steps. Luck 0 makes a driver switch whatever they think, luck 1 stay.
+# Two rounds of three steps. Noise 0 makes a driver switch whatever they think, noise 1 stay.
 #
 # First round; front-left and front-right, rear-left and rear-right as they are before each step:
 #   lane 0   3  11 -11  -2   stay      then front-left is 2 cells ahead: -2
@@ -161,8 +161,8 @@ def test_luck_decides_by_the_probability_of_switching(scene):
     entry = play(scene, Scripted({}), keep_log=True).log[0]
     chance = entry["true_probability"]["switch"]
     assert 0.01 < chance < 0.99
-    for luck, action in ((chance - 1e-3, "switch"), (chance + 1e-3, "stay")):
-        start = Start(START, scene.start.scenario, torch.full((1, 2, 3), luck))
+    for action_noise, action in ((chance - 1e-3, "switch"), (chance + 1e-3, "stay")):
+        start = Start(START, scene.start.scenario, torch.full((1, 2, 3), action_noise))
         log = play(Listener(DOMAIN, "fog", driver(), start), Scripted({}), keep_log=True).log
         assert log[0]["action"] == action
 

@@ -194,7 +194,7 @@ def test_it_agrees_with_arviz(tmp_path, rng):
 
 
 def test_rounds_that_hang_on_few_draws_are_doubtful(tmp_path):
-    # Draws at the quantiles of what is told, so that nothing depends on luck.
+    # Draws at the quantiles of what is told, so that nothing depends on chance.
     level = (np.arange(200) + 0.5) / 200
     tail = np.log(level)  # weights of exponent k have a Pareto tail of shape k
     likelihood = np.full((200, 4, 3), -1.0)

@@ -1,7 +1,7 @@
 """The oracle: against plain expectimax, played rounds, and other ways to speak; and what it merges.
 
-Expectimax here goes through every message and every action with `Drivers.step` on what the person
-remembers exactly; the oracle merges equal knowledge on the way.
+Expectimax here goes through every message and every action with `SimulatedDrivers.step` on what they
+remember exactly; the oracle merges equal knowledge on the way.
 """
 
 import itertools
@@ -229,8 +229,8 @@ def test_the_value_is_what_played_rounds_are_worth_on_average(generator):
         return torch.cat(parts), None
 
     state = map_state(lambda part: part.repeat(1, 50, *[1] * (part.dim() - 2)), start.state)
-    luck = torch.rand(1, 300, DOMAIN.horizon, generator=generator)
-    often = replace(start, state=state, luck=luck)
+    action_noise = torch.rand(1, 300, DOMAIN.horizon, generator=generator)
+    often = replace(start, state=state, action_noise=action_noise)
     played = play(Listener(DOMAIN, "fog", person, often), say_all)
     surplus = torch.tensor(played.net).view(50, 6) - oracle.value
     error = (surplus.var(0) / 50).sum().sqrt() / 6

@@ -6,7 +6,7 @@ import torch
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.search_rescue import SearchRescue
-from mirror_ppl.domains.search_rescue.people import HOME, Firefighters
+from mirror_ppl.domains.search_rescue.people import HOME, SimulatedFirefighters
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
 from mirror_ppl.people import draw_starts, simulated_people
@@ -27,7 +27,7 @@ def somebody(*likes, lapse=0.0):
         liked[:, :, TOP_LEFT + room, corridor] = 1.0
         liked[:, 2**room, HOME, :TOP_LEFT] = 1e-6
         liked[:, 2**room, HOME, corridor] = 1.0
-    return Firefighters(torch.tensor([1.5]), liked, torch.tensor([lapse]))
+    return SimulatedFirefighters(torch.tensor([1.5]), liked, torch.tensor([lapse]))
 
 
 def start_of(*scenarios):
@@ -101,7 +101,7 @@ def test_of_two_rounds_each_is_valued_by_itself():
 def test_the_value_is_what_played_rounds_are_worth_on_average(seed):
     """A simulated person: the mean of 500 rounds within 4 of its standard errors."""
     person = simulated_people("search_rescue", "smoke", "paper", 2, 0).select([1])
-    start = draw_starts(1, 500, seed, "oracle", domain=WORLD, fates=person.fates)
+    start = draw_starts(1, 500, seed, "oracle", domain=WORLD, mind_noises=person.mind_noises)
     oracle = ReachableOracle(person, map_state(lambda part: part[0], start.state))
     someone = Listener(WORLD, "smoke", person, start)
     own = play(someone, speaker("oracle", someone, PlannerOptions(), 0))
@@ -115,7 +115,7 @@ def test_the_value_is_what_played_rounds_are_worth_on_average(seed):
 
 def test_nothing_is_told_when_all_is_over():
     person = simulated_people("search_rescue", "smoke", "paper", 1, 0)
-    start = draw_starts(1, 20, 0, "over", domain=WORLD, fates=person.fates)
+    start = draw_starts(1, 20, 0, "over", domain=WORLD, mind_noises=person.mind_noises)
     someone = Listener(WORLD, "smoke", person, start)
     for name in ("all", "oracle", "nearest"):
         played = play(someone, speaker(name, someone, PlannerOptions(), 0), keep_log=True)
@@ -127,7 +127,7 @@ def test_nothing_is_told_when_all_is_over():
 
 def test_the_rule_shows_what_smoke_hides_once_each():
     person = simulated_people("search_rescue", "smoke", "paper", 1, 0)
-    start = draw_starts(1, 5, 0, "rule", domain=WORLD, fates=person.fates)
+    start = draw_starts(1, 5, 0, "rule", domain=WORLD, mind_noises=person.mind_noises)
     someone = Listener(WORLD, "smoke", person, start)
     played = play(someone, speaker("nearest", someone, PlannerOptions(), 0), keep_log=True)
     for number in range(5):

@@ -315,6 +315,23 @@ def test_a_robot_of_another_version_of_the_file_is_told(gone_through, monkeypatc
         load_self_model(weights)
 
 
+def test_people_are_played_with_the_robot_that_they_are_like(gone_through, monkeypatch, capsys):
+    from mirror_ppl.commands import assist, fit
+    from mirror_ppl.models.weights import load_self_model, save_self_model
+
+    monkeypatch.chdir(gone_through)
+    get_domain(WORLD)
+    robot, card = load_self_model(gone_through / "runs" / "round_table_self_model.safetensors")
+    with torch.no_grad():
+        next(robot.parameters()).add_(0.01)
+    save_self_model(robot, gone_through / "runs" / "another.safetensors", card)
+    given = ["--domain", WORLD, "--self-model", "runs/another.safetensors"]
+    few = ["--train-rounds", "2", "--draws", "64", "--out", "runs/another"]
+    assert command(fit, *given, "--demos", "runs/table.nc", *few) == 0
+    assert command(assist, *given, "--posterior", "runs/another/posterior.nc", "--rounds", "1") == 2
+    assert "people were simulated with another self-model" in capsys.readouterr().err
+
+
 def test_settings_are_looked_over(tmp_path, capsys):
     from mirror_ppl.commands import check_domain
 

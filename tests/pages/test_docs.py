@@ -41,7 +41,8 @@ from mirror_ppl.people import populations_of
 from mirror_ppl.training import views as training_views
 from mirror_ppl.training.self_model import SelfModelOptions
 
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+TOP = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
+PAGES = [*(ROOT / name for name in TOP), *sorted((ROOT / "docs").glob("*.md"))]
 EXAMPLE = "docs/examples/late_reactions.py:LatePerson"
 
 
@@ -298,6 +299,8 @@ def test_the_commands_of_the_readme_write_what_it_says(results):
         "docs/human_model.md",
         "docs/extending.md",
         "docs/trust.md",
+        "docs/search_rescue.md",
+        "docs/bomb_defusal.md",
     ],
 )
 def test_python_blocks_run(name, results, monkeypatch):

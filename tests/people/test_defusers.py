@@ -12,7 +12,7 @@ from mirror_ppl.domains.bomb_defusal.participants import (
     participants,
     simulated_defusers,
 )
-from mirror_ppl.domains.bomb_defusal.people import Defusers
+from mirror_ppl.domains.bomb_defusal.people import SimulatedDefusers
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
 from mirror_ppl.people import populations_of, simulate, simulated_people
@@ -24,7 +24,7 @@ NOTHING = {"visual": (), "verbal": False}
 
 
 def person(notices=0.1, reads=False):
-    return Defusers(torch.full((1, 6), notices), torch.tensor([reads]))
+    return SimulatedDefusers(torch.full((1, 6), notices), torch.tensor([reads]))
 
 
 def bomb(kind=0, symbol=0):
@@ -46,11 +46,11 @@ def tell(terminals=(), kind=False):
     }
 
 
-def choices(someone, state, *told, fate=0.9, guess=0.0):
+def choices(someone, state, *told, mind_noise=0.9, guess=0.0):
     """What somebody does at each step, who is unlucky and first takes the bomb for Type A."""
-    fates = torch.full((1, 1, Defusers.fates), fate)
-    fates[..., 0] = guess
-    memory, done = someone.start(1, fate=fates), []
+    mind_noises = torch.full((1, 1, SimulatedDefusers.mind_noises), mind_noise)
+    mind_noises[..., 0] = guess
+    memory, done = someone.start(1, mind_noise=mind_noises), []
     for message in told:
         probability, memory = someone.step(memory, WORLD.observe(state), message)
         assert float(probability.max()) == 1
@@ -67,7 +67,7 @@ def test_who_finds_nothing_waits_and_who_is_shown_it_presses():
     # What was found counts until the press, and not at the next stage.
     assert choices(someone, bomb(), tell([2]), tell([2]), tell([2])) == [RED] * 3
     # Luck finds it.
-    assert choices(someone, bomb(), None, None, fate=0.05) == [RED, RED]
+    assert choices(someone, bomb(), None, None, mind_noise=0.05) == [RED, RED]
 
 
 def test_the_type_is_a_guess_until_it_is_told():
@@ -96,8 +96,8 @@ def test_finding_takes_as_long_as_a_geometric_variable(seed):
     The mean is within 4.5 standard errors, but one in 150,000 times; the horizon cuts off
     0.9 ** 60 = 0.002 of them.
     """
-    people = Defusers(torch.full((400, 6), 0.1), torch.ones(400, dtype=torch.bool))
-    start = draw_starts(400, 1, seed, "test", domain=WORLD, fates=people.fates)
+    people = SimulatedDefusers(torch.full((400, 6), 0.1), torch.ones(400, dtype=torch.bool))
+    start = draw_starts(400, 1, seed, "test", domain=WORLD, mind_noises=people.mind_noises)
     recording = record(people, start)
     first = (recording.actions != WAIT).long().argmax(-1).double() + 1
     error = first.std() / 20
@@ -110,10 +110,14 @@ def test_finding_takes_as_long_as_a_geometric_variable(seed):
 def test_predictions_are_the_frequencies_of_what_people_do(seed, told):
     """Scores of predictions are their entropies on average, if and only if they are right."""
     for reads in (True, False):
-        people = Defusers(torch.linspace(0.04, 0.3, 6).expand(30, 6), torch.full((30,), reads))
-        start = draw_starts(30, 20, seed, "test", str(reads), domain=WORLD, fates=people.fates)
-        gossip = torch.rand(30, 20, 60, 7, generator=torch.Generator().manual_seed(seed))
-        recording = record(people, replace(start, gossip=gossip), told=told)
+        people = SimulatedDefusers(
+            torch.linspace(0.04, 0.3, 6).expand(30, 6), torch.full((30,), reads)
+        )
+        start = draw_starts(
+            30, 20, seed, "test", str(reads), domain=WORLD, mind_noises=people.mind_noises
+        )
+        message_noise = torch.rand(30, 20, 60, 7, generator=torch.Generator().manual_seed(seed))
+        recording = record(people, replace(start, message_noise=message_noise), told=told)
         chances = people.predictive(
             recording.probabilities, recording.observation, recording.actions, recording.told
         )
@@ -169,7 +173,7 @@ def test_branches_are_all_that_chance_may_decide():
     chances, _, actions = someone.branches(memory, observation, tell([2], kind=True))
     assert chances[0, 0].tolist() == [0, 0, 0.5, 0.5]
     assert actions[0, 0].argmax(-1).tolist() == [WAIT, WAIT, YELLOW, YELLOW]
-    assert someone.kept(memory).fate.shape == (1, 1, 0)
+    assert someone.kept(memory).mind_noise.shape == (1, 1, 0)
 
 
 def test_an_oracle_tells_what_is_worth_it():
@@ -182,7 +186,7 @@ def test_an_oracle_tells_what_is_worth_it():
 def test_the_mean_of_noticing_is_learned_from_rounds(seed):
     """Of 36 rounds: within 4.5 standard errors, about 1 / sqrt(times found) on a logarithm."""
     truth = participants(20, seed)
-    start = draw_starts(20, 36, seed, "test", domain=WORLD, fates=truth.fates)
+    start = draw_starts(20, 36, seed, "test", domain=WORLD, mind_noises=truth.mind_noises)
     recording = record(truth, start)
     found = (recording.actions != WAIT).sum((1, 2)).double()
     error = (learn_notices(recording)[:, 0] / truth.notices[:, 0]).log().double().abs()

@@ -20,7 +20,7 @@ from mirror_ppl.domains.search_rescue.participants import (
 from mirror_ppl.domains.search_rescue.people import (
     HOME,
     SUBGOALS,
-    Firefighters,
+    SimulatedFirefighters,
     possible_subgoals,
     subgoal_distances,
 )
@@ -38,7 +38,7 @@ UP, DOWN, WEST, EAST = range(4)
 def person(radius=1.5, lapse=0.0, transitions=None):
     """One firefighter; of equal habits unless said otherwise."""
     equal = torch.ones(1, 8, 6, 6) if transitions is None else transitions
-    return Firefighters(torch.tensor([radius]), equal, torch.tensor([lapse]))
+    return SimulatedFirefighters(torch.tensor([radius]), equal, torch.tensor([lapse]))
 
 
 def state(place, blocked=0, victim=0, found=False):
@@ -199,7 +199,9 @@ def test_told_of_an_obstacle_they_take_the_other_corridor():
 
 
 def test_they_see_by_radius_and_hear_nothing():
-    someone = Firefighters(torch.tensor([1.5, 10.0]), torch.ones(2, 8, 6, 6), torch.zeros(2))
+    someone = SimulatedFirefighters(
+        torch.tensor([1.5, 10.0]), torch.ones(2, 8, 6, 6), torch.zeros(2)
+    )
     two = map_state(lambda part: part.expand(2, *part.shape[1:]), state((7, 4)))
     seen = someone.sees(WORLD.observe(two))
     assert seen["visual"][0, 0].nonzero().flatten().tolist() == [7]
@@ -212,10 +214,10 @@ def test_they_see_by_radius_and_hear_nothing():
 
 def test_luck_chooses_actions_with_their_probabilities():
     chances = torch.tensor([0.1, 0.0, 0.6, 0.3])
-    luck = (torch.arange(1000) + 0.5) / 1000
-    counts = torch.bincount(act(chances.expand(1000, 4), luck), minlength=4)
+    action_noise = (torch.arange(1000) + 0.5) / 1000
+    counts = torch.bincount(act(chances.expand(1000, 4), action_noise), minlength=4)
     assert counts.tolist() == [100, 0, 600, 300]
-    # Of two actions the second is taken where luck is below its probability.
+    # Of two actions the second is taken where the noise is below its probability.
     two = act(torch.tensor([[0.7, 0.3]] * 2), torch.tensor([0.299, 0.301]))
     assert two.tolist() == [1, 0]
 
@@ -224,28 +226,30 @@ def test_fate_chooses_goals_with_their_probabilities(seed):
     generator = torch.Generator().manual_seed(seed)
     liked = torch.rand(1, 8, 6, 6, generator=generator) + 0.1
     someone, number = person(transitions=liked), 20_000
-    fate = torch.rand(1, number, 36, generator=generator)
+    mind_noise = torch.rand(1, number, 36, generator=generator)
     observation = WORLD.observe(
         map_state(lambda part: part.expand(1, number, *part.shape[2:]), state((4, 1)))
     )
-    memory = replace(someone.start(number, fate=fate), goal=torch.full((1, number), LEFT))
+    memory = replace(
+        someone.start(number, mind_noise=mind_noise), goal=torch.full((1, number), LEFT)
+    )
     _, after = someone.step(memory, observation)
     shares = one_hot(after.goal[0], 6).float().mean(0)
     expected = liked[0, ALL, LEFT] * torch.tensor([0, 0, 1, 1, 1, 0])
     expected = expected / expected.sum()
     # Five standard errors of a share of 20,000.
     assert (shares - expected).abs().max() < 5 * 0.5 / math.sqrt(number)
-    # Without fate the likeliest happens.
+    # Without mind_noise the likeliest happens.
     _, after = looking(someone, (4, 1), wanting(LEFT, someone=someone))
     assert int(after.goal) == int(expected.argmax())
 
 
 def test_branches_are_all_that_a_step_can_lead_to(generator):
     someone = simulated_people("search_rescue", "smoke", "paper", 1, 0)
-    start = draw_starts(1, 200, 0, "branches", domain=WORLD, fates=36)
-    memory, now = someone.start(200, fate=start.fate), start.state
+    start = draw_starts(1, 200, 0, "branches", domain=WORLD, mind_noises=36)
+    memory, now = someone.start(200, mind_noise=start.mind_noise), start.state
     told = {m.name: torch.zeros(1, 200, len(m.items), dtype=torch.bool) for m in WORLD.modalities}
-    for luck in start.luck[..., :20].unbind(-1):
+    for action_noise in start.action_noise[..., :20].unbind(-1):
         observation = WORLD.observe(now)
         chance, minds, every = someone.branches(memory, observation, told)
         probability, memory = someone.step(memory, observation, told)
@@ -257,17 +261,19 @@ def test_branches_are_all_that_a_step_can_lead_to(generator):
         for name in ("corridors", "rooms"):
             assert torch.equal(getattr(minds, name)[:, :, 0], getattr(memory, name))
         assert minds.goal[0, 0].tolist() == list(range(6))
-        now = WORLD.transition(now, act(probability, luck))
+        now = WORLD.transition(now, act(probability, action_noise))
 
 
 @pytest.mark.parametrize("told", [0.0, 0.03])
 def test_predictions_without_reading_minds_are_right_on_average(seed, told):
     """Surprise by what they do is what the predictive distribution says: its entropy."""
     people = simulated_people("search_rescue", "smoke", "paper", 4, 0)
-    start = draw_starts(4, 300, seed, "predictive", domain=WORLD, fates=people.fates)
+    start = draw_starts(4, 300, seed, "predictive", domain=WORLD, mind_noises=people.mind_noises)
     items = sum(len(part.items) for part in WORLD.modalities)
-    gossip = torch.rand(4, 300, WORLD.horizon, items, generator=torch.Generator().manual_seed(seed))
-    recording = record(people, replace(start, gossip=gossip), told=told)
+    message_noise = torch.rand(
+        4, 300, WORLD.horizon, items, generator=torch.Generator().manual_seed(seed)
+    )
+    recording = record(people, replace(start, message_noise=message_noise), told=told)
     chances = people.predictive(
         recording.probabilities, recording.observation, recording.actions, recording.told
     )
@@ -290,8 +296,8 @@ def test_habits_and_patience_are_learned_from_rounds():
     habit = torch.zeros(2, 6, 6)
     habit[0, HOME, LEFT], habit[1, HOME, LEFT] = 1.2, -1.2
     true = transitions_of(habit, torch.tensor([1.5, 4.0]))
-    someone = Firefighters(torch.tensor([1.5, 1.5]), true, torch.tensor([0.02, 0.02]))
-    start = draw_starts(2, 800, 0, "habits", domain=WORLD, fates=36)
+    someone = SimulatedFirefighters(torch.tensor([1.5, 1.5]), true, torch.tensor([0.02, 0.02]))
+    start = draw_starts(2, 800, 0, "habits", domain=WORLD, mind_noises=36)
     learned = learn_transitions([record(someone, start)])
 
     def share(weights, rooms, before, first, others):

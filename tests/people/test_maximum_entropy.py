@@ -33,8 +33,8 @@ def random_decisions(number, generator):
         action=torch.zeros(number, dtype=torch.long),
     )
     probability = log_policy(TRUE, decisions, HORIZON, DISCOUNT).exp()[:, 1]
-    luck = torch.rand(number, generator=generator)
-    decisions.action[:] = (luck < probability).long()
+    action_noise = torch.rand(number, generator=generator)
+    decisions.action[:] = (action_noise < probability).long()
     return decisions
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import require_known
 from mirror_ppl.domains.bomb_defusal.panel import STAGES, TERMINALS, read_panel
-from mirror_ppl.domains.bomb_defusal.people import Defusers
+from mirror_ppl.domains.bomb_defusal.people import SimulatedDefusers
 from mirror_ppl.domains.bomb_defusal.world import WAIT, BombDefusal
 from mirror_ppl.people.base import DomainPeople, derived_generator
 from mirror_ppl.people.recordings import Recording, draw_starts, record
@@ -30,7 +30,7 @@ DEFUSER_POPULATIONS = ("paper", "diverse")
 """Who people may be: as quick at every terminal, or at some quicker than at others."""
 
 
-def participants(people: int, seed: int, by_place: bool = False) -> Defusers:
+def participants(people: int, seed: int, by_place: bool = False) -> SimulatedDefusers:
     """The ground truth: how quick each is, and everybody is told the type.
 
     Args:
@@ -44,7 +44,9 @@ def participants(people: int, seed: int, by_place: bool = False) -> Defusers:
             1 + TERMINALS, generator=derived_generator(seed, "notices", person)
         ) * torch.tensor([NOTICE_SPREAD] + [PLACE_SPREAD * by_place] * TERMINALS)
         drawn.append(NOTICE_MEDIAN * (noise[0] + noise[1:]).exp())
-    return Defusers(torch.stack(drawn).clamp(max=1.0), torch.ones(people, dtype=torch.bool))
+    return SimulatedDefusers(
+        torch.stack(drawn).clamp(max=1.0), torch.ones(people, dtype=torch.bool)
+    )
 
 
 def learn_notices(recording: Recording, by_place: bool = False) -> Tensor:
@@ -78,14 +80,14 @@ def learned_notices(people: int, seed: int, by_place: bool) -> Tensor:
         seed,
         "participants",
         domain=BombDefusal(),
-        fates=Defusers.fates,
+        mind_noises=SimulatedDefusers.mind_noises,
     )
     return learn_notices(record(participants(people, seed, by_place), start), by_place)
 
 
 def simulated_defusers(
     setting: str, population: str, people: int, seed: int, device: torch.device | str = "cpu"
-) -> Defusers:
+) -> SimulatedDefusers:
     """The simulated people of a population, to be stepped by whoever wants to.
 
     Each is made for one participant. The same seed gives the same people.
@@ -103,7 +105,9 @@ def simulated_defusers(
     require_known(setting, "setting", BombDefusal.settings, BombDefusal.name)
     require_known(population, "population", DEFUSER_POPULATIONS, BombDefusal.name)
     reads = torch.full((people,), setting == "labelled", device=device)
-    return Defusers(learned_notices(people, seed, population == "diverse").to(device), reads)
+    return SimulatedDefusers(
+        learned_notices(people, seed, population == "diverse").to(device), reads
+    )
 
 
 DEFUSERS = DomainPeople(DEFUSER_POPULATIONS, simulated_defusers)

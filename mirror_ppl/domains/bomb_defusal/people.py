@@ -43,7 +43,7 @@ class Mind:
         guess: what they take it for if they do not, ``[...]``.
         found: whether they have found the terminal that counts ``[...]``, at ``stage`` ``[...]``.
         step: number of the next step ``[...]``.
-        fate: uniform numbers ``[..., 1 + T]``: of the guess, and of finding it at each step.
+        mind_noise: uniform numbers ``[..., 1 + T]``: of the guess, and of finding it at each step.
     """
 
     informed: Tensor
@@ -51,11 +51,11 @@ class Mind:
     found: Tensor
     stage: Tensor
     step: Tensor
-    fate: Tensor
+    mind_noise: Tensor
 
 
 @dataclass(frozen=True)
-class Defusers(SimulatedPeople):
+class SimulatedDefusers(SimulatedPeople):
     """P people who defuse bombs.
 
     Attributes:
@@ -66,7 +66,7 @@ class Defusers(SimulatedPeople):
     notices: Tensor
     reads: Tensor
 
-    fates: ClassVar[int] = 1 + BombDefusal.horizon
+    mind_noises: ClassVar[int] = 1 + BombDefusal.horizon
 
     @property
     def domain(self) -> BombDefusal:
@@ -78,14 +78,14 @@ class Defusers(SimulatedPeople):
         items = self.domain.modalities[0].items
         return {f"notices_{item}": self.notices[:, place] for place, item in enumerate(items)}
 
-    def start(self, *batch: int, fate: Tensor | None = None) -> Mind:
+    def start(self, *batch: int, mind_noise: Tensor | None = None) -> Mind:
         """Minds ``[P, *batch]`` before a round; see `SimulatedPeople.start`."""
         shape, device = (len(self.notices), *batch), self.notices.device
-        if fate is None:
-            fate = torch.full((*shape, self.fates), 0.5, device=device)
+        if mind_noise is None:
+            mind_noise = torch.full((*shape, self.mind_noises), 0.5, device=device)
         never = torch.zeros(shape, dtype=torch.bool, device=device)
         nothing = torch.zeros(shape, dtype=torch.long, device=device)
-        return Mind(never, nothing + UNDECIDED, never, nothing, nothing, fate)
+        return Mind(never, nothing + UNDECIDED, never, nothing, nothing, mind_noise)
 
     def sees(self, observation: Observation) -> Visibility:
         """What they see at once: no terminal, and the type if they can read it."""
@@ -99,12 +99,12 @@ class Defusers(SimulatedPeople):
     ) -> tuple[Tensor, Mind]:
         """Look, listen, and press; see `SimulatedPeople.step`."""
         decided, chance = self._look(memory, observation, told)
-        luck = memory.fate.take_along_dim(1 + memory.step[..., None], -1).squeeze(-1)
-        first = (memory.fate[..., 0] * len(KINDS)).long()
+        action_noise = memory.mind_noise.take_along_dim(1 + memory.step[..., None], -1).squeeze(-1)
+        first = (memory.mind_noise[..., 0] * len(KINDS)).long()
         mind = replace(
             decided,
             guess=torch.where(decided.guess == UNDECIDED, first, decided.guess),
-            found=decided.found | (luck < chance),
+            found=decided.found | (action_noise < chance),
         )
         return self._acts(mind, observation), mind
 
@@ -131,7 +131,7 @@ class Defusers(SimulatedPeople):
             which >= kinds,
             of_each(decided.stage),
             of_each(decided.step),
-            of_each(decided.fate, 1),
+            of_each(decided.mind_noise, 1),
         )
         seen = {
             name: value.unsqueeze(decided.guess.dim()).expand(
@@ -143,7 +143,9 @@ class Defusers(SimulatedPeople):
 
     def kept(self, memory: Mind) -> Mind:
         """What they know, guess and have found."""
-        return replace(memory, step=torch.zeros_like(memory.step), fate=memory.fate[..., :0])
+        return replace(
+            memory, step=torch.zeros_like(memory.step), mind_noise=memory.mind_noise[..., :0]
+        )
 
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility

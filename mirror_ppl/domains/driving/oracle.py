@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, every_message
 from mirror_ppl.domains.base import Observation, map_state, total_reward
-from mirror_ppl.domains.driving.people import Drivers, Memory, remember
+from mirror_ppl.domains.driving.people import Memory, SimulatedDrivers, remember
 from mirror_ppl.domains.driving.world import Driving, DrivingState
 from mirror_ppl.row_hashing import distinct_rows
 
@@ -59,7 +59,7 @@ class Oracle:
         value: expected return of each round, costs of messages taken off, ``[R]``.
     """
 
-    def __init__(self, driver: Drivers, start: DrivingState) -> None:
+    def __init__(self, driver: SimulatedDrivers, start: DrivingState) -> None:
         self._steps = _everything(driver, start)
         value = torch.zeros(int(self._steps[-1].following.max()) + 1)
         self._best: list[Tensor] = []
@@ -118,7 +118,7 @@ class Oracle:
         return torch.stack(lost, 1)
 
 
-def _everything(driver: Drivers, start: DrivingState) -> list[_Step]:
+def _everything(driver: SimulatedDrivers, start: DrivingState) -> list[_Step]:
     domain = Driving()
     channels = Channels(domain)
     messages = every_message(torch.ones(len(channels), dtype=torch.bool))
@@ -186,7 +186,7 @@ def _memory(memory: Memory, rows: Tensor) -> Memory:
     return map_state(lambda part: part[rows], memory)
 
 
-def _choices(driver: Drivers, known: Memory, lane: Tensor) -> Tensor:
+def _choices(driver: SimulatedDrivers, known: Memory, lane: Tensor) -> Tensor:
     """Probabilities ``[M, A]`` of what the driver does, worked out once for equal knowledge."""
     first, which = distinct_rows(torch.cat([lane[:, None], known.rows()], -1))
     parts = [

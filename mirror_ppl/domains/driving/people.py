@@ -186,7 +186,7 @@ def remember(
 
 
 @dataclass(frozen=True)
-class Drivers(SimulatedPeople):
+class SimulatedDrivers(SimulatedPeople):
     """P people who drive, each with their own sight and consistency; step them with `step`.
 
     Attributes:
@@ -211,9 +211,9 @@ class Drivers(SimulatedPeople):
             "consistency": self.consistency,
         }
 
-    def start(self, *batch: int, fate: Tensor | None = None) -> Memory:
+    def start(self, *batch: int, mind_noise: Tensor | None = None) -> Memory:
         """Memory ``[P, *batch, K]`` before a round begins; nothing in it is chance."""
-        del fate
+        del mind_noise
         return Memory.empty((len(self.reach), *batch), self.reach.device)
 
     def sees(self, observation: Observation) -> Visibility:
@@ -258,7 +258,7 @@ class Drivers(SimulatedPeople):
 
 
 @dataclass(frozen=True)
-class TaskDrivers(Drivers):
+class TaskDrivers(SimulatedDrivers):
     """The ground truth: people who value actions exactly, by the reward of the task."""
 
     def values(self, memory: Memory, lane: Tensor) -> Tensor:
@@ -268,7 +268,7 @@ class TaskDrivers(Drivers):
 
 
 @dataclass(frozen=True)
-class PlanningDrivers(Drivers):
+class PlanningDrivers(SimulatedDrivers):
     """The simulated people: the cross-entropy method on a learned reward.
 
     The value of an action is that of the best plan found which begins with it. Plans are searched

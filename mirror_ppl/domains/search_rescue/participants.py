@@ -19,7 +19,7 @@ from mirror_ppl.domains.search_rescue.knowledge import HouseKnowledge
 from mirror_ppl.domains.search_rescue.people import (
     HOME,
     SUBGOALS,
-    Firefighters,
+    SimulatedFirefighters,
     possible_rooms,
     possible_subgoals,
     subgoal_distances,
@@ -64,7 +64,7 @@ RESCUE_POPULATIONS: dict[str, Callable[[str, int, int], Tensor]] = {
 """Populations: how far each person sees, given setting, number of people and seed."""
 
 
-def participants(setting: str, people: int, seed: int) -> Firefighters:
+def participants(setting: str, people: int, seed: int) -> SimulatedFirefighters:
     """The ground truth: people of habits who like short ways, with sight limited by the setting."""
     habits, patiences, lapses = [], [], []
     for person in range(people):
@@ -73,7 +73,7 @@ def participants(setting: str, people: int, seed: int) -> Firefighters:
         haste, lapse = torch.randn(2, generator=generator)
         patiences.append(PATIENCE_MEDIAN * (PATIENCE_SPREAD * haste).exp())
         lapses.append(LAPSE_MEDIAN * (LAPSE_SPREAD * lapse).exp())
-    return Firefighters(
+    return SimulatedFirefighters(
         radius=_by_setting(setting, people, seed),
         transitions=transitions_of(torch.stack(habits), torch.stack(patiences)),
         lapse=torch.stack(lapses),
@@ -165,7 +165,7 @@ def learned_transitions(people: int, seed: int) -> Tensor:
             "participants",
             setting,
             domain=domain,
-            fates=Firefighters.fates,
+            mind_noises=SimulatedFirefighters.mind_noises,
         )
         recordings.append(record(participants(setting, people, seed), start))
     return learn_transitions(recordings)
@@ -173,7 +173,7 @@ def learned_transitions(people: int, seed: int) -> Tensor:
 
 def simulated_firefighters(
     setting: str, population: str, people: int, seed: int, device: torch.device | str = "cpu"
-) -> Firefighters:
+) -> SimulatedFirefighters:
     """The simulated people of a population, to be stepped by whoever wants to.
 
     Each is made for one participant. The same seed gives the same people.
@@ -191,7 +191,7 @@ def simulated_firefighters(
     """
     require_known(setting, "setting", SearchRescue.settings, SearchRescue.name)
     require_known(population, "population", tuple(RESCUE_POPULATIONS), SearchRescue.name)
-    return Firefighters(
+    return SimulatedFirefighters(
         radius=RESCUE_POPULATIONS[population](setting, people, seed).to(device),
         transitions=learned_transitions(people, seed).to(device),
         lapse=participants(setting, people, seed).lapse.to(device),

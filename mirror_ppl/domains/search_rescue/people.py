@@ -57,17 +57,17 @@ class Mind:
         corridors: whether it is known of each if it is blocked, ``[..., 2]``.
         rooms: whether it is known of each if the victim is there, ``[..., 3]``.
         goal: the subgoal, an index into ``SUBGOALS``, ``[...]``.
-        fate: uniform numbers that choose what comes after each subgoal, ``[..., 6, 6]``.
+        mind_noise: uniform numbers that choose what comes after each subgoal, ``[..., 6, 6]``.
     """
 
     corridors: Tensor
     rooms: Tensor
     goal: Tensor
-    fate: Tensor
+    mind_noise: Tensor
 
 
 @dataclass(frozen=True)
-class Firefighters(SimulatedPeople):
+class SimulatedFirefighters(SimulatedPeople):
     """P people who search and rescue.
 
     Attributes:
@@ -81,7 +81,7 @@ class Firefighters(SimulatedPeople):
     transitions: Tensor
     lapse: Tensor
 
-    fates: ClassVar[int] = len(SUBGOALS) ** 2
+    mind_noises: ClassVar[int] = len(SUBGOALS) ** 2
 
     @property
     def domain(self) -> SearchRescue:
@@ -92,17 +92,17 @@ class Firefighters(SimulatedPeople):
         """How far they see, and how often they step anywhere."""
         return {"sight_radius": self.radius, "lapse": self.lapse}
 
-    def start(self, *batch: int, fate: Tensor | None = None) -> Mind:
+    def start(self, *batch: int, mind_noise: Tensor | None = None) -> Mind:
         """Minds ``[P, *batch]`` at the entrance; see `SimulatedPeople.start`."""
         shape, device = (len(self.radius), *batch), self.radius.device
         knowledge = HouseKnowledge.nothing(*shape, device=device)
-        if fate is None:
-            fate = torch.full((*shape, self.fates), 0.5, device=device)
+        if mind_noise is None:
+            mind_noise = torch.full((*shape, self.mind_noises), 0.5, device=device)
         return Mind(
             knowledge.corridors,
             knowledge.rooms,
             torch.full(shape, HOME, device=device),
-            fate.unflatten(-1, (len(SUBGOALS), len(SUBGOALS))),
+            mind_noise.unflatten(-1, (len(SUBGOALS), len(SUBGOALS))),
         )
 
     def sees(self, observation: Observation) -> Visibility:
@@ -119,11 +119,11 @@ class Firefighters(SimulatedPeople):
         here = memory.goal[..., None, None]
         row = chance.take_along_dim(here, -2).squeeze(-2)
         # The largest of logarithms with Gumbel noise is a draw with these probabilities.
-        noise = -(-memory.fate.take_along_dim(here, -2).squeeze(-2).log()).log()
+        noise = -(-memory.mind_noise.take_along_dim(here, -2).squeeze(-2).log()).log()
         goal = (row.log() + noise).argmax(-1)
         steps = self._steps(knowledge, observation)
         probability = steps.take_along_dim(goal[..., None, None], -2).squeeze(-2)
-        return probability, Mind(knowledge.corridors, knowledge.rooms, goal, memory.fate)
+        return probability, Mind(knowledge.corridors, knowledge.rooms, goal, memory.mind_noise)
 
     def branches(
         self, memory: Mind, observation: Observation, told: Visibility
@@ -142,13 +142,13 @@ class Firefighters(SimulatedPeople):
             of_each(knowledge.corridors, 1),
             of_each(knowledge.rooms, 1),
             every.expand(chance.shape),
-            of_each(memory.fate, 2),
+            of_each(memory.mind_noise, 2),
         )
         return chance, minds, self._steps(knowledge, observation)
 
     def kept(self, memory: Mind) -> Mind:
         """What they know, and their subgoal."""
-        return replace(memory, fate=memory.fate[..., :0, :0])
+        return replace(memory, mind_noise=memory.mind_noise[..., :0, :0])
 
     def predictive(
         self, probabilities: Tensor, observation: Observation, actions: Tensor, told: Visibility
@@ -165,7 +165,7 @@ class Firefighters(SimulatedPeople):
             heard = {name: mask[:, :, step] for name, mask in told.items()}
             knowledge = self._learn(memory, now, heard)
             chance = self._next(memory, knowledge, now)
-            memory = Mind(knowledge.corridors, knowledge.rooms, memory.goal, memory.fate)
+            memory = Mind(knowledge.corridors, knowledge.rooms, memory.goal, memory.mind_noise)
             goals = (goals[..., None, :] @ chance).squeeze(-2)
             steps = self._steps(knowledge, now)
             found.append((goals[..., None] * steps).sum(-2))
