@@ -2,7 +2,7 @@
 
 Sphinx with MyST rather than MkDocs Material, after a look at both:
 
-- The root of the repository is the folder of sources. README.md, CHANGELOG.md, docs/ and
+- The root of the repository is the folder of sources. README.md and the like, docs/ and
   notebooks/ become pages where they are, so links that are written for a code host work here
   unchanged and are checked; files that are no pages become downloads. MkDocs knows one folder of
   pages, and needs code that rewrites such links.
@@ -30,7 +30,7 @@ author = "mirror_ppl contributors"
 version = release = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
-include_patterns = ["README.md", "CHANGELOG.md", "docs/**", "notebooks/*.ipynb"]
+include_patterns = ["*.md", "docs/**", "notebooks/*.ipynb"]
 exclude_patterns = [".*", "build", "docs/_site", "runs"]
 root_doc = "README"
 
@@ -51,7 +51,12 @@ SITE = {
     "Worlds": ["docs/driving", "docs/search_rescue", "docs/bomb_defusal"],
     "Results": ["docs/results", "docs/performance"],
     "Reference": ["docs/reference/index"],
-    "More": ["Gallery <docs/gallery>", "Decisions <docs/decisions>", "Changes <CHANGELOG>"],
+    "More": [
+        "Gallery <docs/gallery>",
+        "Decisions <docs/decisions>",
+        "Changes <CHANGELOG>",
+        "CONTRIBUTING",
+    ],
 }
 """Pages by section; a page that is nowhere fails the build."""
 BELOW = {

@@ -126,5 +126,5 @@ def test_every_page_is_in_the_site():
     pages = {f"docs/{page.stem}" for page in (ROOT / "docs").glob("*.md")}
     pages |= {f"docs/reference/{page.stem}" for page in REFERENCE.glob("*.md")}
     pages |= {f"notebooks/{page.stem}" for page in (ROOT / "notebooks").glob("*.ipynb")}
-    assert set(shown) == pages | {"self", "CHANGELOG", "docs/results/*"}
+    assert set(shown) == pages | {"self", "CHANGELOG", "CONTRIBUTING", "docs/results/*"}
     assert {f"docs/reference/{page}" for page in ("mirror_ppl", "commands", *PACKAGES)} <= pages
