@@ -80,7 +80,8 @@ class InferenceOptions:
     Attributes:
         engine: one of ``ENGINES``.
         draws: posterior draws S of each person.
-        settings: of the engine, such as :class:`ImportanceOptions`; its own unless given.
+        settings: of the engine, such as :class:`~mirror_ppl.inference.ImportanceOptions`; its own
+            unless given.
         screening: when to give up combinations of discrete sites; ``None`` for never. That of the
             amortized guide is its own.
         pooling: ``none``, or ``partial`` to infer with the people the population that they are

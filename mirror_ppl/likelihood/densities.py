@@ -79,7 +79,8 @@ def log_correction(
     """What ``prior`` adds to the density by which draws are proposed, ``[S, P]``.
 
     Its factors and observed sites, scales and masks, but for those that depend on the discrete
-    sites that perception reads; they are part of :func:`log_priors`.
+    sites that perception reads; they are part of
+    :func:`~mirror_ppl.likelihood.combinations.log_priors`.
 
     Args:
         human: the model of people.

@@ -102,7 +102,8 @@ def combination_scores(
 
     Args:
         table: the recorded rounds.
-        likelihood: of each sight ``[..., P, U]``, see :meth:`HumanModel.log_likelihoods`.
+        likelihood: of each sight ``[..., P, U]``, see
+            :func:`~mirror_ppl.likelihood.table_program.log_likelihoods`.
         combinations: numbers ``[M]`` of those that are asked for; all unless given.
     """
     scores = []

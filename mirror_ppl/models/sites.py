@@ -98,5 +98,5 @@ class OnlyRead(dict[str, Tensor]):
         return super().__contains__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """See :meth:`dict.get`."""
+        """See `dict.get`."""
         return super().get(name, default) if name in self else default

@@ -4,11 +4,14 @@ import ast
 import importlib
 import importlib.util
 import inspect
+import pkgutil
+import re
 import sys
 
 import pytest
 from paths import ROOT
 
+import mirror_ppl
 from mirror_ppl.commands import COMMANDS
 
 REFERENCE = ROOT / "docs/reference"
@@ -76,6 +79,57 @@ def test_names_that_are_imported_when_they_are_used(package):
     assert list(places) == module.__all__
     with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'nothing'"):
         module.nothing  # noqa: B018
+
+
+# --- roles in docstrings ----------------------------------------------------------------------
+
+ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod|obj):`~?([^`]+)`")
+
+
+def docstrings(node, scope=()):
+    """Docstrings of a module, of what is in it, and of its data, each with the names around it."""
+    for one in ast.iter_child_nodes(node):
+        if isinstance(one, ast.ClassDef | ast.FunctionDef):
+            yield from docstrings(one, (*scope, one.name))
+        elif isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant):
+            yield scope, str(one.value.value)
+
+
+def has(found, path):
+    """Whether a name with dots is of something; fields of classes without a value count, too."""
+    for part in path.split("."):
+        fields = getattr(found, "__annotations__", {})
+        if not hasattr(found, part):
+            return part in fields
+        found = getattr(found, part)
+    return True
+
+
+def is_imported(name):
+    """Whether a name with dots is a module, or in one."""
+    module, dot, rest = name.partition(".")
+    found = importlib.import_module(module) if module == "mirror_ppl" else None
+    while found is not None and rest and not has(found, rest):
+        part, dot, rest = rest.partition(".")
+        module = f"{module}.{part}"
+        known = importlib.util.find_spec(module)
+        found = None if known is None else importlib.import_module(module)
+    return found is not None
+
+
+def test_roles_in_docstrings_name_what_is_there():
+    """Sphinx takes names that it does not know for code."""
+    wrong = []
+    for info in pkgutil.walk_packages(mirror_ppl.__path__, "mirror_ppl."):
+        module = importlib.import_module(info.name)
+        for scope, text in docstrings(ast.parse(inspect.getsource(module))):
+            around = [module]
+            for name in scope:
+                around.append(getattr(around[-1], name, None))
+            for name in ROLE.findall(text):
+                if not (any(has(one, name) for one in around) or is_imported(name)):
+                    wrong.append(f"{'.'.join([info.name, *scope])}: {name}")
+    assert not wrong
 
 
 # --- the site ---------------------------------------------------------------------------------
