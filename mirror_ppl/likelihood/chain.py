@@ -2,8 +2,9 @@
 
 Where each site of ``round_latents`` counts at certain steps only (its
 :class:`~mirror_ppl.models.spans.Span`), what a person may have attended to need not be gone through
-combination by combination. What is left of the values read so far is the belief and the knowledge that they led to; many lead to the same. So the sum runs
-from the end of the round to its beginning, over *states* in which a span may begin::
+combination by combination. What is left of the values read so far is the belief and the knowledge
+that they led to; many lead to the same. So the sum runs from the end of the round to its beginning,
+over *states* in which a span may begin::
 
     L_i(h) = sum_m p(m_i = m | psi) prod_{t in span i} p(a_t | zH_t(h, m)) L_{i+1}(h'(h, m))
 
