@@ -19,7 +19,7 @@ STUDIES ?= $(patsubst benchmarks/%.py,%,$(sort $(wildcard benchmarks/[a-z]*.py))
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo check test bench results tables format clean
+.PHONY: help venv demo check test docs bench results tables format clean
 .DELETE_ON_ERROR:
 
 help: ## List these commands
@@ -49,6 +49,10 @@ check: $(STAMP) ## Style, format and types
 # One thread a process: the networks are small, and two workers share the cores.
 test: $(STAMP) ## The whole test suite
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
+
+docs: $(STAMP) ## The documentation site in build/site; a broken link or reference fails
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs/_site -d build/doctrees \
+		. build/site
 
 bench: $(STAMP) ## Every study in benchmarks/, one after the other
 	@set -e; for study in $(STUDIES); do \

@@ -1,5 +1,7 @@
 """MIRROR as a Pyro program: what a person sees, how they decide, and what a robot should tell them.
 
+::
+
     import mirror_ppl
 
     recordings = mirror_ppl.load_recordings("recordings.nc")

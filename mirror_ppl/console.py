@@ -7,7 +7,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 from mirror_ppl.errors import HumanModelError, MirrorError, OptionError, UnknownNameError
@@ -23,6 +23,7 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 128 + 2
 EXIT_BROKEN_PIPE = 128 + 13
 EXIT_TERMINATED = 128 + 15
+NO_EXAMPLES: Mapping[str, str] = {}
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 """Errors of writing that are not the code's."""
 NO_MEMORY = ("can't allocate memory", "CUDA out of memory")
@@ -36,6 +37,7 @@ def run(
     prog: str,
     description: str,
     args: Sequence[str] | None = None,
+    examples: Mapping[str, str] = NO_EXAMPLES,
     threads: int = 1,
 ) -> int:
     """Parse the command line into options, call `main` with them, and return the exit status.
@@ -49,6 +51,7 @@ def run(
         prog: the program's name in the help, such as "python -m mirror_ppl.fit".
         description: what the command does, for the help.
         args: the arguments; by default those of the process.
+        examples: arguments, by what they are for; `--help` ends with them.
         threads: how many threads torch gets, unless OMP_NUM_THREADS is set. The networks here are
             too small to gain from more than one.
 
@@ -58,7 +61,7 @@ def run(
         130 after an interruption and 143 after SIGTERM; 141 when the reader of stdout went away.
         Other exceptions are mistakes of the code and pass through.
     """
-    return guarded(lambda: _run(options_class, main, prog, description, args, threads))
+    return guarded(lambda: _run(options_class, main, prog, description, args, examples, threads))
 
 
 def guarded(call: Callable[[], int]) -> int:
@@ -89,18 +92,29 @@ def _run(
     prog: str,
     description: str,
     args: Sequence[str] | None,
+    examples: Mapping[str, str],
     threads: int,
 ) -> int:
     import tyro
 
+    from mirror_ppl.option_help import description_of, examples_of, registry_for
+
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            options = tyro.cli(options_class, prog=prog, description=description, args=args)
+            options = tyro.cli(
+                options_class,
+                prog=prog,
+                description=description_of(description),
+                args=args,
+                registry=registry_for(options_class),
+            )
     except SystemExit as end:
         if end.code:
             raise OptionError(_argument_error(said.getvalue(), prog)) from end
-        return 0  # after --help
+        if examples:  # after --help
+            print(f"\n{examples_of(prog, examples)}")
+        return 0
     # After parsing, so that --help and argument errors do not wait for the import of torch.
     _use_threads(threads)
     try:

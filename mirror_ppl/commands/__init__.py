@@ -1,6 +1,7 @@
 """The commands. Each parses its options, calls the public face, and prints what comes out."""
 
 import signal
+from collections.abc import Sequence
 from importlib import import_module
 from typing import NoReturn
 
@@ -18,13 +19,26 @@ COMMANDS = {
 }
 
 
-def call(name: str) -> NoReturn:
-    """Be the command of that name, from the command line to the exit status of the process."""
+def call(name: str, prog: str | None = None, args: Sequence[str] | None = None) -> NoReturn:
+    """Be the command of that name, from the command line to the exit status of the process.
+
+    Args:
+        name: one of `COMMANDS`.
+        prog: how it was called, for its help; `python -m mirror_ppl.NAME` unless given.
+        args: its arguments; those of the process unless given.
+    """
 
     def command() -> int:
         # Imported here, so that an interruption meanwhile ends in a line, too.
         module = import_module(f"mirror_ppl.commands.{name}")
-        return run(module.Options, module.main, prog=module.PROGRAM, description=module.DESCRIPTION)
+        return run(
+            module.Options,
+            module.main,
+            prog=prog or module.PROGRAM,
+            description=module.DESCRIPTION,
+            args=args,
+            examples=module.EXAMPLES,
+        )
 
     status = guarded(command)
     # All is done and written. Python's own end takes a moment, in which nothing is to interrupt.

@@ -28,6 +28,11 @@ them, and tests that ranks of the truth among posterior draws are uniform. Print
 implant and number of rounds, and writes ranks.png, ecdf.png, coverage.png and calibration.nc. The
 exit status is 1 if calibration is rejected. A run that is stopped goes on where it was when the
 same command is given again."""
+EXAMPLES = {
+    "the engine importance, in a few minutes": "--people 100 --rounds 1 5 --out runs/calibration",
+    "the trained network, of people who react late": "--guide amortized --human-model late",
+}
+"""Arguments, by what they are for."""
 REJECTED = 1
 WIDTH = 80
 FEW_PEOPLE = 100

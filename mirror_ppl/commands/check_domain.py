@@ -14,6 +14,10 @@ PROGRAM = "python -m mirror_ppl.check_domain"
 DESCRIPTION = """Look over a world of your own, whose code is run: whether it keeps the contract of
 worlds, one line for each thing that is wrong, and what it offers. The exit status is 1 if something
 is wrong, and 2 if it cannot be loaded. How a world is written stands in docs/adding_a_world.md."""
+EXAMPLES = {
+    "a world that the documentation explains": "docs/examples/round_table.py:RoundTable",
+}
+"""Arguments, by what they are for."""
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,13 @@ PROGRAM = "python -m mirror_ppl.compare"
 DESCRIPTION = """Compare human models that were fitted to the same recordings by how well they
 predict rounds that they did not learn from, and print how far each is behind the best, with the
 standard error of the difference."""
+EXAMPLES = {
+    "two fits of the same recordings": "runs/demo runs/mine",
+    "by rounds that were held out, with a picture": (
+        "runs/demo runs/mine --by heldout --figure runs/compare.png"
+    ),
+}
+"""Arguments, by what they are for."""
 
 
 @dataclass(frozen=True)

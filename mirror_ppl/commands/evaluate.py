@@ -24,6 +24,15 @@ the net return of people who receive messages from communicators that plan with 
 share of the communicated items that is relevant. Writes rows of every person (CSV), tables to read
 (Markdown), a summary (JSON) and a figure. A run that is stopped goes on where it was when the same
 command is given again; the exit status is 1 if something failed."""
+EXAMPLES = {
+    "a quick look at predictions beside baselines": (
+        "prediction --people 4 --seeds 1 --models mirror bc logistic --out runs/baselines"
+    ),
+    "what messages are worth in another world": (
+        "assistance --domain search_rescue --out runs/rescue"
+    ),
+}
+"""Arguments, by what they are for."""
 FAILED = 1
 QUICK = ("driving",)
 """Worlds of short rounds, of which more is learned in the same time."""

@@ -27,6 +27,15 @@ uncertainty of it, and measure how well their held-out actions are predicted. Wi
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
 InferenceData), summary.json, pictures of what they see, check.png and open.png. A fit that is
 stopped goes on from its checkpoint when the same command is given again."""
+EXAMPLES = {
+    "ten simulated people who differ in what they see": (
+        "--setting fog --population diverse --out runs/diverse"
+    ),
+    "recordings of your own, five rounds of each person": (
+        "--demos runs/people.nc --train-rounds 5 --out runs/people"
+    ),
+}
+"""Arguments, by what they are for."""
 
 
 @dataclass(frozen=True)
@@ -66,16 +75,16 @@ class Options:
     guide_file: Path | None = None
     """Network of the guides auto and amortized (see `python -m mirror_ppl.train --what guide`)."""
     pooling: str = "none"
-    """Whether people tell of each other: none, or partial (the population that they are from is
-    inferred with them, and posterior.nc holds it)."""
+    """none, or partial (partial pooling: the population that the people are from is inferred with
+    them, and posterior.nc holds it)."""
     prior_from: Path | None = None
     """A posterior.nc of --pooling partial, whose population is the prior of these people."""
     allow_contradictions: str = "0%"
     """Percentage of steps whose action may contradict the next observation, such as 2%: for
     recordings of noisy rigs. The summary counts them."""
     explore: int = 8
-    """Rounds that the model plays in each scenario, to say which would tell more of what people
-    see; 0 leaves it out."""
+    """Rounds that are simulated of each scenario, to find the one that is most informative about
+    what people see; 0 leaves it out."""
     steps: int = 300
     """Gradient steps of svi."""
     refine: int = 0

@@ -19,6 +19,15 @@ COPIES = 4
 """Of recordings in memory: while they are made, checked and packed into a file."""
 DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
 for python -m mirror_ppl.fit. How the people are made is told in docs/people.md."""
+EXAMPLES = {
+    "ten people who drive in fog": (
+        "--setting fog --people 10 --rounds 40 --seed 1 --out runs/people.nc"
+    ),
+    "four people who react late, drawn from the prior": (
+        "--human-model late --people 4 --out runs/late.nc"
+    ),
+}
+"""Arguments, by what they are for."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +59,8 @@ class Options:
     rounds: int = 40
     """How many rounds each of them plays, at least 1."""
     told: float = 0.0
-    """Chance that an item that can be communicated is told, at each step, whoever it helps: rounds
-    that tell what people make of messages."""
+    """Probability that an item that can be communicated is, at each step, whether it helps or not:
+    such rounds show how people use messages."""
     seed: int = 0
     """The same seed gives the same people in every setting, and the same command the same file."""
     device: str = "cpu"

@@ -16,6 +16,15 @@ measure it, and write its weights with a card that tells both. A self-model is m
 exact planner; it takes about ten minutes. A guide learns from people who are drawn from the human
 model's prior; it takes about half an hour. A run that is stopped goes on when the same command is
 given again."""
+EXAMPLES = {
+    "the self-model that ships, from nothing": (
+        "--domain driving --out runs/driving_self_model.safetensors"
+    ),
+    "a network that infers people of a human model at once": (
+        "--what guide --human-model one-radius --people 1000"
+    ),
+}
+"""Arguments, by what they are for."""
 SELF_MODEL, GUIDE = "self-model", "guide"
 OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "sizes", "device")
 OF_GUIDE = ("people", "elbo_steps", "dropout", "human_model", "self_model")

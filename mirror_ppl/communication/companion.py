@@ -13,7 +13,7 @@ from mirror_ppl.errors import InputError
 
 
 class Companion:
-    """Receives what happens in rounds of one person, and plans the messages to them.
+    """Receives what happens in rounds of one person, and plans the messages to them::
 
         companion = Companion(communicator)
         companion.begin(observation)

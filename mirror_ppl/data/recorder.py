@@ -16,7 +16,7 @@ from mirror_ppl.errors import InputError
 
 
 class Recorder(gym.Wrapper):
-    """Keeps what happens in an environment, for `fit`.
+    """Keeps what happens in an environment, for `fit`::
 
         env = Recorder(world.make(), world, person="ada")
         env.reset(); env.tell("visual", "key"); env.step(2); ...

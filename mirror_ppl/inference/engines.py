@@ -80,7 +80,8 @@ class InferenceOptions:
     Attributes:
         engine: one of ``ENGINES``.
         draws: number of posterior draws S of each person.
-        settings: settings of the engine, such as :class:`ImportanceOptions`; by default its own.
+        settings: settings of the engine, such as
+            :class:`~mirror_ppl.inference.ImportanceOptions`; by default its own.
         screening: when to drop combinations of discrete sites; ``None`` for never. The amortized
             guide has its own.
         pooling: ``none``, or ``partial`` to infer the population together with the people

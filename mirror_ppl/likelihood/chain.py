@@ -1,6 +1,7 @@
 """Exact marginalization of attention that is read span by span.
 
-Where each site of ``round_latents`` is read at certain steps only (its :class:`Span`), attention
+Where each site of ``round_latents`` is read at certain steps only (its
+:class:`~mirror_ppl.models.spans.Span`), attention
 need not be enumerated combination by combination. The values read so far matter only through the
 belief and the knowledge that they led to, and many values lead to the same. The sum therefore runs
 backwards through the round, over the *states* in which a span may begin::

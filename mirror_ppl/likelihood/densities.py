@@ -79,7 +79,8 @@ def log_correction(
     """Log density ``[S, P]`` that ``prior`` adds to that of sampling its draws.
 
     Sums its factors, observed sites, scales and masks. Those that depend on the discrete sites that
-    perception reads are excluded; they are part of :func:`log_priors`.
+    perception reads are excluded; they are part of
+    :func:`~mirror_ppl.likelihood.combinations.log_priors`.
 
     Args:
         human: the model of people.

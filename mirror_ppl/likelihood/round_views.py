@@ -84,7 +84,8 @@ class Rounds:
 
 @dataclass(frozen=True)
 class RoundViews:
-    """V distinct views of one round, and their N moments; see :class:`ViewTable`.
+    """V distinct views of one round, and their N moments; see
+    :class:`~mirror_ppl.likelihood.view_table.ViewTable`.
 
     Attributes:
         moments: ``[V, T]``.

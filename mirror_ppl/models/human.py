@@ -48,6 +48,7 @@ from mirror_ppl.models.view import View
 from mirror_ppl.models.world_program import first_state, next_state, reward
 
 Implants = Mapping[str, Tensor]
+"""Values of sample sites by name, ``[..., P, 1]`` and event dimensions behind."""
 ACTION = "action"
 """Site of the action of a step."""
 ABOUT_SPANS = ("round_latents", "sees", "perceive")

@@ -98,5 +98,5 @@ class OnlyRead(dict[str, Tensor]):
         return super().__contains__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return the value of a site, or a default; see :meth:`dict.get`."""
+        """Return the value of a site, or a default; see `dict.get`."""
         return super().get(name, default) if name in self else default

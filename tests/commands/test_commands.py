@@ -52,7 +52,8 @@ def test_version():
     ("args", "told"),
     [
         (("--nonsense",), "--nonsense"),
-        (("fit", "--out", "x"), "python -m mirror_ppl.fit"),
+        (("fitt", "--out", "x"), "unknown argument"),
+        (("fit", "--nonsense"), "python -m mirror_ppl.fit --help"),
         (("--version", "more"), "more"),
     ],
 )
