@@ -131,11 +131,14 @@ class GymnasiumWorld(World):
         return _file(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle without tables that other processes can read from the file."""
-        kept = ("tables",) if self._path is None or not self._path.exists() else ()
-        return {
-            name: part for name, part in vars(self).items() if name not in CACHED or name in kept
-        }
+        """Pickle with the tables, or with the file from which other processes read them.
+
+        Other processes do not have the source of the class, and cannot visit the environment.
+        """
+        tables, path = self.tables, self._path
+        kept = {"tables": tables} if path is None or not path.exists() else {}
+        own = {name: part for name, part in vars(self).items() if name not in CACHED}
+        return own | kept | {"_path": path}
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
