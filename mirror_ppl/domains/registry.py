@@ -23,6 +23,8 @@ DOMAINS: dict[str, Domain] = {
     domain.name: domain for domain in (Driving(), SearchRescue(), BombDefusal())
 }
 """The package's own worlds by name."""
+CODE = "_hash_of_file"
+"""Attribute of the class of a user's world."""
 _ADDED: dict[str, World] = {}
 _LOADED: dict[tuple[Path, str, int], World] = {}
 """Worlds loaded from files, by file, class and modification time."""
@@ -78,17 +80,25 @@ def add_domain(world: World | type[World] | str) -> World:
 
 
 def code_of(domain: Domain) -> str:
-    """Return a hash of the file of a user's world; empty for the package's own worlds."""
+    """Return a hash of the file of a user's world; empty for the package's own worlds.
+
+    It is computed once and kept by the class: other processes do not have the file.
+    """
     if domain.name in DOMAINS:
         return ""
-    try:
-        return hashlib.sha256(Path(inspect.getfile(type(domain))).read_bytes()).hexdigest()
-    except (OSError, TypeError):  # written at a prompt
-        return ""
+    kind = type(domain)
+    if CODE not in vars(kind):
+        try:
+            content = Path(inspect.getfile(kind)).read_bytes()
+            setattr(kind, CODE, hashlib.sha256(content).hexdigest())
+        except (OSError, TypeError):  # written at a prompt
+            setattr(kind, CODE, "")
+    return vars(kind)[CODE]
 
 
 def know(world: World) -> World:
     """Register a world that was already checked."""
+    code_of(world)
     _ADDED[world.name] = world
     return world
 

@@ -250,7 +250,7 @@ def test_what_matters_most_is_told_first_and_what_would_be_done_is_about_it():
     one = four(3, actions)
     assert one.why() == (
         f"{BEHIND}, and {AHEAD}: they would switch into that lane with probability 0.90; "
-        "told, 0.40 (gain +3.50)"
+        "with the message, 0.40 (gain +3.50)"
     )
 
 

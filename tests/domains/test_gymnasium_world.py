@@ -1,6 +1,8 @@
 """Gymnasium environments as worlds: tables that are the environment, and what is refused."""
 
+import inspect
 import pickle
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +15,7 @@ from mirror_ppl.domains.checking import faults_of
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld, Place
 from mirror_ppl.domains.registry import load_world
 from mirror_ppl.errors import DomainError, InputError, UnknownNameError
+from mirror_ppl.workers import run_tasks
 
 UNLOCKING = f"{ROOT / 'docs' / 'examples' / 'unlocking.py'}:Unlocking"
 
@@ -299,3 +302,23 @@ def test_only_worlds_of_environments_are_recorded_so():
 
     with pytest.raises(InputError, match="GymnasiumWorld"):
         Recorder(Row(), get_domain("driving"))
+
+
+def number_of_states(name):
+    """What another process finds of a world: how many states, and whether it has its class."""
+    from mirror_ppl.domains import get_domain
+    from mirror_ppl.domains.registry import code_of
+
+    return len(get_domain(name).tables.over), len(code_of(get_domain(name)))
+
+
+def test_other_processes_read_the_tables_of_a_users_file(tmp_path):
+    file = tmp_path / "shelf.py"
+    imports = (
+        "import gymnasium as gym\nfrom mirror_ppl.domains import Modality\n"
+        "from mirror_ppl.domains.gymnasium_world import GymnasiumWorld\n\n\n"
+    )
+    file.write_text(imports + "\n\n".join(map(inspect.getsource, (Row, Shelf))))
+    world = add_domain(f"{file}:Shelf")
+    tasks = [partial(number_of_states, "shelf")] * 2
+    assert list(run_tasks(tasks, 2)) == [(len(world.tables.over), 64)] * 2

@@ -1,5 +1,6 @@
 """The page about worlds of one's own: its file, its commands, and what is refused."""
 
+import hashlib
 import re
 import shlex
 from importlib import import_module
@@ -12,7 +13,7 @@ from running import command
 import mirror_ppl
 from mirror_ppl.domains import DOMAINS, Modality, World, add_domain, get_domain
 from mirror_ppl.domains.checking import CAPABILITIES, faults_of
-from mirror_ppl.domains.registry import load_world
+from mirror_ppl.domains.registry import code_of, load_world
 from mirror_ppl.errors import DomainError, UnknownNameError
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.people import simulate, simulated_people
@@ -313,6 +314,12 @@ def test_a_robot_of_another_version_of_the_file_is_told(gone_through, monkeypatc
     get_domain(f"{other}:RoundTable")
     with pytest.warns(StaleSelfModel, match="has changed since this self-model was trained"):
         load_self_model(weights)
+
+
+def test_other_processes_know_the_version_of_the_file(monkeypatch):
+    world = get_domain(WORLD)
+    monkeypatch.setattr("inspect.getfile", None)  # a class that was sent has no file
+    assert code_of(world) == hashlib.sha256(FILE.read_bytes()).hexdigest()
 
 
 def test_people_are_played_with_the_robot_that_they_are_like(gone_through, monkeypatch, capsys):
