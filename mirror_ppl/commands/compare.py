@@ -141,7 +141,7 @@ def _show(comparison: Comparison) -> None:
     )
     table.add_column("", justify="right", no_wrap=True)
     table.add_column("model", overflow="fold")
-    for name in ("elpd", "difference", *(["doubtful"] if left_out else []), "weight"):
+    for name in ("log density", "difference", *(["doubtful"] if left_out else []), "weight"):
         table.add_column(name, justify="right", no_wrap=True)
     for rank, model in enumerate(comparison.models, 1):
         score = model.total
@@ -149,7 +149,7 @@ def _show(comparison: Comparison) -> None:
         table.add_row(
             f"{rank}",
             Text(model.label),
-            f"{score.elpd:z.4f}",
+            f"{score.log_density:z.4f}",
             # The best has no difference to itself, nor any error of it.
             "-" if rank == 1 else f"{score.difference:z.4f}{error}",
             *([] if score.doubtful is None else [f"{score.doubtful} of {score.rounds}"]),

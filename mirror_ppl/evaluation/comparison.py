@@ -85,17 +85,17 @@ class Score:
     Attributes:
         rounds: number of rounds.
         actions: number of actions in these rounds.
-        elpd: mean log predictive density per action.
-        elpd_se: its standard error; ``None`` for a single round.
-        difference: to the ``elpd`` of the best model.
+        log_density: mean log predictive density per action.
+        log_density_se: its standard error; ``None`` for a single round.
+        difference: to the ``log_density`` of the best model.
         difference_se: standard error of the difference, paired; ``None`` for a single round.
         doubtful: number of rounds with a doubtful leave-one-out estimate; ``None`` if held out.
     """
 
     rounds: int
     actions: int
-    elpd: float
-    elpd_se: float | None
+    log_density: float
+    log_density_se: float | None
     difference: float
     difference_se: float | None
     doubtful: int | None
@@ -395,13 +395,13 @@ def _stacking(values: np.ndarray) -> np.ndarray:
     # A common factor changes no weight, and keeps densities of long rounds above 0.
     shifted = values - values.max(0)
     unused = {"se": np.nan, "p_loo": np.nan, "warning": False, "scale": "log"}
-    elpd: dict[str, Any] = {
+    sums: dict[str, Any] = {
         f"{model:03}": az.ELPDData({"elpd_loo": row.sum(), "loo_i": xr.DataArray(row)} | unused)
         for model, row in enumerate(shifted)
     }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        table = az.compare(elpd, method="stacking")
+        table = az.compare(sums, method="stacking")
     weights = np.clip(table["weight"].sort_index().to_numpy(float), 0, 1)
     return weights / weights.sum()
 
@@ -412,8 +412,8 @@ def _score(rounds: _Rounds, best: np.ndarray, actions: np.ndarray, chosen: np.nd
     return Score(
         rounds=len(values),
         actions=number,
-        elpd=float(values.sum()) / number,
-        elpd_se=_error(values, number),
+        log_density=float(values.sum()) / number,
+        log_density_se=_error(values, number),
         difference=float(differences.sum()) / number,
         difference_se=_error(differences, number),
         doubtful=None if rounds.doubtful is None else int(rounds.doubtful[chosen].sum()),

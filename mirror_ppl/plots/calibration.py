@@ -102,7 +102,8 @@ def plot_ecdf(calibration: Calibration) -> Picture:
 def plot_coverage(calibration: Calibration) -> Picture:
     """Draw the coverage of central intervals against the number of rounds, one panel per site.
 
-    Bars are two binomial standard errors to either side; dotted lines are the nominal coverage.
+    Bars are two binomial standard errors to either side, within 0 and 1; dotted lines show the
+    nominal coverage.
     """
     coverage, error = calibration.coverage, calibration.coverage_error
     sites = coverage["site"].values.tolist()
@@ -117,11 +118,13 @@ def plot_coverage(calibration: Calibration) -> Picture:
     for ax, site in zip(grid.flat, sites, strict=False):
         for level, colour, marker in LEVEL_STYLES:
             ax.axhline(level, color=colour, lw=1.2, ls=":")
+            held = coverage.sel(site=site, level=level).values
+            bars = ERRORS * error.sel(site=site, level=level).values
             handles[f"{level:.0%} interval"] = ax.errorbar(
                 # Side by side, so that bars of neighbouring levels can be distinguished.
                 place + 0.08 * (LEVELS.index(level) - 1),
-                coverage.sel(site=site, level=level).values,
-                ERRORS * error.sel(site=site, level=level).values,
+                held,
+                np.minimum(bars, [held, 1 - held]),
                 color=colour,
                 marker=marker,
                 ms=6,

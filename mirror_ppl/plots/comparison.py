@@ -28,8 +28,8 @@ def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
 
     Args:
         table: a row for each ``model``, the best first, over all rounds (``person`` is missing) and
-            for each person, in one order: number of ``rounds``, ``elpd``, ``difference`` to the
-            best and its standard error ``difference_se``, NaN where there is none.
+            for each person, in one order: number of ``rounds``, ``log_density``, ``difference`` to
+            the best and its standard error ``difference_se``, NaN where there is none.
         by: the measure, a key of `MEASURES`.
     """
     totals = table.loc[table["person"].isna()].set_index("model")
@@ -60,9 +60,9 @@ def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
         shown = [label_of(person) for person in people] * (len(models) - 1)
         ax.set_yticks(places, shown, minor=True, fontsize=7)
     ax.set_ylim(down - GAP / 2, -GAP - LINE / 2)
-    for elpd, top in zip(totals["elpd"], tops, strict=True):
-        _column(ax, f"{elpd:z.4f}", top)
-    _column(ax, "elpd", -GAP - LINE / 2, weight="bold")
+    for log_density, top in zip(totals["log_density"], tops, strict=True):
+        _column(ax, f"{log_density:z.4f}", top)
+    _column(ax, "log density", -GAP - LINE / 2, weight="bold")
     _finish(
         figure, ax, f"{MEASURES[by]}, {totals.loc[best, 'rounds']} rounds of {len(people)} people"
     )

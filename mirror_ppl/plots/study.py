@@ -50,6 +50,8 @@ STYLES: dict[str, tuple[str, str, str]] = {
 """Colour, line and mark of each model."""
 OTHER_LINES, OTHER_MARK = ("-", "--", "-.", ":"), "."
 """Lines and mark of users' models."""
+HATCHES = {"-": "", "--": "////", ":": "....", "-.": "xxxx"}
+"""Patterns of bars, by the line of the model."""
 OFF_SCALE = 4.0
 """Distance from the curves, in their spans, beyond which a level is named in words."""
 NO_ROUNDS = 0.4
@@ -170,12 +172,14 @@ def plot_relevance(shares: pd.DataFrame) -> Picture:
         for one in last.to_dict("records"):
             x = names.index(one["modality"])
             x += (models.index(one["model"]) - (len(models) - 1) / 2) * width
-            label, colour = looks[one["model"]][:2]
+            label, colour, line, _ = looks[one["model"]]
             if math.isnan(one["mean"]):
                 text = f"{label}: no messages"
                 ax.text(x, 1, text, rotation=90, ha="center", va="bottom", fontsize=7, color=colour)
                 continue
-            ax.bar(x, 100 * one["mean"], 0.9 * width, color=colour, label=label)
+            # The pattern distinguishes models of one colour.
+            look = {"color": colour, "hatch": HATCHES[line], "edgecolor": "white", "lw": 0}
+            ax.bar(x, 100 * one["mean"], 0.9 * width, label=label, **look)
             ax.plot([x, x], [100 * one["low"], 100 * one["high"]], color=BLACK, lw=1)
         ax.set_xticks(range(len(names)), names)
         ax.set_ylim(0, 105)

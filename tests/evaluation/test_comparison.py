@@ -120,8 +120,8 @@ def test_where_all_draws_agree_leave_one_out_is_what_they_say(paths, values):
     for model, value in zip(comparison.models, values, strict=True):
         total = model.total
         assert (total.rounds, total.actions, total.doubtful) == (7, 22, 0)
-        assert total.elpd == pytest.approx(value[REAL].sum() / 22)
-        assert total.elpd_se == pytest.approx(standard_error(value[REAL]) / 22)
+        assert total.log_density == pytest.approx(value[REAL].sum() / 22)
+        assert total.log_density_se == pytest.approx(standard_error(value[REAL]) / 22)
 
 
 def test_differences_are_paired_over_rounds(paths, values):
@@ -138,7 +138,7 @@ def test_differences_are_paired_over_rounds(paths, values):
                 continue
             number = LENGTHS[person].sum()
             assert (score.rounds, score.actions) == (own.sum(), number)
-            assert score.elpd == pytest.approx(value[person, own].sum() / number)
+            assert score.log_density == pytest.approx(value[person, own].sum() / number)
             assert score.difference == pytest.approx(behind[person, own].sum() / number)
             # Of a single round nobody knows how much another would differ.
             alone = own.sum() == 1
@@ -164,7 +164,7 @@ def test_draws_are_weighted_by_how_little_they_expected_a_round(tmp_path, rng):
     other = likelihood - 1
     comparison = compared(write(tmp_path / "a.nc", likelihood), write(tmp_path / "b.nc", other))
     expected = -np.log(np.exp(-likelihood).mean(0))
-    assert comparison.models[0].total.elpd == pytest.approx(expected[REAL].sum() / 22)
+    assert comparison.models[0].total.log_density == pytest.approx(expected[REAL].sum() / 22)
     assert comparison.models[1].total.difference == pytest.approx(-7 / 22)
     assert comparison.models[0].total.doubtful == 7
 
@@ -186,7 +186,7 @@ def test_it_agrees_with_arviz(tmp_path, rng):
     assert [model.label for model in comparison.models] == list(table.index)
     for model in comparison.models:
         row, total = table.loc[model.label], model.total
-        scores = (total.elpd, total.elpd_se, -total.difference, total.difference_se)
+        scores = (total.log_density, total.log_density_se, -total.difference, total.difference_se)
         expected = row[["elpd_loo", "se", "elpd_diff", "dse"]].to_numpy(float) / 22
         assert scores == pytest.approx(expected)
         assert model.weight == pytest.approx(row["weight"], abs=1e-6)
@@ -253,7 +253,7 @@ def test_held_out_actions_are_predicted_by_the_average_of_draws(tmp_path, rng):
     rounds = np.where(steps, np.log(right.mean(1)), 0).sum(-1)[:, REAL]
     assert [model.label for model in comparison.models] == ["0", "1"]
     for model, value in zip(comparison.models, rounds, strict=True):
-        assert model.total.elpd == pytest.approx(value.sum() / 22)
+        assert model.total.log_density == pytest.approx(value.sum() / 22)
         assert model.total.difference == pytest.approx((value - rounds[0]).sum() / 22)
         error = standard_error(value - rounds[0]) / 22
         assert model.total.difference_se == pytest.approx(error)
@@ -333,10 +333,10 @@ def test_the_table_tells_the_numbers(paths, values, capsys):
     rows = {line.split()[1]: line.split() for line in out.splitlines() if line[1:2].isdigit()}
     behind = (values[2] - values[0])[REAL]
     assert list(rows) == ["fast", "slow"]
-    elpd = [f"{value[REAL].sum() / 22:.4f}" for value in values]
-    assert rows["fast"] == ["1", "fast", elpd[0], "-", "0", "of", "7", "1.00"]
+    log_density = [f"{value[REAL].sum() / 22:.4f}" for value in values]
+    assert rows["fast"] == ["1", "fast", log_density[0], "-", "0", "of", "7", "1.00"]
     numbers = [f"{behind.sum() / 22:.4f}", f"±{standard_error(behind) / 22:.4f}"]
-    assert rows["slow"] == ["2", "slow", elpd[2], *numbers, "0", "of", "7", "0.00"]
+    assert rows["slow"] == ["2", "slow", log_density[2], *numbers, "0", "of", "7", "0.00"]
 
 
 def test_the_table_of_held_out_rounds_doubts_nothing(tmp_path, rng, capsys):
@@ -440,8 +440,8 @@ def test_the_figure_shows_every_difference(paths):
     (square,) = [line for line in ax.lines if line.get_marker() == "s"]
     assert (square.get_xdata()[0], square.get_ydata()[0]) == (0, tops[0])
     assert [text.get_text() for text in ax.texts] == [
-        *(f"{model.total.elpd:.4f}" for model in comparison.models),
-        "elpd",
+        *(f"{model.total.log_density:.4f}" for model in comparison.models),
+        "log density",
     ]
     low, high = ax.get_ylim()
     assert all(high < dot[2] < low for dot in dots(ax))
@@ -700,4 +700,4 @@ def test_folders_of_fits_are_compared(fits, tmp_path, capsys, by):
         summary = json.loads((fits / f"{seed}" / "summary.json").read_text())
         expected = [-person["test"]["nll"] for person in summary["people"]]
         people = models[f"mirror {seed}"]["people"]
-        assert [person["elpd"] for person in people] == pytest.approx(expected, abs=1e-5)
+        assert [person["log_density"] for person in people] == pytest.approx(expected, abs=1e-5)

@@ -114,7 +114,7 @@ def test_a_fit_holds_what_was_measured(tmp_path):
 
 WRONG = {
     "no site": ({"mood": [1.0]}, InputError, '"mood" was measured, but is no site of Answering'),
-    "support": ({"in_sight": [1.5]}, InputError, '"in_sight" was measured as what its site cannot'),
+    "support": ({"in_sight": [1.5]}, InputError, '"in_sight" has measurements outside the support'),
 }
 
 
