@@ -51,7 +51,7 @@ test: $(STAMP) ## The whole test suite
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
 
 docs: $(STAMP) ## The documentation site in build/site; a broken link or reference fails
-	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -c docs/_site -d build/doctrees \
+	$(BIN)/sphinx-build --fresh-env --quiet --fail-on-warning --keep-going -c docs/_site -d build/doctrees \
 		. build/site
 
 bench: $(STAMP) ## Every study in benchmarks/, one after the other

@@ -16,6 +16,7 @@ from mirror_ppl.communication import (
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalAnyKind
 from mirror_ppl.errors import HumanModelError, InputError
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
@@ -256,7 +257,8 @@ def of_kind(human, seed, **known):
 )
 def test_kinds_are_told_apart(driving, kind, model, known):
     recordings = of_kind(model(driving), 100, **known).select_people([0])
-    found = infer(AnyKind(driving), recordings, InferenceOptions("importance", 200), 1)
+    options = InferenceOptions("importance", 100, ImportanceOptions(proposals=256, enough=100))
+    found = infer(AnyKind(driving), recordings, options, 1)
     own = (found.draws[KIND][:, :, 0] == list(KINDS).index(kind)).float().mean(0)
     assert (own > 0.5).all(), own
     assert (found.pareto_k < 0.7).all()
@@ -264,7 +266,9 @@ def test_kinds_are_told_apart(driving, kind, model, known):
 
 def test_a_fit_tells_the_probability_of_each_model(driving):
     recordings = of_kind(Late(driving), 100, **{LATE: 0.95, "consistency": 4.0})
-    fit = mirror_ppl.infer(recordings.select_people([0]), human="all", seed=1)
+    few = {"proposals": 256, "enough": 100}
+    one = recordings.select_people([0])
+    fit = mirror_ppl.infer(one, human="all", engine="importance", settings=few, draws=100, seed=1)
     for number, person in enumerate(fit.summary["people"]):
         models = person["check"]["models"]
         assert list(models) == list(KINDS) and sum(models.values()) == pytest.approx(1)
