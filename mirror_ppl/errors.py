@@ -140,5 +140,9 @@ class StaleSelfModel(UserWarning):
     """Warns that a user's world has changed since its self-model was trained."""
 
 
+class LacksSitesOfWorld(UserWarning):
+    """Warns that a human model is not derived from the one that its world needs."""
+
+
 class UnreliableWeights(UserWarning):
     """Warns that a person's importance weights are not reliable."""

@@ -38,7 +38,7 @@ from mirror_ppl.inference.workers import Workers
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.loading import checked_base, load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import populations_of
@@ -469,5 +469,5 @@ def _human(
         path = shipped_weights(domain) if self_model is None else Path(self_model)
         self_model, _ = load_self_model(path, domain)
     if isinstance(human, type):
-        return human(self_model)
+        return checked_base(human(self_model))
     return load_human_model(human, self_model)

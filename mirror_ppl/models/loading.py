@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.registry import known_domains
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, LacksSitesOfWorld
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.variants import VARIANTS
@@ -32,6 +33,24 @@ def model_name(class_name: str) -> str:
 def human_models_of(domain: Domain) -> Mapping[str, type[HumanModel]]:
     """Return the package's human models by name, some replaced by those of the domain."""
     return {**VARIANTS, **domain.record.part("human_models")}
+
+
+def checked_base(human: HumanModel) -> HumanModel:
+    """Return a user's human model, with a warning if its world needs another base class.
+
+    Warns:
+        LacksSitesOfWorld: the world has a human model of its own, whose sites this one lacks.
+    """
+    needed = human_models_of(human.self_model.domain)[MIRROR]
+    if not isinstance(human, needed):
+        warnings.warn(
+            f"{type(human).__name__} lacks the sites in which people of "
+            f"{human.self_model.domain.name} differ; derive it from {needed.__module__}."
+            f"{needed.__name__}",
+            LacksSitesOfWorld,
+            stacklevel=3,
+        )
+    return human
 
 
 def file_of(specification: str | None) -> Path | None:
@@ -72,6 +91,7 @@ def load_human_model(
     path = Path(path_text)
     chosen = class_in_file(path, name, HumanModel, HumanModelError)
     try:
-        return chosen(self_model)
+        human = chosen(self_model)
     except (Exception, SystemExit) as error:
         raise HumanModelError(f"{name} cannot be made: {describe(error, path)}") from error
+    return checked_base(human)

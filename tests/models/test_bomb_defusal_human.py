@@ -16,6 +16,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.domains.bomb_defusal.panel import BUTTONS, OLD_RULES, RULES, read_panel
+from mirror_ppl.errors import LacksSitesOfWorld
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.results.summary import summarize
 from mirror_ppl.likelihood.attention import Proposal, site_probabilities
@@ -405,3 +406,14 @@ def test_of_rules_the_most_probable_one_is_told():
         "most_probable": names[9], "probability": 0.75, "truth": None
     }  # fmt: skip
     assert person["implants"]["lapse"]["median"] == pytest.approx(0.2)
+
+
+def test_a_model_that_lacks_the_sites_of_the_world_is_warned_of(defuser, tmp_path):
+    file = tmp_path / "own.py"
+    file.write_text(
+        "from mirror_ppl.models import HumanModel\n\n\nclass Own(HumanModel):\n    pass\n"
+    )
+    message = "Own lacks the sites in which people of bomb_defusal differ; derive it from .*Human"
+    with pytest.warns(LacksSitesOfWorld, match=message):
+        load_human_model(f"{file}:Own", defuser.self_model)
+    load_human_model(f"{file}:Own", SelfModel(get_domain("driving")))
