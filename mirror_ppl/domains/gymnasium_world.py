@@ -245,7 +245,8 @@ class GymnasiumWorld(World):
 
     @cached_property
     def _decisive(self) -> Visibility:
-        values = self.reference_values(Place(torch.arange(len(self.tables.over))), 1.0)
+        # With a discount, waiting is worse than acting, also where steps cost nothing.
+        values = self.reference_values(Place(torch.arange(len(self.tables.over))), SOONER)
         names = [m.name for m in self.modalities]
         return decisive_items(self.tables.observation, values, names)
 

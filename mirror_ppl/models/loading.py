@@ -41,8 +41,9 @@ def checked_base(human: HumanModel) -> HumanModel:
     Warns:
         LacksSitesOfWorld: the world has a human model of its own, whose sites this one lacks.
     """
-    needed = human_models_of(human.self_model.domain)[MIRROR]
-    if not isinstance(human, needed):
+    own = human.self_model.domain.record.part("human_models")
+    if own and not isinstance(human, tuple(own.values())):
+        needed = own[MIRROR]
         warnings.warn(
             f"{type(human).__name__} lacks the sites in which people of "
             f"{human.self_model.domain.name} differ; derive it from {needed.__module__}."

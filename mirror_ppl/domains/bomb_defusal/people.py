@@ -99,12 +99,12 @@ class SimulatedDefusers(SimulatedPeople):
     ) -> tuple[Tensor, Mind]:
         """Look, listen, and press; see `SimulatedPeople.step`."""
         decided, chance = self._look(memory, observation, told)
-        action_noise = memory.mind_noise.take_along_dim(1 + memory.step[..., None], -1).squeeze(-1)
+        noise = memory.mind_noise.take_along_dim(1 + memory.step[..., None], -1).squeeze(-1)
         first = (memory.mind_noise[..., 0] * len(KINDS)).long()
         mind = replace(
             decided,
             guess=torch.where(decided.guess == UNDECIDED, first, decided.guess),
-            found=decided.found | (action_noise < chance),
+            found=decided.found | (noise < chance),
         )
         return self._acts(mind, observation), mind
 
