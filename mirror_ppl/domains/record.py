@@ -9,6 +9,16 @@ from typing import Any
 
 from mirror_ppl.errors import DomainError
 
+SQIL_IN_LONG_ROUNDS: Mapping[str, Any] = {
+    "batch": 5,
+    "sampled": 5,
+    "kept": 50,
+    "epochs": 1500,
+    "check_every": 10,
+    "patience": 60,
+}
+"""Settings of SQIL for long rounds: it takes many steps until it imitates what people do."""
+
 
 @dataclass(frozen=True)
 class Record:

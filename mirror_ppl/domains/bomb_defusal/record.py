@@ -1,6 +1,6 @@
 """The record of bomb defusal: settings, people and human models."""
 
-from mirror_ppl.domains.record import Record
+from mirror_ppl.domains.record import SQIL_IN_LONG_ROUNDS, Record
 
 RECORD = Record(
     networks={"encoder": 128, "decoder": 64, "q_network": 200, "image": 64, "stride": 2},
@@ -38,12 +38,7 @@ RECORD = Record(
     baselines={
         # People wait at most steps of long rounds.
         "sqil": {
-            "batch": 5,
-            "sampled": 5,
-            "kept": 50,
-            "epochs": 1500,
-            "check_every": 10,
-            "patience": 60,
+            **SQIL_IN_LONG_ROUNDS,
             "learning_rate": 0.05,
             "weight_decay": 1.0,
             "reward": 10.0,

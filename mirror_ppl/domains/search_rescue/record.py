@@ -1,6 +1,6 @@
 """The record of search and rescue: settings, people and pictures."""
 
-from mirror_ppl.domains.record import Record
+from mirror_ppl.domains.record import SQIL_IN_LONG_ROUNDS, Record
 
 RECORD = Record(
     networks={"encoder": 128, "decoder": 64, "q_network": 200},
@@ -31,12 +31,7 @@ RECORD = Record(
         "bc": {"learning_rate": 0.003, "weight_decay": 3.0},
         # Rounds are long, so networks need many steps to imitate people.
         "sqil": {
-            "batch": 5,
-            "sampled": 5,
-            "kept": 50,
-            "epochs": 1500,
-            "check_every": 10,
-            "patience": 60,
+            **SQIL_IN_LONG_ROUNDS,
             "learning_rate": 0.01,
             "weight_decay": 0.1,
         },
