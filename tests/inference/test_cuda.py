@@ -1,5 +1,6 @@
 """What runs on a GPU gives what the processor gives; skipped where there is none."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,7 +21,9 @@ def test_a_fit_on_a_gpu_finds_what_one_on_the_processor_finds(engine):
     for site in sight_sites(fits[0].human.domain):
         one, other = (fit.data.posterior[site].to_numpy() for fit in fits)
         # Standard errors are a fourteenth of the deviation; half leaves room for SVI's optimizer.
-        assert (abs(one.mean((0, 1)) - other.mean((0, 1))) < 0.5 * one.std((0, 1)) + 1e-3).all()
+        # The larger deviation: a rare value can be missing from all draws of one fit.
+        deviation = np.maximum(one.std((0, 1)), other.std((0, 1)))
+        assert (abs(one.mean((0, 1)) - other.mean((0, 1))) < 0.5 * deviation + 1e-3).all()
 
 
 @pytest.mark.parametrize("domain", ["driving", "search_rescue", "bomb_defusal"])
