@@ -38,7 +38,7 @@ def main(options: Options) -> int:
     from mirror_ppl.domains.registry import load_world
 
     world = load_world(options.domain)
-    if faults := faults_of(world) or _of_settings(world):
+    if faults := faults_of(world) or _of_record(world):
         print(f"{world.name}: {len(faults)} thing{'s' * (len(faults) > 1)} wrong")
         for fault in faults:
             print(f"  {fault}")
@@ -47,9 +47,10 @@ def main(options: Options) -> int:
     return 0
 
 
-def _of_settings(world: World) -> list[str]:
-    """What is wrong with the settings of a world that is sound otherwise."""
+def _of_record(world: World) -> list[str]:
+    """Faults in the record of a world that is sound otherwise."""
     from mirror_ppl.communication.planners import PlannerOptions
+    from mirror_ppl.domains.record import PARTS
     from mirror_ppl.domains.registry import know
     from mirror_ppl.errors import MirrorError
     from mirror_ppl.models.sizes import sizes_of
@@ -66,6 +67,11 @@ def _of_settings(world: World) -> list[str]:
             made()
         except (MirrorError, TypeError, ValueError) as error:
             found.append(f"{name}: {error}")
+    for name in PARTS:
+        try:
+            world.record.part(name)
+        except MirrorError as error:
+            found.append(str(error))
     return found
 
 

@@ -18,6 +18,8 @@ SQIL_IN_LONG_ROUNDS: Mapping[str, Any] = {
     "patience": 60,
 }
 """Settings of SQIL for long rounds: it takes many steps until it imitates what people do."""
+PARTS = ("people", "human_models", "pictures", "rounds")
+"""Attributes of a record that may be strings ``"module:name"``."""
 
 
 @dataclass(frozen=True)

@@ -348,6 +348,8 @@ def test_settings_are_looked_over(tmp_path, capsys):
         ('record = Record(training={"phases": 0})', "phases must be at least 1, not 0"),
         ('record = Record(planning={"horizn": 3})', "planning has horizn"),
         ('record = Record(networks={"coder": 3})', "networks: "),
+        ('record = Record(people="nowhere:PEOPLE")', 'people: there is no "nowhere:PEOPLE"'),
+        ('record = Record(pictures="math:PICTURES")', 'pictures: there is no "math:PICTURES"'),
     ):
         file = tmp_path / "settings.py"
         world = FILE.read_text().replace("    horizon = 8\n", f"    horizon = 8\n    {line}\n")
