@@ -33,12 +33,18 @@ from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.results.criticism import FINE
 from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.results.population_file import load_population
+from mirror_ppl.inference.results.posterior_file import load_posterior
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
 from mirror_ppl.inference.workers import Workers
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
-from mirror_ppl.models.loading import checked_base, load_human_model
+from mirror_ppl.models.loading import (
+    checked_base,
+    human_models_of,
+    load_human_model,
+    model_name,
+)
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import populations_of
@@ -136,13 +142,7 @@ class Fit(fitting.Fit):
             UnknownNameError: no person has that id.
             InputError: there are several people, and none is named.
         """
-        if name is None and len(self.people) > 1:
-            raise InputError(
-                f"the fit is of {len(self.people)} people: name one of them, such as "
-                f"{next(iter(self.people))!r}"
-            )
-        chosen = next(iter(self.people)) if name is None else name
-        return FittedPerson(self, require_known(chosen, "person", self.people))
+        return FittedPerson(self, _one_of(self.people, name, "the fit"))
 
     def save(self, folder: str | Path, **told: Any) -> dict[str, str]:
         """Write ``posterior.nc``, ``summary.json`` and the pictures, all of them or none.
@@ -232,31 +232,41 @@ class Communicator(PlannedCommunicator):
     """Plans messages for one person of a fit.
 
     Args:
-        fit: what :func:`infer` returned.
+        fit: what :func:`infer` returned, or the path of a saved ``posterior.nc``.
         person: id; the only one unless named.
         planner: ``mirror`` (reward, in the domain's simulator), ``mirror-self-model`` (reward, in
             the robot's learned model of the world) or ``mirror-kl`` (beliefs near the robot's).
         draws: posterior draws to plan with; 20 to 100 are enough.
         seed: of everything random; the same seed and round give the same decision.
+        human: human model of a saved posterior, if it is your own; as for :func:`infer`.
+        self_model: the robot's networks of a saved posterior; those that ship unless given.
         settings: of the planner, see :class:`PlannerOptions`; those of the domain unless given.
 
     Raises:
         InputError: the fit is of several people and none is named, or an argument is of another
             kind.
+        PosteriorError: the file is missing or damaged, or of another human model or self-model.
         UnknownNameError: there is no such person, planner or setting.
     """
 
     def __init__(
         self,
-        fit: Fit,
+        fit: Fit | str | Path,
         person: str | None = None,
         *,
         planner: str = "mirror",
         draws: int = 64,
         seed: int = 0,
+        human: HumanModel | type[HumanModel] | str | None = None,
+        self_model: SelfModel | str | Path | None = None,
         **settings: Any,
     ) -> None:
-        listener = require_kind(fit, Fit, "fit").person(person).listener(draws)
+        if isinstance(fit, str | Path):
+            listener = _saved_person(Path(fit), person, draws, human, self_model)
+        else:
+            if not (human is None and self_model is None):
+                raise InputError("human and self_model are for a saved posterior; a fit has both")
+            listener = require_kind(fit, Fit, "fit").person(person).listener(draws)
         known = [field.name for field in fields(PlannerOptions)]
         for name in settings:
             require_known(name, "setting", known)
@@ -441,6 +451,36 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             stacklevel=2,
         )
     return Fit(**vars(found))
+
+
+def _one_of(people: tuple[str, ...], name: str | None, where: str) -> str:
+    """Id of a person; that of the only one unless named."""
+    if name is None and len(people) > 1:
+        raise InputError(
+            f"{where} is of {len(people)} people: name one of them, such as {next(iter(people))!r}"
+        )
+    return require_known(next(iter(people)) if name is None else name, "person", people)
+
+
+def _saved_person(
+    path: Path,
+    person: str | None,
+    draws: int,
+    human: HumanModel | type[HumanModel] | str | None,
+    self_model: SelfModel | str | Path | None,
+) -> Person:
+    """Make the person to plan messages for from a posterior file."""
+    saved = load_posterior(path)
+    number = saved.people.index(_one_of(saved.people, person, str(path)))
+    domain = saved.attributes["domain"]
+    if human is None:
+        human = model_name(saved.attributes.get("human_model", "unknown"))
+        if human not in human_models_of(get_domain(domain)):
+            raise InputError(f"{path}: is of your own human model {human}; give it as human=")
+    model = _human(human, self_model, domain)
+    held = len(next(iter(saved.values.values())))
+    chosen = saved.draws(model, min(whole_number(draws, "draws", *LIMITS["draws"]), held))
+    return Person(model, {name: value[:, number : number + 1] for name, value in chosen.items()})
 
 
 def _doubtful(summary: Mapping[str, Any]) -> list[str]:

@@ -184,10 +184,14 @@ class Demonstrations:
         return self.actions != NO_INDEX
 
     def __repr__(self) -> str:
-        rounds, steps = int(self.round_counts.sum()), int(self.lengths.sum())
+        people = f"{self.num_people} {'person' if self.num_people == 1 else 'people'}"
+        least, most = int(self.round_counts.min()), int(self.round_counts.max())
+        rounds = (
+            f"{most} round{'s' * (most != 1)}" if least == most else f"{least} to {most} rounds"
+        )
         return (
             f"Demonstrations({self.domain}, {self.setting}: "
-            f"people {self.num_people}, rounds {rounds}, steps {steps})"
+            f"{people}, {rounds} each, {int(self.lengths.sum())} steps in all)"
         )
 
     def equals(self, other: Demonstrations) -> bool:

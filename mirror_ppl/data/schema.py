@@ -183,8 +183,14 @@ class _Places:
                 f"expected {tuple(expected.values())} ({wanted})"
             )
 
-    def refuse(self, name: str, bad: Tensor, value: Tensor, expected: str) -> None:
-        """Raise for the first entry of ``value`` that is bad."""
+    def refuse(
+        self, name: str, bad: Tensor, value: Tensor, expected: str, inside: Tensor | None = None
+    ) -> None:
+        """Raise for the first entry of ``value`` that is bad.
+
+        With ``inside``, the mask of what is read, the message says how to mark padding if the rest
+        of the round looks like padding: -1 or NaN.
+        """
         if not bad.any():
             return
         index = tuple(bad.nonzero()[0].tolist())
@@ -195,9 +201,22 @@ class _Places:
             else:
                 where.append(f"{dimension} {place}")
         what = f"{name} of {', '.join(of)}" if of else name
+        hint = "" if inside is None else self._hint(name, index, value, inside)
         raise DemonstrationsError(
-            f"{', '.join(where)}: {what} is {value[index].item():g}, expected {expected}"
+            f"{', '.join(where)}: {what} is {value[index].item():g}, expected {expected}{hint}"
         )
+
+    def _hint(self, name: str, index: tuple[int, ...], value: Tensor, inside: Tensor) -> str:
+        """Name the variable that marks padding, if the round's rest looks like padding."""
+        if name == "reward" or self.dimensions[name][2:3] not in (("step",), ("time",)):
+            return ""
+        person, number, step = index[:3]
+        rest, read = value[person, number, step:], inside[person, number, step:]
+        if not (rest.isnan() | (rest == NO_INDEX))[read].all():
+            return ""
+        if step == 0:
+            return "; if the round is padding, round_count has to be the person's number of rounds"
+        return "; if this is padding, length has to be the round's number of actions"
 
     def whole(
         self,
@@ -213,13 +232,13 @@ class _Places:
         good = (value >= lowest) & (value <= highest) & (value == value.round())
         inside = torch.ones_like(good) if inside is None else _over_items(inside, good)
         expected = f"a whole number from {lowest} to {highest}{meaning}"
-        self.refuse(name, inside & ~good, value, expected)
+        self.refuse(name, inside & ~good, value, expected, inside)
         return value.masked_fill(~inside, 0).long()
 
     def numbers(self, name: str, value: Tensor, inside: Tensor) -> Tensor:
         """Finite numbers; outside of ``inside`` anything is allowed and becomes NaN."""
         inside = _over_items(inside, value)
-        self.refuse(name, inside & ~value.isfinite(), value, "a finite number")
+        self.refuse(name, inside & ~value.isfinite(), value, "a finite number", inside)
         return value.masked_fill(~inside, torch.nan)
 
     def entropies(self, name: str, value: Tensor, inside: Tensor, actions: int) -> Tensor:

@@ -29,7 +29,10 @@ def ragged(given_fields):
 
 def test_padding_is_brought_into_one_form_and_the_rest_is_kept(given_fields, ragged):
     assert (ragged.num_people, ragged.shape) == (3, (3, 3, 4))
-    assert repr(ragged) == "Demonstrations(driving, fog: people 3, rounds 5, steps 11)"
+    assert (
+        repr(ragged)
+        == "Demonstrations(driving, fog: 3 people, 0 to 3 rounds each, 11 steps in all)"
+    )
     for p in range(3):
         for b in range(3):
             n = RAGGED[p][b] if b < len(RAGGED[p]) else 0
@@ -148,6 +151,23 @@ BAD = {
     "action missing": (
         put(["actions"], (0, 1, 0), -1),
         "person 'a', round 1, step 0: action is -1, "
+        "expected a whole number from 0 to 1 (stay, switch); "
+        "if the round is padding, round_count has to be the person's number of rounds",
+    ),
+    "padding that length does not mark": (
+        put(["actions"], (2, 1, slice(2, None)), -1),
+        "person 'c', round 1, step 2: action is -1, "
+        "expected a whole number from 0 to 1 (stay, switch); "
+        "if this is padding, length has to be the round's number of actions",
+    ),
+    "observations of padding that length does not mark": (
+        put(["ego"], (2, 1, slice(3, None)), NAN),
+        "person 'c', round 1, time 3: ego of lane is nan, expected a finite number; "
+        "if this is padding, length has to be the round's number of actions",
+    ),
+    "actions missing in the middle, which is no padding": (
+        put(["actions"], (2, 1, slice(1, 3)), -1),
+        "person 'c', round 1, step 1: action is -1, "
         "expected a whole number from 0 to 1 (stay, switch)",
     ),
     "half an action": (

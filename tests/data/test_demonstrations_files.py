@@ -258,7 +258,8 @@ BAD_DATASETS = {
     "action absent inside a round": (
         changed("action", (0, 1, 0), NAN),
         "person 'a', round 1, step 0: action is nan, "
-        "expected a whole number from 0 to 1 (stay, switch)",
+        "expected a whole number from 0 to 1 (stay, switch); "
+        "if the round is padding, round_count has to be the person's number of rounds",
     ),
     "round of length zero": (
         changed("length", (2, 2), 0),
@@ -371,7 +372,10 @@ def test_the_documented_example_runs_and_is_a_valid_recording(tmp_path, monkeypa
     assert len(blocks) == 4
     monkeypatch.chdir(tmp_path)
     exec("\n".join(blocks), {})
-    assert "Demonstrations(driving, fog: people 2, rounds 10, steps 150)" in capsys.readouterr().out
+    assert (
+        "Demonstrations(driving, fog: 2 people, 5 rounds each, 150 steps in all)"
+        in capsys.readouterr().out
+    )
     loaded = load_demonstrations("recordings.nc")
     assert loaded.people == ("anna", "ben")
     # What the example made up is what the domain would have shown: lanes follow actions.

@@ -19,9 +19,11 @@ from mirror_ppl.data import save_demonstrations
 from mirror_ppl.errors import (
     DemonstrationsError,
     InputError,
+    PosteriorError,
     UnknownNameError,
     UnreliableWeights,
 )
+from mirror_ppl.models import HumanModel
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.people import simulate
 
@@ -104,6 +106,57 @@ def test_messages_are_planned(fit):
     assert decision.why()
     kl = mirror_ppl.Communicator(fit, "person-01", planner="mirror-kl", draws=8)
     assert kl.search.steps == 1
+
+
+@pytest.fixture(scope="module")
+def saved(fit, tmp_path_factory):
+    """The posterior file of the fit."""
+    folder = tmp_path_factory.mktemp("saved")
+    fit.save(folder)
+    return folder / "posterior.nc"
+
+
+def test_messages_are_planned_from_a_saved_posterior(fit, recordings, saved):
+    moment = RoundSoFar.of(recordings, "person-04", 7, 5)
+    one = mirror_ppl.Communicator(fit, "person-04", draws=8, horizon=3)
+    other = mirror_ppl.Communicator(str(saved), "person-04", draws=8, horizon=3)
+    for site, value in one.person.draws.items():
+        if not site.startswith("residual_"):  # which files hold to eight bits
+            torch.testing.assert_close(other.person.draws[site], value)
+    assert other.plan(moment).message == one.plan(moment).message
+    assert mirror_ppl.Communicator(saved, "person-01").person.number == 30
+
+
+class Unnamed(HumanModel):
+    """A human model that no name stands for."""
+
+
+def test_a_saved_posterior_of_a_users_model_needs_the_model(recordings, tmp_path):
+    some = recordings.select_people(["person-01"])
+    mirror_ppl.infer(some, human=Unnamed, draws=5, train_rounds=1, explore=0).save(tmp_path)
+    path = tmp_path / "posterior.nc"
+    refused(
+        lambda: mirror_ppl.Communicator(path),
+        "is of your own human model Unnamed; give it as human=",
+    )
+    found = mirror_ppl.Communicator(path, human=Unnamed)
+    assert isinstance(found.person.human, Unnamed)
+    assert found.person.number == 5
+
+
+def test_saved_posteriors_that_cannot_be_planned_with(fit, saved, tmp_path):
+    communicator = mirror_ppl.Communicator
+    with pytest.raises(PosteriorError, match="there is no such file; python -m mirror_ppl.fit"):
+        communicator(tmp_path / "none.nc", "person-01")
+    with pytest.raises(UnknownNameError, match='unknown person "person-05"'):
+        communicator(saved, "person-05")
+    refused(lambda: communicator(saved), "is of 2 people: name one of them, such as 'person-01'")
+    with pytest.raises(PosteriorError, match="is of human model mirror, not one-radius"):
+        communicator(saved, "person-01", human="one-radius")
+    refused(
+        lambda: communicator(fit, "person-01", human="mirror"),
+        "human and self_model are for a saved posterior; a fit has both",
+    )
 
 
 def test_one_person_need_not_be_named(recordings):
