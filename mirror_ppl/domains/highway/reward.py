@@ -42,7 +42,6 @@ from mirror_ppl.domains.highway.road import (
     LEFT_EDGE,
     LIMIT,
     RIGHT_EDGE,
-    SHOULDER,
     WIDTH,
     centre_of,
 )
@@ -89,9 +88,9 @@ def rewards(state: HighwayState, action: Tensor, following: HighwayState) -> dic
         "back_proximity": PROXIMITY * (back <= PROXIMITY_RANGE),
         "near": NEAR * (around <= NEAR_RANGE),
         "shoulder": ROAD_SHOULDER * on_shoulder(following),
-        "accident": ACCIDENT * over(following),
+        "accident": ACCIDENT * following.over,
     }
-    goes_on = ~over(state)
+    goes_on = ~state.over
     return {name: torch.where(goes_on, term.to(dtype), 0.0) for name, term in terms.items()}
 
 
@@ -116,14 +115,3 @@ def on_shoulder(state: HighwayState) -> Tensor:
     """Return whether ``[...]`` a side of the ego's body is beyond a line of the road."""
     y = state.y[..., 0]
     return (y - WIDTH / 2 < LEFT_EDGE) | (y + WIDTH / 2 > RIGHT_EDGE)
-
-
-def off_road(state: HighwayState) -> Tensor:
-    """Return whether ``[...]`` the ego's centre has left the shoulder."""
-    y = state.y[..., 0]
-    return (y < LEFT_EDGE - SHOULDER) | (y > RIGHT_EDGE + SHOULDER)
-
-
-def over(state: HighwayState) -> Tensor:
-    """Return whether ``[...]`` the round has ended with an accident."""
-    return state.crashed | off_road(state)

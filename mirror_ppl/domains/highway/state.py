@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.highway.road import lane_of
+from mirror_ppl.domains.highway.road import LEFT_EDGE, RIGHT_EDGE, SHOULDER, lane_of
 
 NEVER = 10**6
 """Tick of a manoeuvre that does not happen."""
@@ -78,6 +78,17 @@ class HighwayState:
         """Speed in m/s ``[..., N]`` that vehicles intend to drive at now."""
         since = self.tick[..., None] - self.begun
         return torch.where((since >= 0) & (since < self.cue_for), self.cue_speed, self.cruise)
+
+    @property
+    def off_road(self) -> Tensor:
+        """Whether ``[...]`` the ego's centre has left the shoulder."""
+        y = self.y[..., 0]
+        return (y < LEFT_EDGE - SHOULDER) | (y > RIGHT_EDGE + SHOULDER)
+
+    @property
+    def over(self) -> Tensor:
+        """Whether ``[...]`` the round has ended with an accident."""
+        return self.crashed | self.off_road
 
 
 def each(function: Callable[..., Any], *states: HighwayState) -> HighwayState:

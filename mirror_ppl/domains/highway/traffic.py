@@ -74,7 +74,7 @@ SMALL = 1e-2
 
 
 def transition(state: HighwayState, action: Tensor) -> HighwayState:
-    """Return the state a decision later.
+    """Return the state a decision later; rounds that are over stay as they are.
 
     Args:
         state: ``[...]``.
@@ -82,13 +82,12 @@ def transition(state: HighwayState, action: Tensor) -> HighwayState:
             beyond [-1, 1] count as the nearest within.
     """
     action = action.clamp(-1, 1).to(state.x.dtype)
-    now, shape = flat(state)
-    action = action.expand(*shape, 2).reshape(-1, 2)
-    now = replace(now, controls=action)
+    start, shape = flat(state)
+    now = replace(start, controls=action.expand(*shape, 2).reshape(-1, 2))
     for _ in range(TICKS):
         later = tick(now)
         now = where(now.crashed, now, later) if now.crashed.any() else later
-    return shaped(now, shape)
+    return shaped(where(start.over, start, now) if start.over.any() else now, shape)
 
 
 @dataclass(frozen=True)

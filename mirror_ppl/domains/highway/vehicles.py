@@ -14,9 +14,14 @@ os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 
 import numpy as np
 import torch
-from highway_env.road.road import Road, RoadNetwork
-from highway_env.vehicle.behavior import IDMVehicle
-from highway_env.vehicle.kinematics import Vehicle
+
+try:
+    from highway_env.road.road import Road, RoadNetwork
+    from highway_env.vehicle.behavior import IDMVehicle
+    from highway_env.vehicle.kinematics import Vehicle
+except ImportError as error:
+    message = "the environment needs highway-env: pip install 'mirror_ppl[highway]'"
+    raise ImportError(message) from error
 
 from mirror_ppl.domains.highway.road import (
     EGO_SPEEDS,

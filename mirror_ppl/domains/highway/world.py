@@ -112,7 +112,7 @@ class Highway:
 
     def over(self, state: HighwayState) -> Tensor:
         """Return where ``[...]`` a collision or the end of the shoulder has ended the round."""
-        return reward.over(state)
+        return state.over
 
     def observe(self, state: HighwayState) -> Observation:
         """Return everything: ego ``[..., 6]``, visual ``[..., 36, 3]``, verbal ``[..., 6, 1]``."""

@@ -7,7 +7,7 @@ import torch
 from highway_states import state_of
 
 from mirror_ppl.domains.highway.lidar import AHEAD, BACK, RANGE, scan
-from mirror_ppl.domains.highway.reward import TERMS, over, proximities, rewards, speed_reward
+from mirror_ppl.domains.highway.reward import TERMS, proximities, rewards, speed_reward
 from mirror_ppl.domains.highway.road import LIMIT
 from mirror_ppl.domains.highway.world import Highway
 
@@ -98,10 +98,10 @@ def test_shoulder_and_the_end_of_the_road():
         before = state_of((0.0, 8.0 if y > 0 else 0.0, 0.0, 10.0))
         centre = -abs(y - before.y[0].item()) / 2
         only(terms(state_of((0.0, y, 0.0, 10.0)), before), shoulder=-4.0, lane_centre=centre)
-    assert not over(state_of((0.0, 11.9, 0.0, 10.0)))
+    assert not state_of((0.0, 11.9, 0.0, 10.0)).over
     for y in (12.1, -4.1):
         gone = state_of((0.0, y, 0.0, 10.0))
-        assert over(gone)
+        assert gone.over
         assert terms(gone)["accident"] == -40.0
 
 

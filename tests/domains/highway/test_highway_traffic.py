@@ -81,6 +81,15 @@ def test_a_collision_stops_the_round():
     assert WORLD.over(end)
 
 
+def test_who_leaves_the_shoulder_does_not_come_back():
+    """Steering back would bring it onto the road again."""
+    gone = state_of((0.0, 12.1, -0.3, 10.0))
+    assert WORLD.over(gone) and not WORLD.over(state_of((0.0, 11.9, -0.3, 10.0)))
+    after = play(gone, (-1.0, 1.0), steps=10)
+    for name, part in vars(gone).items():
+        assert torch.equal(part, getattr(after, name)), name
+
+
 # --- others -------------------------------------------------------------------------------------
 
 

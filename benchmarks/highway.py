@@ -1,0 +1,177 @@
+"""How well the expert drives on the highway, beside random actions and beside doing nothing.
+
+    python -m benchmarks.highway
+
+Rounds of the domain's batched physics and rounds of the Gymnasium environment on highway-env, from
+the same starts. None of the three drivers depends on what can be seen, so that there is one row
+for both settings.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.highway import Highway, HighwayState, expert
+from mirror_ppl.domains.highway.pictures import picture
+
+Driver = Callable[[HighwayState], Tensor]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    rounds: int = 100
+    """Rounds of each driver."""
+    seed: int = 0
+    """Seed of the rounds."""
+    horizon: int = expert.ExpertOptions.horizon
+    """Decisions that the expert looks ahead."""
+    environment: bool = True
+    """Whether to play the environment on highway-env too."""
+    out: Path | None = None
+    """File of rows, one for each driver, scenario and simulator; none unless given."""
+    picture: Path | None = None
+    """File of a picture of a round; none unless given. Nothing is measured then."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """Rounds of a driver: return, whether there was an accident, and reward terms, each [B]."""
+
+    terms: dict[str, Tensor]
+    accident: Tensor
+    seconds: float
+
+    @property
+    def total(self) -> Tensor:
+        """Return of each round."""
+        return torch.stack(list(self.terms.values())).sum(0)
+
+
+def main(options: Options) -> None:
+    """Run the study."""
+    torch.set_num_threads(1)
+    if options.picture:
+        draw(options.picture)
+        return
+    world = Highway()
+    scenario = torch.arange(options.rounds) % len(world.scenarios)
+    start = world.initial(options.rounds, torch.Generator().manual_seed(options.seed), scenario)
+    noise = torch.Generator().manual_seed(options.seed + 1)
+    drivers: dict[str, Driver] = {
+        "expert": lambda state: expert.act(state, expert.ExpertOptions(options.horizon)),
+        "nothing": lambda state: torch.zeros(*state.tick.shape, 2),
+        "random": lambda state: torch.rand(*state.tick.shape, 2, generator=noise) * 2 - 1,
+    }
+    simulators = {"batched": play_batched}
+    if options.environment:
+        simulators["highway-env"] = play_environment
+    rows = []
+    print(f"{'simulator':<12} {'driver':<8} {'return':>8} {'s.e.':>6} {'accidents':>9} {'s':>6}")
+    for simulator, play in simulators.items():
+        for name, driver in drivers.items():
+            played = play(world, start, driver)
+            error = played.total.std() / options.rounds**0.5
+            print(
+                f"{simulator:<12} {name:<8} {played.total.mean():>8.1f} {error:>6.1f} "
+                f"{played.accident.double().mean():>9.0%} {played.seconds:>6.0f}",
+                flush=True,
+            )
+            rows += rows_of(simulator, name, played, scenario, world)
+    if options.out:
+        with options.out.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+def play_batched(world: Highway, start: HighwayState, driver: Driver) -> Played:
+    """Play all rounds at once, by the domain's physics."""
+    began, state = time.monotonic(), start
+    sums: dict[str, Tensor] = {}
+    for _ in range(world.horizon):
+        action = driver(state)
+        following = world.transition(state, action)
+        for name, term in world.rewards(state, action, following).items():
+            sums[name] = sums.get(name, torch.zeros(())) + term
+        state = following
+    return Played(sums, world.over(state), time.monotonic() - began)
+
+
+def play_environment(world: Highway, start: HighwayState, driver: Driver) -> Played:
+    """Play all rounds on highway-env, side by side, so that the driver decides for all at once."""
+    from mirror_ppl.domains.highway import vehicles
+    from mirror_ppl.domains.highway.road import TICKS
+
+    began, batch = time.monotonic(), len(start.tick)
+    roads = [vehicles.make_road(map_state(lambda part, i=i: part[i], start)) for i in range(batch)]
+    ticks, state = [0] * batch, start
+    sums: dict[str, Tensor] = {}
+    for _ in range(world.horizon):
+        action = driver(state)
+        over = world.over(state)
+        following = []
+        for number, road in enumerate(roads):
+            controls = action[number].double().numpy()
+            ego = vehicles.ego_of(road)
+            ego.drive(controls)
+            for _ in range(TICKS):
+                if not (ego.hit_others or over[number]):
+                    vehicles.tick(road, ticks[number])
+                    ticks[number] += 1
+            following.append(vehicles.read_road(road, ticks[number], controls))
+        after = map_state(lambda *parts: torch.stack(parts), *following)
+        for name, term in world.rewards(state, action, after).items():
+            sums[name] = sums.get(name, torch.zeros(())) + term
+        state = after
+    return Played(sums, world.over(state), time.monotonic() - began)
+
+
+def rows_of(
+    simulator: str, driver: str, played: Played, scenario: Tensor, world: Highway
+) -> list[dict[str, str | float]]:
+    """Return a row for each scenario."""
+    rows = []
+    for index, name in enumerate(world.scenarios):
+        own = scenario == index
+        row: dict[str, str | float] = {
+            "simulator": simulator,
+            "driver": driver,
+            "scenario": name,
+            "rounds": int(own.sum()),
+            "return": round(played.total[own].mean().item(), 2),
+            "accidents": round(played.accident[own].double().mean().item(), 3),
+        }
+        row |= {term: round(sums[own].mean().item(), 2) for term, sums in played.terms.items()}
+        rows.append(row)
+    return rows
+
+
+def draw(path: Path) -> None:
+    """Write the picture of docs/highway.md: the expert as a car cuts in, in clear and in fog."""
+    from matplotlib.image import imsave
+
+    world = Highway()
+    index = torch.tensor([world.scenarios.index("car on the left cuts in")])
+    state = world.initial(1, torch.Generator().manual_seed(3), index)
+    for _ in range(26):
+        state = world.transition(state, torch.zeros(1, 2))
+    one = map_state(lambda part: part[0], state)
+    seen = world.observe(one)
+    masks = (world.visibility(setting, seen)["visual"] for setting in world.settings)
+    imsave(path, np.ascontiguousarray(picture(one, seen, *masks)))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
