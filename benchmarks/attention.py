@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def _near(truth: Draws, human: PerItem, generator: torch.Generator) -> Draws:
-    """People ``[NEAR, 1, 1, ...]`` like somebody."""
+    """People ``[NEAR, 1, 1, ...]`` like a person."""
     near = draw_prior(human, 1, NEAR, 0)
     for name, value in near.items():
         near[name] = truth[name].expand(value.shape).clone()

@@ -93,7 +93,7 @@ def implants(number=1, model=None, sight=BLIND, **values):
 
 
 def person(number=1, model=None, **values):
-    """Somebody with draws of :func:`implants`."""
+    """A person with draws of :func:`implants`."""
     model = model or human()
     return Person(model, implants(number, model, **values))
 

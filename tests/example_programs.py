@@ -65,7 +65,7 @@ class MaskedPrior(HumanModel):
 
 
 class ObservedInAct(HumanModel):
-    """Somebody who says at each step how well they like it."""
+    """A person who says at each step how well they like it."""
 
     def act(self, implants, belief, values):
         spread = values.max(-1).values - values.min(-1).values
@@ -76,7 +76,7 @@ class ObservedInAct(HumanModel):
 
 
 class InRounds(DistractedPerson):
-    """Somebody who says after each round whether they were distracted."""
+    """A person who says after each round whether they were distracted."""
 
     def round_latents(self, implants):
         with poutine.scale(scale=0.8):

@@ -1,4 +1,4 @@
-"""Rounds of driving by somebody who follows a rule."""
+"""Rounds of driving by a person who follows a rule."""
 
 import torch
 

@@ -120,7 +120,7 @@ def test_cannot_see_what_is_not_visible(random_clone):
 
 
 @pytest.mark.parametrize("modality", ["visual", "verbal"])
-def test_reads_what_was_told(modality, random_clone):
+def test_reads_messages(modality, random_clone):
     clone, data = random_clone
     told = {name: value.clone() for name, value in data.told.items()}
     # A car behind, which nobody sees in fog.

@@ -52,7 +52,7 @@ def test_solves_a_task_that_it_must(rule, generator):
     assert (found.argmax(-1) == test.actions).float().mean() > 0.95
 
 
-def test_people_who_are_alike_learn_from_each_other(generator):
+def test_similar_people_share_weights(generator):
     data = group(avoid, generator, 8, 14)
     train, validation, test = parts(data, (0, 1), (1, 6), (6, 14))
     together = fit_pooled_logistic(train, validation)
@@ -69,7 +69,7 @@ def test_people_who_are_alike_learn_from_each_other(generator):
     assert nll < 0.8 * torch.stack(alone).mean()
 
 
-def test_people_who_differ_are_not_made_alike(generator):
+def test_people_who_differ_keep_weights_of_their_own(generator):
     data = concatenate(
         [rounds_of(avoid, generator, 60, "a"), rounds_of(alternate, generator, 60, "b")]
     )

@@ -25,7 +25,7 @@ ONLY = {NETWORK: torch.zeros(1, dtype=torch.long)}
 
 
 def recorded(domain, generator, rounds=3):
-    """Rounds in the setting that shows less, in which somebody was told this and that."""
+    """Rounds in the setting that shows less, in which a person received various messages."""
     found = simulate(
         domain, get_domain(domain).settings[-1], "paper", people=1, rounds=rounds, seed=0
     )
@@ -93,7 +93,7 @@ def test_acts_as_the_network_does(domain, generator):
             torch.testing.assert_close(draw, expected[0, number, past.time], rtol=1e-4, atol=1e-5)
 
 
-def test_who_acts_on_what_they_are_told_is_told(generator):
+def test_people_who_act_on_messages_get_messages(generator):
     """A network set by hand switches if told of the car ahead, and otherwise drives into it."""
     human = network("driving", generator, "fog")
     weights, hidden, sizes = human.networks.weights, human.networks.hidden, DOMAIN.symbol_sizes
@@ -133,7 +133,7 @@ def test_the_world_that_is_planned_in_can_be_another(generator):
     assert NETWORK in human.draws(1)
 
 
-def test_what_the_setting_shows_anyway_can_be_told(generator):
+def test_items_that_the_setting_shows_can_be_communicated(generator):
     """In bomb defusal, where all terminals are in view: a network hears that one is shown."""
     human = network("bomb_defusal", generator, "unlabelled")
     domain = human.domain

@@ -82,7 +82,7 @@ def test_played_rounds_are_of_the_domain_and_of_the_networks(name):
         assert abs(float(rate.mean() - expected.mean())) < 4.5 * float(error) + 1e-6
 
 
-def test_rounds_that_are_played_are_told_as_much_as_recorded_ones():
+def test_played_rounds_have_as_many_messages_as_recorded_ones():
     domain = get_domain("driving")
     networks = untrained(domain, ("a", "b"))
     recorded = simulate("driving", "fog", "paper", 2, 40, seed=0, told=0.1)

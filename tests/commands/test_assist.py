@@ -85,7 +85,7 @@ def test_the_log_holds_every_decision(done):
     assert cost / 4 == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_table_tells_the_numbers(posterior, capsys):
+def test_the_table_shows_the_numbers(posterior, capsys):
     chosen = ("--communicator", "oracle", "none")
     assert command(assist, "--posterior", posterior, *SMALL, *chosen) == 0
     captured = capsys.readouterr()

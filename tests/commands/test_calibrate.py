@@ -41,7 +41,7 @@ def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
-def test_it_tells_and_writes_what_it_found(small, tmp_path, capsys):
+def test_it_prints_and_writes_what_it_found(small, tmp_path, capsys):
     assert command(calibrate, *small, "--jobs", 1) == 0
     out, err = capsys.readouterr()
     assert "60 people drawn from the prior" in out

@@ -433,7 +433,7 @@ def test_simulate_writes_recordings_that_can_be_fitted(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("module", [assist, calibrate, evaluate, fit, train, simulate])
-def test_help_tells_every_option(module, capsys):
+def test_help_explains_every_option(module, capsys):
     assert command(module, "--help") == 0
     out = " ".join(capsys.readouterr().out.split())
     for name in module.Options.__dataclass_fields__:
@@ -527,7 +527,7 @@ def test_summary_by_hand():
     assert score(log_probabilities, unknown)[0]["floor"] is None
 
 
-def test_bins_are_told_in_cells():
+def test_bins_are_reported_in_cells():
     draws = {"sight_front_own": torch.tensor([[[0]], [[5]], [[6]]]), "lapse": torch.ones(3, 1, 1)}
     units = in_units(get_domain("driving"), draws)
     assert units["sight_front_own"].tolist() == [[0.0], [6.0], [12.0]]

@@ -66,7 +66,7 @@ def test_unknown_argument_is_one_line_and_status_2(args, told):
 # --- errors -----------------------------------------------------------------------------------
 
 
-def test_unknown_name_tells_the_known_ones_and_the_closest():
+def test_an_unknown_name_gives_the_known_ones_and_the_closest():
     error = UnknownNameError.of("domain", "Drivin", ["driving", "bomb"])
     expected = 'unknown domain "Drivin"; known: bomb, driving; perhaps you meant "driving"'
     assert str(error) == expected
@@ -273,7 +273,7 @@ def test_progress_of_resumed_work_reckons_by_what_this_run_did(clock):
     ]
 
 
-def test_progress_on_a_terminal_tells_what_is_left_of_slow_steps(monkeypatch, clock):
+def test_progress_on_a_terminal_shows_what_is_left_of_slow_steps(monkeypatch, clock):
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
     stream = Terminal()
@@ -283,7 +283,7 @@ def test_progress_on_a_terminal_tells_what_is_left_of_slow_steps(monkeypatch, cl
     assert "20 min 0 s left" in stream.getvalue()
 
 
-def test_progress_tells_how_far_failed_work_came(clock):
+def test_progress_shows_how_far_failed_work_came(clock):
     stream = io.StringIO()
     with pytest.raises(ZeroDivisionError), Progress("fit", stream=stream, done=10) as progress:
         progress.advance("loss 3")

@@ -129,7 +129,7 @@ def test_a_population_is_learned_from_others(monkeypatch):
         assert not torch.equal(others.actions[:, :3], rounds.actions)
 
 
-def test_baselines_know_what_rewards_tell_of_the_world():
+def test_baselines_know_what_rewards_identify_of_the_world():
     """Recorded rewards say that the robot's rules are out of date; each planner gets to know it."""
     group = Group("bomb_defusal", "unlabelled", "paper", 2, 0)
     person = learn("bc", group, 20, 0).person(1, 3)  # pyright: ignore[reportAttributeAccessIssue]
@@ -247,7 +247,7 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     assert len(list((tmp_path / "parts").iterdir())) == 2 * (len(QUICK) + 1)
 
 
-def test_what_fails_is_told_and_the_rest_is_shown(tmp_path, capsys, monkeypatch):
+def test_failures_are_reported_and_the_rest_is_shown(tmp_path, capsys, monkeypatch):
     def broken(group, rounds, seed, members):
         raise RuntimeError("this one cannot learn")
 
@@ -377,7 +377,7 @@ def result(model, rounds, mean, place=Place("driving", "fog", "paper")):  # noqa
     return ModelResult(place, model, rounds, Interval(mean, mean - 0.1, mean + 0.1), 3, None)
 
 
-def test_tables_say_where_somebody_is_missing():
+def test_tables_say_where_a_person_is_missing():
     """A cell of bc failed: its mean is of one person, and the advantage over it, too."""
     rows = [
         Place("driving", "fog", "paper")._asdict()
@@ -472,7 +472,7 @@ def test_models_of_ones_own_are_called_by_file_and_class_unless_two_are_called_s
     assert len({line.get_linestyle() for line in ax.lines[1:]}) == len(names) - 1
 
 
-def test_levels_that_would_flatten_the_curves_are_told_in_words():
+def test_levels_that_would_flatten_the_curves_are_given_in_words():
     """Curves from .1 to .5 with their intervals: a level at 1.9 is drawn, one at -90 is not."""
     results = [result("mirror", 20, 0.2), result("bc", 1, 0.4)]
     results += [result("none", 0, 1.9), result("all", 0, -90.0)]
@@ -482,7 +482,7 @@ def test_levels_that_would_flatten_the_curves_are_told_in_words():
     assert ax.get_ylim()[0] > -1
 
 
-def test_bars_are_of_the_most_rounds_and_silence_is_told():
+def test_bars_are_of_the_most_rounds_and_silence_is_named():
     place = Place("driving", "fog", "paper")
     shares = [
         Share(place, "mirror", 1, "all", 5, Interval(0.9, 0.8, 1.0)),
@@ -495,7 +495,7 @@ def test_bars_are_of_the_most_rounds_and_silence_is_told():
     assert [text.get_text() for text in ax.texts] == ["none: no messages"]
 
 
-def test_people_are_told_things_where_help_is_compared():
+def test_people_receive_messages_where_help_is_compared():
     """And by what was asked for, if anything was."""
     for name, told, expected in (
         ("prediction", None, 0.0),

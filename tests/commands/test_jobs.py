@@ -113,7 +113,7 @@ def test_a_damaged_result_is_made_anew(tmp_path):
         assert json.loads(file.read_text())["result"] == [{"number": 3, "square": 9}]
 
 
-def test_a_failure_is_told_loses_nothing_and_is_tried_again(tmp_path):
+def test_a_failure_is_reported_loses_nothing_and_is_tried_again(tmp_path):
     outcomes = Runner(tmp_path, same, keep_going=True).run(CELLS, all_but_one)
     assert squares(outcomes) == [9, 4]
     error = outcomes[1].error
@@ -129,7 +129,7 @@ def die_of_one(cell):
     return square(cell)
 
 
-def test_who_kills_their_process_is_told_and_the_others_are_done(tmp_path):
+def test_work_that_kills_its_process_is_reported_and_the_rest_is_done(tmp_path):
     outcomes = Runner(tmp_path, same, 2, keep_going=True).run(CELLS, die_of_one)
     assert squares(outcomes) == [9, 4]
     assert outcomes[1].error == KILLED
@@ -224,7 +224,7 @@ def test_processes_beside_each_other_find_the_same(tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_a_cluster_that_is_not_there_is_told(tmp_path):
+def test_a_missing_cluster_is_reported(tmp_path):
     from dask.base import get_scheduler
 
     with pytest.raises(OptionError) as error:

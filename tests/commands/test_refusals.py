@@ -34,7 +34,7 @@ def test_nothing_is_simulated_for_a_file_that_cannot_be_written(tmp_path, monkey
         simulate.main(simulate.Options(out=tmp_path / "file" / "below.nc"))
 
 
-def test_what_was_told_is_in_the_posterior_file(tmp_path):
+def test_messages_are_in_the_posterior_file(tmp_path):
     options = fit.Options(out=tmp_path, people=("person-01",), train_rounds=1, draws=4, explore=0)
     fit.main(options)
     with xr.open_dataset(tmp_path / "posterior.nc", group="constant_data") as constants:

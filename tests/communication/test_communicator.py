@@ -144,7 +144,7 @@ def test_it_asks_for_the_steps_that_are_left_and_the_items_that_may_be_sent():
 
 
 def talker(**values):
-    """A communicator for four draws of somebody who hardly errs."""
+    """A communicator for four draws of a person who hardly errs."""
     someone = person(4, **({"consistency": 8.0, "lapse": 0.001} | values))
     return Communicator(someone, ExpectedUtility(WORLD))
 
@@ -194,7 +194,7 @@ def test_the_last_action_can_still_be_helped(monkeypatch):
     assert decision.gain.mean == pytest.approx(1 - decision.cost, abs=0.05)
 
 
-def test_silence_at_the_last_action_of_somebody_who_acts_the_same_anyway(monkeypatch):
+def test_silence_at_the_last_action_of_a_person_who_acts_the_same_anyway(monkeypatch):
     monkeypatch.setattr(Driving, "horizon", 1)
     assert silent(talker(sight=2, consistency=0.0).plan(begun(*BLOCKED)))
     # And where the reward is the same whatever they do, but for the change of lanes.
@@ -211,7 +211,7 @@ def second_look(lane, positions, speeds):
 @pytest.mark.parametrize("assumes_closing", [0, 1])
 @pytest.mark.parametrize("assumes_clear", [0, 1])
 @pytest.mark.parametrize("scene", [BLOCKED, (1, [5, 8, -6, -4], [1, 1, -1, -1])])
-def test_silence_to_somebody_who_sees_everything(assumes_clear, assumes_closing, scene):
+def test_silence_to_a_person_who_sees_everything(assumes_clear, assumes_closing, scene):
     """What they see for the second time they know: no news of it, so it costs what it costs."""
     someone = talker(sight=FULL_SIGHT, assumes_clear=assumes_clear, assumes_closing=assumes_closing)
     past = second_look(*scene)
@@ -230,7 +230,7 @@ def test_silence_to_somebody_who_sees_everything(assumes_clear, assumes_closing,
     torch.testing.assert_close(utility[1:] - utility[0], expected[:3])
 
 
-def test_speech_at_first_sight_to_somebody_who_sees_everything():
+def test_speech_at_first_sight_to_a_person_who_sees_everything():
     """They see a car and take it to come closer, so they would switch lanes for nothing, -1."""
     scene = (0, [3, 11, -11, -11], [1, 1, -1, -1])
     someone = talker(sight=FULL_SIGHT)
@@ -244,7 +244,7 @@ def test_speech_at_first_sight_to_somebody_who_sees_everything():
     assert silent(someone.plan(second_look(*scene)))
 
 
-def test_silence_to_somebody_who_does_not_listen(generator):
+def test_silence_to_a_person_who_does_not_listen(generator):
     for time in (0, 2, 5):
         past, _ = random_round(time, generator)
         assert silent(talker(consistency=0.0).plan(past))
@@ -261,7 +261,7 @@ def test_silence_to_somebody_who_does_not_listen(generator):
         ("verbal", -1, 0, False),
     ],
 )
-def test_who_was_told_need_not_be_told_again(name, speed, closing, news):
+def test_communicated_items_need_not_be_communicated_again(name, speed, closing, news):
     """What they were told stays known, so the same once more gains nothing.
 
     What was shown is shown in vain if they imagine it to be where it is. They see two cells.
@@ -281,7 +281,7 @@ def test_who_was_told_need_not_be_told_again(name, speed, closing, news):
 
 @pytest.mark.parametrize("assumes_clear", [0, 1])
 @pytest.mark.parametrize("lane", [0, 1])
-def test_a_car_in_the_fog_is_told_of(assumes_clear, lane):
+def test_a_car_in_the_fog_is_communicated(assumes_clear, lane):
     """They see two cells; the car ahead in their lane is three away and closes in.
 
     Untold they stay, get within two cells of it, -2, and switch then. Told, they switch now.
@@ -370,7 +370,7 @@ def test_nothing_is_kept_between_decisions(rounds, generator):
         assert same(one, fresh.plan(past))
 
 
-def test_another_seed_is_other_luck(rounds, generator):
+def test_another_seed_is_other_noise(rounds, generator):
     someone = Person(human(), varied_draws(6, generator))
     one, other = (
         Communicator(someone, ExpectedUtility(WORLD, 4, enumerate_above=1), seed=seed).plan(

@@ -1,4 +1,4 @@
-"""A communicator in somebody else's loop."""
+"""A communicator in another program's loop."""
 
 import numpy as np
 import pytest

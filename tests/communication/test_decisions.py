@@ -162,7 +162,7 @@ def test_a_decision_without_a_choice():
 
 
 def turned(silent, told):
-    """A decision to show the car ahead, with chances of staying and switching at each step."""
+    """A decision to show the car ahead, with probabilities of actions at each step."""
     return decision(1, [plan(None), plan(SHOWN)], [[0.0, 0], [1, 1]], [silent, told])
 
 
@@ -245,7 +245,7 @@ def test_why_where_no_action_changes_much():
     )
 
 
-def test_what_matters_most_is_told_first_and_what_would_be_done_is_about_it():
+def test_the_item_that_matters_most_comes_first_and_the_action_is_about_it():
     actions = [[[0.1, 0.9]]] + [[[0.6, 0.4]]] * 3
     one = four(3, actions)
     assert one.why() == (

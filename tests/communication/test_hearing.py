@@ -1,4 +1,4 @@
-"""Which channels reach somebody: exact posteriors, and planners that find out."""
+"""Which channels reach a person: exact posteriors, and planners that find out."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -40,7 +40,7 @@ def told_round(domain="driving"):
     return rounds, RoundSoFar.of(rounds, "person-01", 0, 8)
 
 
-def test_what_reaches_somebody_is_inferred_exactly(driving):
+def test_channels_that_reach_a_person_are_inferred_exactly(driving):
     """By Bayes's rule, with the likelihood of each pattern by going through the program."""
     draws = nearly_blind(driving, 5)
     rounds, past = told_round()

@@ -51,7 +51,7 @@ def since(*times, steps=STEPS):
 
 
 def viewer(sight=BLIND, clear=1, closing=1):
-    """Implants ``[1]`` of somebody with the same sight in all directions."""
+    """Implants ``[1]`` of a person with the same sight in all directions."""
     assumes = dict(zip(assumption_sites(DOMAIN), (clear, closing), strict=True))
     return {k: torch.tensor([v]) for k, v in (dict.fromkeys(SIGHTS, sight) | assumes).items()}
 
@@ -144,14 +144,14 @@ def test_rounds_are_remembered_one_by_one(generator):
         assert same(alone, View(*own))
 
 
-def test_the_first_step_is_as_it_was_told(generator):
+def test_the_first_step_is_as_communicated(generator):
     told = {name: torch.rand(9, 1, 4, generator=generator) < 0.5 for name in NAMES}
     view = perceived(steps=1, **told)
     assert torch.equal(view.visible["visual"], told["visual"] | told["verbal"])
     assert torch.equal(view.visible["verbal"], told["verbal"])
 
 
-def test_telling_again_what_is_known_changes_nothing(generator):
+def test_communicating_again_what_is_known_changes_nothing(generator):
     told = {name: torch.rand(9, STEPS, 4, generator=generator) < 0.2 for name in NAMES}
     view = perceived(**told)
     assert not torch.equal(view.visible["verbal"], told["verbal"])
@@ -164,7 +164,7 @@ def test_telling_again_what_is_known_changes_nothing(generator):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("time", range(STEPS))
 @pytest.mark.parametrize("car", range(4))
-def test_what_is_told_is_no_longer_taken_to_be_absent(name, time, car):
+def test_communicated_items_are_no_longer_assumed_absent(name, time, car):
     told = told_of(car, time)
     placed = since(*(time if index == car else None for index in range(4)))
     view = perceived(viewer(closing=0), **{name: told})
@@ -236,7 +236,7 @@ def test_beliefs_about_a_car_shown_once_are_those_of_one_that_closes_in(car):
 
 
 def after(beliefs, which, past, message, action):
-    """Beliefs after a step, and which of them somebody has."""
+    """Beliefs after a step, and which of them a person has."""
     one = torch.zeros(1, dtype=torch.long)
     transition = person().transition(
         one,
@@ -252,7 +252,7 @@ def names(mask):
 
 
 def lasting(beliefs, which):
-    """Cars of which somebody knows how they move, and cars of which they know only the place."""
+    """Cars of which a person knows how they move, and cars of which they know only the place."""
     knowledge = beliefs.knowledge
     known = DOMAIN.known(knowledge)
     unsure = DOMAIN.assume(knowledge, beginning().now)[0]["closing"]
@@ -266,7 +266,7 @@ def beginning():
 
 
 def steps_of_planning(*messages):
-    """What lasts for somebody blind after each of these messages."""
+    """What lasts for a blind person after each of these messages."""
     past = beginning()
     beliefs, which = beliefs_before(person(), past)
     result, action = [], len(DOMAIN.actions)
@@ -295,7 +295,7 @@ def test_planning_remembers_what_was_shown():
     ]
 
 
-def test_planning_goes_on_from_what_was_told_in_the_round_so_far():
+def test_planning_continues_from_the_messages_of_the_round_so_far():
     past = beginning()
     message = flags(visual=["front-left"], verbal=["rear-right"])
     past = past.then(CHANNELS.split(message), 0, past.now)

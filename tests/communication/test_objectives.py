@@ -95,7 +95,7 @@ def chances(model, draw, past, told):
 
 @torch.no_grad()
 def worth(model, draw, past, world, candidate, horizon, discount):
-    """Utility of one candidate ``[L, N]`` for one draw, and chances of actions by step."""
+    """Utility of one candidate ``[L, N]`` for one draw, and probabilities of actions by step."""
     predicted = torch.zeros(horizon, ACTIONS)
 
     def rest(past, state, step, weight):
@@ -119,7 +119,7 @@ def worth(model, draw, past, world, candidate, horizon, discount):
 
 
 def reference(someone, past, world, candidates, horizon, discount=1.0):
-    """Utilities ``[C, S]`` and chances of actions ``[C, H, A]``."""
+    """Utilities ``[C, S]`` and probabilities of actions ``[C, H, A]``."""
     utility = torch.zeros(len(candidates), someone.number)
     predicted = torch.zeros(len(candidates), horizon, ACTIONS)
     for s in range(someone.number):
@@ -232,7 +232,7 @@ def test_utilities_are_those_of_every_course(
         ("verbal", "rear-right", [-11, -12]),
     ],
 )
-def test_what_can_no_longer_be_told_at_its_step_changes_nothing_but_its_cost(
+def test_items_that_cannot_be_communicated_at_their_step_change_only_the_cost(
     clear, closing, name, car, places
 ):
     """The same message a step earlier does, but where everybody sees the car; and so do others."""
@@ -385,8 +385,8 @@ def test_more_steps_than_can_be_named_are_refused():
         SimulatorWorld(DOMAIN).rollouts(past, 63, torch.Generator())
 
 
-def test_all_candidates_have_the_same_luck():
-    """To somebody who does not listen all messages are worth the same, whatever was left to chance.
+def test_all_candidates_have_common_random_numbers():
+    """To a person who does not listen all messages are worth the same, whatever was left to chance.
 
     So gains over silence have no spread at all: they are the costs.
     """

@@ -190,7 +190,7 @@ class Tracks:
 
 
 def person_of(kind, number, generator):
-    """Somebody of a model of that class, with draws that differ in everything."""
+    """A person of a model of that class, with draws that differ in everything."""
     return Person(kind(self_model()), varied_draws(number, generator))
 
 
@@ -270,7 +270,7 @@ def test_a_car_that_is_imagined_elsewhere_is_believed_elsewhere(generator, kind)
 @pytest.mark.parametrize("time", [0, 4])
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_belief_is_worked_out_once(generator, kind, time):
-    """Fewer than there are looks: each is had by somebody, and no two are alike."""
+    """Fewer than there are looks: each is had by a person, and no two are alike."""
     someone = person_of(kind, 8, generator)
     past, _ = random_round(time, generator)
     tracks = Tracks(someone, past, 6, 200, generator)
@@ -288,7 +288,7 @@ def test_each_belief_is_worked_out_once(generator, kind, time):
         assert (beliefs.scale is None) == (kind is Averaging)
 
 
-def test_the_last_action_and_everything_told_so_far_is_in_a_belief(someone, generator):
+def test_the_last_action_and_all_messages_so_far_are_in_a_belief(someone, generator):
     """A change of any of them in the round so far changes the next belief, as it does in rounds."""
     past, _ = random_round(3, generator)
 
@@ -368,7 +368,7 @@ def test_what_percepts_saw_before_keeps_their_beliefs_apart():
 
 
 @pytest.mark.parametrize("assumption", ASSUMED)
-def test_somebody_who_takes_something_for_granted_believes_otherwise(assumption):
+def test_assumptions_change_beliefs(assumption):
     """Of one car seen and three out of sight, until all are spoken of."""
     past = begun(0, [4, 9, -5, -9], [-1, 1, -1, -1])
     someone = person(2, front_own=4, **{assumption: [0, 1]})
@@ -420,7 +420,7 @@ def test_a_memory_that_is_not_used_leaves_decisions_as_they_are(generator):
     )
 
 
-def test_items_tell_what_somebody_does_not_know_yet():
+def test_items_are_informative_where_a_person_does_not_know_them_yet():
     # One sees two cells ahead, the other nothing.
     two = DOMAIN.reach_bins.index(2.0)
     someone = person(2, front_own=[two, 0], front_other=[two, 0])

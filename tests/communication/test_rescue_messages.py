@@ -13,7 +13,7 @@ TELLING = {"middle-left", "middle-right", "top-left", "top-middle", "top-right"}
 
 
 def context(radius):
-    """Somebody at the entrance who sees so far; three draws of all else."""
+    """A person at the entrance who sees so far; three draws of all else."""
     torch.manual_seed(0)
     human = HumanModel(SelfModel(WORLD))
     draws = {
@@ -43,7 +43,7 @@ def test_what_a_portion_shows_for_less_need_not_be_said():
     assert items(context(1.5).telling(speech)) == items(speech)
 
 
-def test_who_sees_the_house_is_told_nothing():
+def test_people_who_see_the_house_get_no_message():
     everything = torch.ones(len(CHANNELS), dtype=torch.bool)
     assert not context(10.0).telling(everything).any()
 

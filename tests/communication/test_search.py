@@ -368,7 +368,7 @@ def test_objectives_need_not_look_at_actions(search_):
     assert search_(value, ALL, 0).valued.actions is None
 
 
-def test_only_what_is_new_is_valued_and_each_is_told_where_it_is(generator):
+def test_only_what_is_new_is_valued_and_each_index_is_returned(generator):
     value, allowed = HandSet(table(generator)), only(0, 3)
     found = Exhaustive()(value, allowed, 0)
     both, other = only(0, 3)[None], only(5)[None]

@@ -62,7 +62,7 @@ def test_what_the_world_made_never_contradicts(name):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_first_wrong_action_is_told_with_what_was_expected(name):
+def test_the_first_wrong_action_is_reported_with_what_was_expected(name):
     """One action is changed, at a step at which another one leads elsewhere."""
     rounds = recorded(name)
     domain = get_domain(rounds.domain)

@@ -72,7 +72,7 @@ def test_arrays_are_copies_and_fields_are_frozen(given_fields):
         made.setting = "clear"
 
 
-def test_optional_fields_may_be_absent_and_nothing_is_told_by_default(given_fields):
+def test_optional_fields_may_be_absent_and_there_are_no_messages_by_default(given_fields):
     for name in ("told", "rewards", "scenarios", "truth", "action_entropy", "provenance"):
         del given_fields[name]
     made = Demonstrations(**given_fields)

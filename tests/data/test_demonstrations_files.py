@@ -312,7 +312,7 @@ def test_truncated_files_are_refused(ragged, path, engine, part):
 
 
 @pytest.mark.parametrize("damage", ["values", "header"])
-def test_damage_is_noticed_and_told_in_one_place(path, damage, capfd):
+def test_damage_is_noticed_and_reported_in_one_place(path, damage, capfd):
     save_demonstrations(path, Demonstrations(**fields([[30] * 30])))
     content = bytearray(path.read_bytes())
     if damage == "values":

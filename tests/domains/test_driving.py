@@ -221,7 +221,7 @@ def test_fog_leaves_two_cells_ahead_in_both_lanes(domain, cells, lane):
 
 
 @pytest.mark.parametrize("cells", range(-13, 14))
-def test_cars_in_front_can_be_shown_and_all_on_the_road_told_of(domain, cells):
+def test_cars_in_front_can_be_shown_and_all_on_the_road_spoken_of(domain, cells):
     allowed = domain.communicable(domain.observe(state(0, (cells,) * 4)))
     assert allowed["visual"].tolist() == [0 <= cells < 12] * 4
     assert allowed["verbal"].tolist() == [-12 < cells < 12] * 4
@@ -252,20 +252,20 @@ def test_reach_bins_go_up_to_the_whole_road(domain):
 
 
 def blind(expected):
-    """What somebody sees by themselves who sees nothing."""
+    """What a person sees by themselves who sees nothing."""
     nothing = torch.zeros_like(expected["visual"][..., 0], dtype=torch.bool)
     return {"visual": nothing, "verbal": nothing}
 
 
 def after_one_step(domain, now, **visible):
-    """Knowledge of somebody to whom these items of a state were shown or told."""
+    """Knowledge of a person to whom these items of a state were communicated."""
     observed = domain.observe(now)
     return domain.learn(
         domain.nothing_known(*now.lane.shape), observed, blind(observed) | visible, blind
     )
 
 
-def test_clear_is_about_cars_neither_seen_nor_told_yet(domain):
+def test_clear_is_about_cars_neither_seen_nor_communicated_yet(domain):
     seen = torch.tensor([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0]]).bool()
     told = torch.tensor([[0, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]]).bool()
     observed = domain.observe(state(0, (5, 6, -7, -8)))
@@ -318,7 +318,7 @@ def test_who_assumes_cars_to_come_closer_supposes_it_of_those_seen_once(domain, 
     assert torch.equal(supposed.speed[~unsure], start.speed[~unsure])
 
 
-def test_symbols_tell_all_observations_apart(domain):
+def test_symbols_distinguish_all_observations(domain):
     cells = torch.arange(-12, 13)
     places = torch.cartesian_prod(cells, torch.tensor([0, 1]))
     now = DrivingState(places[:, 1], places[:, :1].expand(-1, 4), torch.ones(50, 4).long())

@@ -200,7 +200,7 @@ def test_a_given_scenario_is_kept_in_every_round(scenario):
     assert {env.reset(seed=seed)[1]["scenario"] for seed in range(5)} == {scenario}
 
 
-def test_the_scenario_that_is_told_is_the_one_that_moves_the_cars():
+def test_the_reported_scenario_is_the_one_that_moves_the_cars():
     env, by_name = DrivingEnv(), dict(zip(Driving.scenarios, range(8), strict=True))
     for seed in range(30):
         _, info = env.reset(seed=seed)

@@ -41,7 +41,7 @@ SILENCE = told()
 
 
 def within(cells):
-    """What somebody sees who sees so far in all directions; nothing from -1 on."""
+    """What a person sees who sees so far in all directions; nothing from -1 on."""
 
     def sees(observation):
         near = observation["visual"][..., 0].abs() <= cells
@@ -51,7 +51,7 @@ def within(cells):
 
 
 def course(observations, messages=(), reach=-1):
-    """Knowledge after each step of somebody who sees so far and hears these messages."""
+    """Knowledge after each step of a person who sees so far and hears these messages."""
     sees, knowledge, result = within(reach), DOMAIN.nothing_known(), []
     for step, observation in enumerate(observations):
         message = messages[step] if step < len(messages) else SILENCE
@@ -98,7 +98,7 @@ def test_at_the_beginning_nothing_is_known():
     ("place", "speed"), [(5, -1), (1, -1), (11, -1), (0, 1), (-1, 1), (-5, 1), (-11, 1)]
 )
 @pytest.mark.parametrize("car", range(4))
-def test_first_sight_tells_the_place_and_leaves_the_speed_to_be_assumed(car, place, speed):
+def test_first_sight_gives_the_place_and_leaves_the_speed_to_be_assumed(car, place, speed):
     """Closer, that is; a car abreast would have been ahead before had it come from there."""
     steps = course(at(place, 7, 7, car=car), [told(visual=[car])])
     expected = [unsure(place + step * speed, speed) for step in range(3)]
@@ -137,7 +137,7 @@ def test_car_missed_where_it_should_be_in_sight_is_known():
         steps = course(at(4, 5, 6, 7, 8), [told(visual=[AHEAD])], reach)
         expected = [*[unsure(4 - step, -1) for step in range(missed)], *[KNOWN] * (5 - missed)]
         assert [of(knowledge) for knowledge in steps] == expected
-    # Behind, it draws away as well, and to somebody who sees nothing it is never missing.
+    # Behind, it draws away as well, and to a person who sees nothing it is never missing.
     steps = course(at(-4, -5, -6, car=BEHIND), [told(visual=[BEHIND])], reach=2)
     assert [of(k, BEHIND) for k in steps] == [unsure(-4, 1), unsure(-3, 1), KNOWN]
     steps = course(at(-4, -5, -6, car=BEHIND), [told(visual=[BEHIND])])
@@ -261,7 +261,7 @@ def random_rounds(number, generator, rate=0.05):
 
 
 def eyes(reach):
-    """What somebody sees who sees so far ``[B, 4]`` in each direction."""
+    """What a person sees who sees so far ``[B, 4]`` in each direction."""
 
     def sees(observation):
         lane = observation["ego"][..., 0].long()

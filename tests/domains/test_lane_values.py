@@ -180,7 +180,7 @@ def test_unknown_cars_are_ignored(generator):
     )
     values = known_car_values(now, known, 15, 0.95)
     assert torch.equal(values, known_car_values(mixed, known, 15, 0.95))
-    # As for somebody who was told of the known ones, and takes those to be all there are.
+    # As for a person who received the known ones, and takes those to be all there are.
     told = {"visual": torch.zeros_like(known), "verbal": known}
     before = DOMAIN.nothing_known(500)
     knowledge = DOMAIN.learn(before, DOMAIN.observe(now), told, lambda expected: told)

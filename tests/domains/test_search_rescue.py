@@ -367,7 +367,7 @@ def test_networks_read_pixels_and_places():
     assert symbols["verbal"].sum(-1).tolist() == [[1.0] * 5] * 9
 
 
-def test_what_cannot_be_is_told():
+def test_what_cannot_be_is_reported():
     observation = WORLD.observe(start(NINE))
     assert not any(broken.any() for broken in WORLD.faults(observation).values())
 

@@ -95,7 +95,7 @@ def test_rewards_costs_and_collisions_are_those_of_the_scene(played):
     assert played.milliseconds >= 0
 
 
-def test_items_and_chances_are_counted_by_modality(played):
+def test_items_and_opportunities_are_counted_by_modality(played):
     assert played.items == {"visual": [2, 0], "verbal": [3, 0]}
     # On the road: 4, 2 and 2 cars; of these ahead or abreast 2, 1 and 2.
     assert played.chances == {"visual": 5, "verbal": 8}
@@ -129,7 +129,7 @@ def test_speakers_are_given_the_rounds_as_they_went(scene):
     assert not any(mask.any() for mask in second.told.values())
 
 
-def test_the_log_tells_every_decision_and_how_likely_the_deed_was(scene, played):
+def test_the_log_has_every_decision_and_the_probability_of_the_action(scene, played):
     assert [(entry["step"], entry["round"]) for entry in played.log] == [
         (step, number) for step in range(3) for number in range(2)
     ]
@@ -138,7 +138,7 @@ def test_the_log_tells_every_decision_and_how_likely_the_deed_was(scene, played)
     assert first[1]["message"] == {"visual": [], "verbal": []}
     assert [entry["cost"] for entry in first] == pytest.approx([0.07, 0, 0.12])
     assert [entry["action"] for entry in first] == ["stay", "switch", "stay"]
-    # What was said reached the driver: their choices are those of somebody who was told so.
+    # What was said reached the driver: their choices are those of a person who received it.
     memory, state = Memory.empty((1,)), DrivingState(*(part[:, 0] for part in vars(START).values()))
     for step, entry in enumerate(first):
         told = CHANNELS.split(CHANNELS.flags(SCRIPT.get(step, {}))[None])
@@ -157,7 +157,7 @@ def test_a_log_is_kept_only_if_asked_for(scene, played):
     assert without_time(again) == without_time(played)
 
 
-def test_luck_decides_by_the_probability_of_switching(scene):
+def test_action_noise_decides_by_the_probability_of_switching(scene):
     entry = play(scene, Scripted({}), keep_log=True).log[0]
     chance = entry["true_probability"]["switch"]
     assert 0.01 < chance < 0.99
@@ -181,7 +181,7 @@ def run(name, rates=None, seed=0, rounds=20):
     return play(someone, speaker(name, someone, PlannerOptions(), seed, rates))
 
 
-def test_all_play_the_same_rounds_with_the_same_luck():
+def test_all_play_the_same_rounds_with_the_same_action_noise():
     silence = run("none")
     assert without_time(run("none", seed=1)) == without_time(silence)
     torch.manual_seed(1)  # nothing global matters
@@ -192,7 +192,7 @@ def test_all_play_the_same_rounds_with_the_same_luck():
     never = {"visual": 0.0, "verbal": 0.0}
     assert without_time(run("random", never)) == without_time(silence)
     assert without_time(run("random", {"visual": 1.0, "verbal": 1.0})) == without_time(run("all"))
-    # The cars' courses are nobody's doing, so everybody has the same chances to speak of them.
+    # Cars' courses depend on no person, so all have the same opportunities to speak of them.
     for name in ("all", "nearest", "oracle"):
         assert run(name, rounds=5).chances == run("none", rounds=5).chances
     other = play(listener(seed=1), lambda rounds, truth: (flags, None))
@@ -213,7 +213,7 @@ def test_random_messages_have_the_rate_that_is_asked_for():
     for name, rate in rates.items():
         number = played.chances[name]
         assert number > 1000
-        # Each of the chances is taken or not: within 4 standard deviations, 1 seed of 16,000 fails.
+        # Each opportunity is taken or not: within 4 standard deviations, 1 seed of 16,000 fails.
         spread = math.sqrt(number * rate * (1 - rate))
         assert abs(sum(played.items[name]) - number * rate) < 4 * spread
     assert run("random", rates, seed=1, rounds=100).items != played.items

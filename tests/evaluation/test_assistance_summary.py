@@ -104,7 +104,7 @@ def test_ways_are_left_out_where_there_is_nowhere_to_go():
     assert all("way_to_oracle" not in entry for entry in summarize_assistance(level).values())
 
 
-def test_where_nothing_was_told_there_is_no_share_of_it():
+def test_without_messages_there_is_no_share_of_relevant_ones():
     entry = summarize_assistance(PLAYED)["none"]
     assert entry["relevant"] == {"course": {"all": None, "visual": None, "verbal": None}}
     assert entry["items"] == {"visual": 0.0, "verbal": 0.0}

@@ -193,7 +193,7 @@ def test_it_agrees_with_arviz(tmp_path, rng):
         assert model.good_k == pytest.approx(1 - 1 / np.log10(400))
 
 
-def test_rounds_that_hang_on_few_draws_are_doubtful(tmp_path):
+def test_rounds_that_depend_on_few_draws_are_doubtful(tmp_path):
     # Draws at the quantiles of what is told, so that nothing depends on chance.
     level = (np.arange(200) + 0.5) / 200
     tail = np.log(level)  # weights of exponent k have a Pareto tail of shape k
@@ -325,7 +325,7 @@ def test_models_are_called_by_their_class_and_by_their_path_where_that_is_needed
 # --- what is printed and written --------------------------------------------------------------
 
 
-def test_the_table_tells_the_numbers(paths, values, capsys):
+def test_the_table_shows_the_numbers(paths, values, capsys):
     assert command(compare, paths[2], paths[0], "--labels", "slow", "fast") == 0
     out, err = capsys.readouterr()
     assert err == ""
@@ -620,7 +620,7 @@ def test_other_held_out_rounds(tmp_path):
     assert compared(one, other).models[1].total.difference == 0
 
 
-def test_the_same_recordings_may_tell_more_of_simulated_people(paths, tmp_path):
+def test_the_same_recordings_may_hold_more_about_simulated_people(paths, tmp_path):
     # `truth_` and the entropy differ with the number of other attributes.
     other = write(tmp_path / "other.nc", np.zeros((4, 3)), version="2", self_model="another")
     assert len(compared(paths[0], other).models) == 2

@@ -59,7 +59,7 @@ def test_a_newcomer_stands_below_people(capsys):
     assert "newcomer" not in shown(capsys)
 
 
-def test_what_is_not_to_be_trusted_is_told(capsys):
+def test_unreliable_results_are_reported(capsys):
     doubtful = [person(1) | {"pareto_k": 0.8}, person(2) | {"pareto_k": 0.6}]
     assert "not to be relied on for person-01 (Pareto k above 0.7)" in shown(
         capsys, people=doubtful
@@ -73,7 +73,7 @@ def test_what_is_not_to_be_trusted_is_told(capsys):
     assert "relied on" not in shown(capsys)
 
 
-def test_whom_the_model_does_not_explain_is_told_with_reasons(capsys):
+def test_people_whom_the_model_does_not_explain_are_reported_with_reasons(capsys):
     assert "Model check: 2 of 2 people ok" in shown(capsys)
     late = person(2)
     late["check"] |= {"verdict": "suspect", "reasons": ["acts late (p < 0.0005)", "earns less"]}
@@ -120,7 +120,7 @@ def test_people_who_notice_things_have_no_reach(capsys):
     assert "What each person sees (cells) and" in shown(capsys)
 
 
-def test_who_was_inferred_how_is_told(capsys):
+def test_the_engine_of_each_person_is_reported(capsys):
     assert "Inferred by the engine importance: 2 of 2 people\n" in shown(capsys)
     people = [person(1), person(2), person(3) | {"engine": "amortized"}]
     told = "Inferred by the engine importance: 2 of 3 people; amortized: person-03\n"

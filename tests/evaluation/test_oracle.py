@@ -257,7 +257,7 @@ def test_in_clear_weather_with_nothing_at_stake_it_is_silent(horizon):
     assert said(Oracle(driver(EVERYTHING, 8.0), start), 1, 6) == 0
 
 
-def test_to_somebody_who_would_crash_it_speaks(horizon):
+def test_people_who_would_crash_get_a_message(horizon):
     horizon(6)
     start = scenes(((2, -1), AWAY, GONE, GONE))
     person = driver(NOTHING, 8.0)
@@ -269,7 +269,7 @@ def test_to_somebody_who_would_crash_it_speaks(horizon):
 
 @pytest.mark.parametrize("gain", [0.0, 1e-8])
 def test_silence_wins_ties(horizon, monkeypatch, gain):
-    """What costs nothing (or earns next to nothing) is not said to somebody who does not care."""
+    """What costs nothing (or earns next to nothing) is not said to a person who does not care."""
     horizon(4)
     monkeypatch.setattr(Channels, "cost", lambda self, flags: -gain * flags.sum(-1).float())
     assert said(Oracle(driver(consistency=0.0), FEW), 3, 4) == 0
@@ -327,7 +327,7 @@ def test_the_canonical_form_changes_no_behaviour(generator, planning):
 
 
 def knowledge(**changes):
-    """Somebody who knows three cars: one by two sights, one by one sight, one by speech."""
+    """A person who knows three cars: one by two sights, one by one sight, one by speech."""
     given = {
         "known": [True, True, True, False],
         "position": [3.0, -2.0, 4.0, 0.0],

@@ -36,7 +36,7 @@ def start_of(*scenarios):
 
 
 def played_by(person, start, oracle):
-    """What the oracle says in one round ``[1]`` of somebody who never errs, and its net return."""
+    """What the oracle says in one round ``[1]`` of a person who never errs, and its net return."""
     state, memory = map_state(lambda part: part[None], start), person.start(1)
     net, said = 0.0, []
     for step in range(WORLD.horizon):
@@ -54,7 +54,7 @@ def played_by(person, start, oracle):
     return net, said
 
 
-def test_who_goes_right_by_themselves_is_told_nothing():
+def test_people_who_go_right_by_themselves_get_no_message():
     """10 steps there, 10 back: 1 + 15 - 20 * .1."""
     person = somebody((HOME, RIGHT), (RIGHT, TOP_RIGHT))
     oracle = ReachableOracle(person, start_of((2, 0)))
@@ -113,7 +113,7 @@ def test_the_value_is_what_played_rounds_are_worth_on_average(seed):
         assert (own.net - other.net).mean() > least
 
 
-def test_nothing_is_told_when_all_is_over():
+def test_no_message_is_sent_when_the_round_is_over():
     person = simulated_people("search_rescue", "smoke", "paper", 1, 0)
     start = draw_starts(1, 20, 0, "over", domain=WORLD, mind_noises=person.mind_noises)
     someone = Listener(WORLD, "smoke", person, start)

@@ -160,7 +160,7 @@ def test_shares_are_of_all_items_and_of_each_modality():
     assert shares["none", "all"].items == 0
 
 
-def test_shares_are_compared_in_people_whom_both_told_something():
+def test_shares_are_compared_in_people_who_got_messages_from_both():
     """Mirror 1/2, 2/2 and 1/4 of three people; bc 1/4, none and 1/2: ahead by 1/4 and -1/4."""
 
     def told(model, rounds, person, items, goal):

@@ -83,7 +83,7 @@ def test_each_person_is_judged_alone(toy, recordings, network, monkeypatch):
     assert whole.engines == ("amortized", "importance", "amortized")
 
 
-def test_a_run_that_goes_on_knows_who_was_inferred_how(
+def test_a_resumed_run_knows_the_engine_of_each_person(
     toy, recordings, network, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(workers, "PART", 1)
@@ -101,7 +101,7 @@ def test_a_run_that_goes_on_knows_who_was_inferred_how(
     assert found.engines == ("importance", "importance", "amortized")
 
 
-def test_a_fit_tells_which_engine_inferred_whom():
+def test_a_fit_reports_the_engine_of_each_person():
     people = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0, 1])
     one = people.select_people(["person-01"])
     fit = mirror_ppl.infer(one, draws=5, explore=0)

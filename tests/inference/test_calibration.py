@@ -54,7 +54,7 @@ class Blank(nn.Module):
 
 
 class Coins(HumanModel):
-    """Somebody who drives by throwing three coins in turn, so that the posterior is known.
+    """A person who drives by throwing three coins in turn, so that the posterior is known.
 
     One coin has any rate, one is of three kinds, and one of two. A belief is the number of steps.
     """

@@ -200,7 +200,7 @@ def test_weights_do_not_depend_on_what_was_proposed(toy, recordings):
             assert off < float(bound(exact.variance(site)[0], found.effective / 2))
 
 
-def test_weights_that_cannot_be_relied_on_are_told(toy, recordings):
+def test_unreliable_weights_are_reported(toy, recordings):
     table = build_view_table(toy, recordings.select_people([1]))
     torch.manual_seed(0)
     sampler = Sampler(toy, table)
@@ -362,7 +362,7 @@ def test_training_goes_on_where_it_was(toy, tmp_path):
 # --- one interface ----------------------------------------------------------------------------
 
 
-def test_people_do_not_depend_on_who_else_is_there(toy, recordings, network):
+def test_people_do_not_depend_on_the_other_people(toy, recordings, network):
     for guide in ("importance", "amortized"):
         together = infer(toy, recordings.select_people([0, 1]), options_of(guide), 0, network)
         alone = infer(toy, recordings.select_people([0]), options_of(guide), 0, network)

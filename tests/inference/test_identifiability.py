@@ -62,7 +62,7 @@ def test_entropies_by_hand():
     assert [float(v) for v in _entropy_and_shared(sure)] == pytest.approx([math.log(2)] * 2)
 
 
-def test_what_is_open_is_that_of_the_exact_conditionals(toy, rounds, draws):
+def test_posterior_entropy_is_that_of_the_exact_conditionals(toy, rounds, draws):
     found = identify(toy, rounds, draws, 0, rounds=0)
     assert found.sites == ("reach",)
     assert found.information.shape == found.information_error.shape == (3, 0)
@@ -90,8 +90,8 @@ def test_a_population_takes_the_place_of_the_prior(toy, rounds, draws):
         torch.testing.assert_close(found.entropy[person, 0], expected, rtol=1e-3, atol=1e-4)
 
 
-def test_what_the_prior_rules_out_is_not_open(toy, rounds):
-    """Also when its chances in a population are told of the other values alone."""
+def test_what_the_prior_rules_out_has_no_entropy(toy, rounds):
+    """Also when its probabilities in a population are given for the other values alone."""
 
     class Short(ToyHuman):
         def prior(self):
@@ -120,7 +120,7 @@ def two_reaches(rates):
     }
 
 
-def test_rounds_tell_what_they_should(toy, rounds):
+def test_rounds_are_as_informative_as_they_should_be(toy, rounds):
     nobody = rounds.select_people([0]).select_rounds([])
     # Both rates alike: what they do has nothing to do with what they see.
     found = identify(toy, nobody, two_reaches((0.3, 0.3)), 0, rounds=2)
@@ -131,7 +131,7 @@ def test_rounds_tell_what_they_should(toy, rounds):
     assert found.information.shape == (1, 8)
     assert found.information.max() > 0.9 * math.log(2)
     assert found.information.max() <= math.log(2) + 1e-4
-    # Nothing is open about somebody of whom everything is known.
+    # The posterior of a person who is fully known has no entropy.
     known = two_reaches((0.99, 0.01)) | {"reach": torch.full((POLICIES, 1, 1), 4)}
     found = identify(toy, nobody, known, 0, rounds=2)
     assert found.entropy.max() == 0
@@ -158,7 +158,7 @@ def test_expected_information_is_that_of_the_toy(toy, rounds):
 
 
 def test_wide_posteriors_are_looked_at_as_a_whole(toy, rounds):
-    """Of somebody without rounds everything is open, however few draws there are."""
+    """The posterior entropy of a person without rounds is the prior's, however few the draws."""
     human = HumanModel(toy.self_model)
     nobody = rounds.select_people([0]).select_rounds([])
     draws = infer(human, nobody, InferenceOptions(draws=100), 0).draws
@@ -181,7 +181,7 @@ def test_few_draws_do_not_make_a_posterior_narrow(toy, rounds):
     assert float(found.all_entropy[0]) == pytest.approx(math.log(9604), rel=1e-3)
 
 
-def test_which_population_it_is_hangs_on_no_policy(toy, rounds):
+def test_the_population_shares_no_information_with_the_policy(toy, rounds):
     """Without a round sight and policy are independent, however populations differ."""
     nobody = rounds.select_people([0]).select_rounds([])
     draws = infer(toy, nobody, InferenceOptions(draws=POLICIES), 0).draws
@@ -199,7 +199,7 @@ def test_models_without_anything_to_see_have_no_report(toy, rounds):
     assert identify(human, rounds, draws, 0) is None
 
 
-def test_twenty_rounds_leave_less_open_than_one(toy):
+def test_twenty_rounds_leave_less_entropy_than_one(toy):
     human = HumanModel(toy.self_model)
     recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([1])
     found = []

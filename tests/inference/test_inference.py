@@ -196,7 +196,7 @@ def test_marginals_equal_brute_force(few, table, rounds):
             for weight, value in zip(weights, COMBINATIONS[site], strict=True):
                 by_value[value] += weight
             torch.testing.assert_close(found[site][person], by_value, rtol=1e-3, atol=1e-5)
-    # Of somebody without rounds nothing is learned.
+    # Of a person without rounds nothing is learned.
     torch.testing.assert_close(found["sight_front_own"][1], torch.arange(1.0, 8) / 28)
 
 
@@ -458,7 +458,7 @@ def test_pruning_gives_up_whoever_is_hopeless(few, table):
     assert alive[some.expand(20, 2), combination[:, some]].all()
 
 
-def test_fit_tells_who_is_consistent_and_how_far_they_see(few, generator):
+def test_fit_recovers_consistency_and_reach(few, generator):
     # One decides nearly at random, the other nearly perfectly; they see 1 cell and everything.
     known = fixed_policy(2, torch.tensor([[0.5], [6.0]]))
     known |= {"sight_front_own": torch.tensor([[1], [6]]), "assumes_clear": torch.ones(2, 1)}

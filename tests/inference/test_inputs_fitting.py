@@ -166,7 +166,7 @@ def test_predictions_need_draws_of_these_people(one, two):
 
 
 def test_the_limit_of_what_can_be_sampled_will_do(one):
-    """Somebody of consistency 0, which no draw of the prior is, acts at random."""
+    """A person of consistency 0, which no draw of the prior is, acts at random."""
     draws = implants(1, consistency=0.0, lapse=1.0)
     found = predict_rounds(human(), one, draws)
     torch.testing.assert_close(found.exp(), torch.full_like(found, 0.5))

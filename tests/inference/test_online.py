@@ -125,7 +125,7 @@ def test_people_are_not_mixed(human, network):
         OnlinePosterior(human, network).add(two)
 
 
-def test_the_rounds_of_somebody_else_are_refused(human):
+def test_the_rounds_of_another_person_are_refused(human):
     two = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0])
     online = OnlinePosterior(human)
     online.add(two.select_people([0]))

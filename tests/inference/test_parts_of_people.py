@@ -66,7 +66,7 @@ def test_what_is_kept_makes_no_difference(fit, recordings, tmp_path):
     assert not folder.exists()
 
 
-def test_nobody_depends_on_who_else_there_is(fit, recordings):
+def test_no_person_depends_on_the_other_people(fit, recordings):
     """Of the first people; seeds of later ones are by their number."""
     some = mirror_ppl.infer(recordings.part(range(3)), draws=20, train_rounds=3, explore=1)
     for name, values in some.data.posterior.data_vars.items():

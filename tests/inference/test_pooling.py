@@ -126,7 +126,7 @@ def test_the_sampler_s_densities_are_those_of_the_program(pooling, draws):
     assert max(offsets) - min(offsets) < 2e-3 * max(map(abs, offsets))
 
 
-def test_sites_that_hang_on_others_keep_their_prior():
+def test_sites_that_depend_on_others_keep_their_prior():
     """How soon each terminal is noticed follows how quick somebody is, in a population, too."""
     human = load_human_model(None, load_self_model(shipped_weights("bomb_defusal"))[0])
     pooling = Pooling(human)
@@ -183,7 +183,7 @@ def test_newcomers_are_from_the_population(pooling):
     assert not torch.equal(new["in_sight"][:, 0], new["in_sight"][:, 1])
 
 
-def test_people_who_are_alike_tell_of_each_other(toy, pooling):
+def test_similar_people_are_pooled(toy, pooling):
     """All see as far as bin 3 and hardly differ otherwise; of one there is a single round."""
     generator = torch.Generator().manual_seed(1)
     alike = {
@@ -245,7 +245,7 @@ def test_newcomers_follow_what_the_prior_says_besides():
     some = population(by_rate(0.5, -1.0), by_rate(0.7, 0.4), number)
     new = Pooling(human).newcomers(some, 1, 0)
     assert new["kind"].shape == (number, 1, 1, 3)
-    # Chances of 1, 2, 3 of 28; the others are as good as impossible.
+    # Probabilities of 1, 2, 3 of 28; the others are as good as impossible.
     counts = torch.bincount(new["reach"].flatten(), minlength=7).numpy()
     assert counts[3:].sum() == 0
     expected = number * torch.arange(1.0, 4).double().numpy() / 6

@@ -95,7 +95,7 @@ def test_spreads_are_weighed_with_the_mean_integrated_out():
                 torch.testing.assert_close(found[column, cell] - offset, one, rtol=1e-6, atol=1e-5)
 
 
-def test_concentrations_are_weighed_with_chances_integrated_out():
+def test_concentrations_are_weighted_with_probabilities_integrated_out():
     """By an urn: each person has a value as often as those before, and as the prior says."""
     prior = torch.tensor([0.2, 0.5, 0.3]).double()
     values = torch.tensor([2, 0, 2, 2, 1])
@@ -139,7 +139,7 @@ def test_the_seed_decides():
     assert torch.equal(one, same) and not torch.equal(one, other)
 
 
-def test_impossible_values_have_small_chances():
+def test_impossible_values_have_small_probabilities():
     """Nobody has a value that the prior hardly allows: its chance has a logarithm all the same."""
     priors = HyperPriors({"sees": torch.tensor([1e-6, 1 - 1e-6])}, 1.0, 0.5, 0.5)
     chances, *_ = sample_population(people(torch.ones_like(SEES)), priors, 50, 0)

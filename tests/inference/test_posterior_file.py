@@ -78,7 +78,7 @@ def test_draws_come_back_as_the_model_samples_them(path, draws):
         assert torch.equal(back[name], value), name
 
 
-def test_a_file_tells_what_it_is_of(path):
+def test_a_file_says_what_it_is_of(path):
     file = load_posterior(path)
     assert file.path == path
     assert file.people == PEOPLE

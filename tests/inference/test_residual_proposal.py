@@ -27,7 +27,7 @@ def human():
 
 @pytest.fixture(scope="module")
 def played(human):
-    """Somebody who changes lanes whenever they can, by a residual twice as large as usual."""
+    """A person who changes lanes whenever they can, by a residual twice as large as usual."""
     generator = torch.Generator().manual_seed(0)
     out = torch.zeros(1, 1, 9, 2)
     out[..., -1, :] = torch.tensor([-0.2, 0.2])

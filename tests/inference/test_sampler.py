@@ -56,7 +56,7 @@ def toy():
 
 @pytest.fixture(scope="module")
 def table(toy):
-    """Somebody who changes lanes at half of their steps."""
+    """A person who changes lanes at half of their steps."""
     recorded = simulate("driving", "fog", people=1, rounds=3, seed=0)
     shape = recorded.actions.shape
     second = (torch.arange(shape.numel()) % 2 > 0).long().view(shape)
@@ -170,7 +170,7 @@ def test_what_is_proposed_has_heavy_tails_and_these_moments():
     assert float(proposal.log_prob(far) - gaussian.log_prob(far)) > 100
 
 
-def test_what_hangs_on_others_is_found(toy):
+def test_sites_that_depend_on_others_are_found(toy):
     assert dependent_sites(toy, scalar_sites(toy)) == ("in_sight",)
     human = HumanModel(SelfModel(get_domain("driving")))
     assert dependent_sites(human, scalar_sites(human)) == ()
@@ -234,7 +234,7 @@ class ByVector(Spread):
 
 
 @pytest.mark.parametrize(("kind", "name"), [(ByKind, "kind"), (ByVector, "sign")])
-def test_priors_that_hang_on_other_sites_count_as_they_are(toy, table, kind, name):
+def test_priors_that_depend_on_other_sites_count_as_they_are(toy, table, kind, name):
     """Half of the prior is Beta(1, 1) and half Beta(60, 60): the posterior by conjugacy."""
     human = kind(toy.self_model)
     assert dependent_sites(human, scalar_sites(human)) == ()

@@ -241,7 +241,7 @@ class RarelyDeaf(Deaf):
 
 
 @torch.no_grad()
-def test_what_is_read_only_where_something_is_told_is_found(self_model, rounds):
+def test_what_is_read_only_with_a_message_is_found(self_model, rounds):
     human = Deaf(self_model)
     assert set(perceived_sites(human)) == {"reach", "hears"}
     everything = torch.ones_like(rounds.told["visual"]) & rounds.mask[..., None]
@@ -276,14 +276,14 @@ class LostInPart(ToyHuman):
         return implants
 
 
-def test_priors_that_hang_on_what_provenance_loses_are_not_fixed(self_model):
+def test_priors_that_depend_on_what_provenance_loses_are_not_fixed(self_model):
     human = LostInPart(self_model)
     assert fixed_prior(human, grid_of(perceived_sites(human))) is None
     check_contract(human)
 
 
 def answering(at, width):
-    """Somebody whose consistency was measured."""
+    """A person whose consistency was measured."""
 
     class Answering(VARIANTS["perceptual-only"]):
         def prior(self):
@@ -349,7 +349,7 @@ class Mine(ToyHuman):
 """
 
 
-def test_a_program_of_a_notebook_is_told_from_its_former_self(self_model):
+def test_a_redefined_program_of_a_notebook_is_another_one(self_model):
     found = []
     for weight in ("0.0", "40.0", "0.0"):
         scope = {"ToyHuman": ToyHuman, "pyro": pyro, "__name__": "a_notebook"}

@@ -49,7 +49,7 @@ def prior_of(human):
     return fixed_prior(human, grid_of(perceived_sites(human)))
 
 
-def test_priors_that_hang_on_others_are_noticed(self_model):
+def test_priors_that_depend_on_others_are_noticed(self_model):
     """Also on a discrete site that is hardly ever 1; the same at every call."""
     assert prior_of(Cautious(self_model)) is None
     state = torch.random.get_rng_state()
@@ -127,7 +127,7 @@ def test_weights_of_sets_are_those_of_all_combinations(self_model, one):
     assert (share - chances).abs().max() < 5 * (0.25 / 4000) ** 0.5
 
 
-def test_those_who_are_rare_are_not_made_common(self_model, one):
+def test_rare_policies_stay_rare(self_model, one):
     for seed in range(3):
         found = infer(Cautious(self_model), one, InferenceOptions(draws=400), seed).draws
         assert float((found["cautious"] == 1).double().mean()) < 0.15

@@ -102,7 +102,7 @@ def drawn(human, number, people=1, seed=0):
 
 
 def geometric(probability):
-    """Chances of each number of failures, by hand."""
+    """Probabilities of each number of failures, by hand."""
     chances = [probability * (1 - probability) ** n for n in range(STEPS)]
     return torch.tensor([*chances, (1 - probability) ** STEPS])
 
@@ -157,7 +157,7 @@ def test_an_item_is_seen_from_when_it_is_noticed(per_item, recordings):
         assert torch.equal(seen[:, place], steps >= first)
 
 
-def test_attention_differs_between_rounds_and_people_and_its_seed_tells_it(per_item):
+def test_attention_differs_between_rounds_and_people_and_follows_its_seed(per_item):
     def play(seed):
         generator = torch.Generator().manual_seed(seed)
         people = prior_people(per_item, 2, torch.Generator().manual_seed(0))
@@ -258,7 +258,7 @@ def test_what_is_kept_stands_for_what_is_not():
     assert abs(totals.mean() - something.sum()) < 5 * error
 
 
-def test_sites_are_proposed_by_those_who_are_likely(per_item):
+def test_sites_are_proposed_by_probable_people(per_item):
     ways = drawn(per_item, 2)
     ways |= {site: torch.tensor([0.2, 0.8]).view(2, 1, 1) for site in NOTICES}
     found = site_probabilities(per_item, ways)
@@ -378,7 +378,7 @@ def test_the_posterior_is_the_exact_one(self_model):
     assert spread < 0.2  # they tell something
 
 
-def test_predictions_take_from_a_round_what_it_has_told(self_model, recordings):
+def test_predictions_condition_on_the_round_so_far(self_model, recordings):
     human, rounds = OneItem(self_model), ragged(recordings, [[15, 6], [9]])
     draws = drawn(human, 2, 2)
     found = predict_actions(human, build_view_table(human, rounds, likely=draws), draws)
@@ -429,7 +429,7 @@ def example(self_model):
 
 
 def test_the_example_is_a_mixture_of_seeing_and_not(self_model, recordings):
-    """Of rounds of somebody who is away with some probability; by the package's own model."""
+    """Of rounds of a person who is away with some probability; by the package's own model."""
     human = example(self_model)
     check_contract(human)
     one = recordings.select_people([0]).select_rounds([0])
@@ -497,7 +497,7 @@ def test_who_acts_as_if_they_saw_has_noticed(self_model, recordings):
 
 
 def test_rare_attention_is_found_out(self_model, recordings):
-    """Of somebody who is hardly ever away, from what only somebody who is would do."""
+    """Of a person who is hardly ever away, from what only a person who is would do."""
     human = example(self_model)
     draws = drawn(human, 200)
     draws |= {"distracted": torch.full((200, 1, 1), 0.02)}
@@ -522,7 +522,7 @@ def test_rare_attention_is_found_out(self_model, recordings):
     assert told > 0
 
 
-def test_a_communicator_plans_for_somebody_who_attends(per_item, recordings):
+def test_a_communicator_plans_for_a_person_who_attends(per_item, recordings):
     someone = Person(per_item, drawn(per_item, 8))
     communicator = Communicator(someone, ExpectedUtility(SelfModelWorld(per_item.self_model), 3))
     for time in (0, 5):
@@ -600,7 +600,7 @@ class ReadsSight(OneRadius):
         return {"away": pyro.sample("away", dist.Bernoulli(chance))}
 
 
-def test_attention_that_hangs_on_what_is_seen_is_refused(self_model, recordings):
+def test_attention_that_depends_on_what_is_seen_is_refused(self_model, recordings):
     """On a value in the middle, too."""
     one = recordings.select_people([0]).select_rounds([0])
     message = '"away" of round_latents depends on a discrete site that perceive'

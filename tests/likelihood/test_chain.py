@@ -236,7 +236,7 @@ def looked_for(table, terminal):
     return int(table.attention.covariates["sought_0"][0, 0]) == terminal - 1
 
 
-def test_somebody_without_rounds_has_a_table(defuser):
+def test_a_person_without_rounds_has_a_table(defuser):
     nobody = recorded().select_rounds([])
     table = build_view_table(defuser, nobody)
     assert predict_actions(defuser, table, draw_prior(defuser, 1, 2, 0)).shape[:2] == (2, 1)
@@ -340,7 +340,7 @@ def test_who_may_break_spans_is_summed_out_as_elsewhere(defuser, kind):
 
 
 @pytest.mark.parametrize("name", ["round_latents", "sees", "perceive"])
-def test_who_changes_what_spans_are_about_declares_them(name):
+def test_models_that_change_what_spans_are_about_declare_them(name):
     """Also where a class beside the one with spans changes it."""
     own = {name: getattr(HumanModel, name)}
     message = f"Own overrides {name} and inherits spans: declare .spans = BombDefusalHuman.spans."

@@ -240,7 +240,7 @@ def test_the_former_name_of_importance(recordings):
     assert [one.filename for one in told] == [__file__] * 2  # of whoever gave it
 
 
-def test_runs_of_one_that_needs_more_than_made_up_rounds_are_told_apart():
+def test_runs_of_one_that_needs_more_than_made_up_rounds_are_distinguished():
     class Particular(ToyHuman):
         def model(self, rounds, world=False):
             raise RuntimeError("of nobody but the recorded")
@@ -249,7 +249,7 @@ def test_runs_of_one_that_needs_more_than_made_up_rounds_are_told_apart():
     assert run_identity(human, None, ["x"]) != run_identity(human, None, ["y"])
 
 
-def test_runs_are_told_apart_by_what_a_program_leans_on_elsewhere():
+def test_runs_are_distinguished_by_what_a_program_uses_elsewhere():
     weight = 1.0
 
     class Leaning(ToyHuman):

@@ -138,7 +138,7 @@ def test_discrete_sites_are_drawn_with_masks(self_model):
 
 
 class LosesProvenance(VARIANTS["per-item"]):
-    """A factor in ``round_latents`` of how far somebody sees, by assignment."""
+    """A factor in ``round_latents`` of how far a person sees, by assignment."""
 
     def round_latents(self, implants):
         latents = super().round_latents(implants)

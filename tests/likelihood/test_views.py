@@ -42,7 +42,7 @@ SIGHTS, ASSUMED = sight_sites(DRIVING), assumption_sites(DRIVING)
 
 
 class Few(HumanModel):
-    """Somebody of whom it is open how far they see ahead in their lane, and what they assume.
+    """A person with unknown sight ahead in their lane, and unknown assumptions.
 
     Of cars that they saw once, they assume that these come closer; of others it is open.
     """
@@ -75,7 +75,7 @@ class Few(HumanModel):
 
 
 class Sure(Few):
-    """Somebody of whom only the policy is open."""
+    """A person of whom only the policy is unknown."""
 
     def prior(self):
         like = next(self.self_model.parameters())
@@ -295,7 +295,7 @@ def test_scores_are_those_of_the_possible_combinations(self_model, recordings):
     whole = build_view_table(human, rounds)
     alive = (torch.arange(14) + torch.arange(3)[:, None]) % 3 == 0
     table = restricted(whole, alive)
-    # Of somebody without rounds nothing is given up.
+    # Of a person without rounds nothing is given up.
     assert torch.equal(table.possible, alive | ~table.real.any(-1)[:, None])
     policy = {name: value[0] for name, value in policies(human, 1, 1).items()}
     likelihoods = log_likelihoods(human, policy, table)
@@ -516,7 +516,7 @@ def test_kinds_of_views_come_as_often_as_stated(many_views):
         assert (share - 1 / bins).abs().max() < 4.5 * standard_error(1 / bins, number)
 
 
-def test_full_views_show_and_tell_everything(many_views):
+def test_full_views_show_and_communicate_everything(many_views):
     plan, _, visible = many_views
     full, _, _ = kinds(plan)
     assert visible["visual"][full].all()
@@ -545,7 +545,7 @@ def test_dropout_views_keep_each_item_at_the_rate_of_the_round(many_views):
     assert torch.corrcoef(rates)[0, 1].abs().item() < 4 / math.sqrt(rates.shape[1])
 
 
-def test_sight_views_show_cars_within_reach_and_what_is_told(many_views):
+def test_sight_views_show_cars_within_reach_and_communicated_items(many_views):
     plan, observation, visible = many_views
     _, _, sight = kinds(plan)
     direction, distance = DRIVING.distance(observation)

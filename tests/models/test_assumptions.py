@@ -179,7 +179,7 @@ def test_only_assumers_take_things_for_granted(many):
         assert (different & taken["visual"])[clear | closing].any()
 
 
-# --- the world of somebody who assumes --------------------------------------------------------
+# --- the world of a person who assumes --------------------------------------------------------
 
 REACH = (2.0, 2.0, 3.0, 0.0)
 
@@ -191,7 +191,7 @@ def lived_by(clear, closing):
 
 
 @pytest.mark.parametrize(("clear", "closing"), BOTH)
-def test_observations_of_somebody_who_assumes_that_cars_come_closer(clear, closing):
+def test_observations_of_a_person_who_assumes_that_cars_come_closer(clear, closing):
     """Each car that was seen comes closer until it is missed where it should be in sight.
 
     The car ahead at 2 cells, at step 3. The others at step 1 already: one abreast in the other lane

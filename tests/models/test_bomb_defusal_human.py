@@ -239,7 +239,7 @@ def test_rules_are_learned_from_rewards_and_planned_with():
     assert again.rule_logits.exp()[:, 0].tolist() == pytest.approx([0.5, 0.5])
 
 
-def test_what_was_done_tells_when_it_was_found(defuser):
+def test_actions_identify_when_it_was_found(defuser):
     observation, _ = course([WAIT] * 4 + [2] + [WAIT] * 3)
     own = {name: value[0] for name, value in observation.items()}
     actions = torch.tensor([WAIT] * 4 + [2] + [WAIT] * 3)
@@ -387,7 +387,7 @@ class Kind(torch.nn.Module):
         return type("Decoded", (), {"mean": belief[..., 5, None, None]})
 
 
-def test_of_rules_the_most_probable_one_is_told():
+def test_of_rules_the_most_probable_one_is_reported():
     human = BombDefusalHuman(load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")[0])
     names = human.value_names["rule_type_b"]
     assert len(names) == len(set(names)) == len(human.exchanges)

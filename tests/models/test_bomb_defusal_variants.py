@@ -88,7 +88,7 @@ def test_policy_alone_sees_all_at_once_and_presses_by_the_rules(robot):
     assert not torch.equal(part.act(own, belief, values), plain.act(own, belief, values))
 
 
-def test_what_rewards_tell_of_the_world_needs_no_implant_of_it(robot):
+def test_what_rewards_identify_of_the_world_needs_no_implant(robot):
     human = variant("perceptual-only", robot)
     assert isinstance(human, BombDefusalHuman) and type(human) is not BombDefusalHuman
     human.fit_world(simulate("bomb_defusal", "labelled", "paper", 3, rounds=20, seed=0))

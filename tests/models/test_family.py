@@ -111,7 +111,7 @@ class Blind(HumanModel):
 
 
 @pytest.mark.parametrize("world", WORLDS[:2])
-def test_beliefs_are_those_of_somebody_who_missed_it_or_forgot_it(world):
+def test_beliefs_are_those_of_a_person_who_missed_it_or_forgot_it(world):
     """Step by step by the package's own model, with views that are made by hand."""
     robot = self_model(world)
     base, noticing, forgetting = HumanModel(robot), Noticing(robot), Forgetting(robot)
@@ -212,8 +212,8 @@ def test_who_shares_no_goal_does_not_look_at_values(driving):
     torch.testing.assert_close(found[..., 1] - found[..., 0], torch.full((1, 5), 1.5))
 
 
-def test_what_does_not_reach_somebody_changes_nothing(driving):
-    """Messages of one channel at a time, to somebody who sees nothing, each of which changes."""
+def test_messages_that_do_not_reach_a_person_change_nothing(driving):
+    """Messages of one channel at a time, to a person who sees nothing, each of which changes."""
     human = HardOfHearing(driving)
     domain, generator = human.domain, torch.Generator().manual_seed(1)
     implants = {name: value[0, :, 0] for name, value in draw_prior(human, 1, 1, 3).items()}
@@ -255,7 +255,7 @@ def of_kind(human, seed, **known):
         ("forgetting", Forgetting, {"consistency": 4.0, FORGETS: 0.7}),
     ],
 )
-def test_kinds_are_told_apart(driving, kind, model, known):
+def test_kinds_are_distinguished(driving, kind, model, known):
     recordings = of_kind(model(driving), 100, **known).select_people([0])
     options = InferenceOptions("importance", 100, ImportanceOptions(proposals=256, enough=100))
     found = infer(AnyKind(driving), recordings, options, 1)
@@ -264,7 +264,7 @@ def test_kinds_are_told_apart(driving, kind, model, known):
     assert (found.pareto_k < 0.7).all()
 
 
-def test_a_fit_tells_the_probability_of_each_model(driving):
+def test_a_fit_reports_the_probability_of_each_model(driving):
     recordings = of_kind(Late(driving), 100, **{LATE: 0.95, "consistency": 4.0})
     few = {"proposals": 256, "enough": 100}
     one = recordings.select_people([0])
@@ -328,7 +328,7 @@ def test_evidence_is_of_actions_alone(driving):
     assert fit.summary["people"][0]["log_evidence"] is None
 
 
-def test_whom_no_channel_reaches_is_told_nothing(driving):
+def test_people_whom_no_channel_reaches_get_no_message(driving):
     """In the moments in which those who hear, alike in all else, are told something."""
     human = HardOfHearing(driving)
     draws = draw_prior(human, 1, 16, 1)

@@ -138,7 +138,7 @@ def test_many_people_perceive_at_once_as_they_do_alone(human, recordings):
             assert torch.equal(together.imagined[name][row], alone.imagined[name][0])
 
 
-def test_what_is_told_is_overlaid_on_what_is_seen(human):
+def test_messages_are_overlaid_on_sight(human):
     observation = looked_at([[5, 9, -3, -4]] * 3)
     told = nothing_told(3)
     told["visual"][0, 1, 0] = True
@@ -157,7 +157,7 @@ def test_what_is_told_is_overlaid_on_what_is_seen(human):
     assert not any(mask.any() for mask in view.taken.values())
 
 
-def test_absent_is_what_was_never_seen_nor_told(human):
+def test_absent_is_what_was_never_seen_nor_communicated(human):
     # Seen at one step, spoken of at one, seen always, never.
     observation = looked_at([[3, 9, -1, -4], [2, 9, -1, -4], [3, 9, -1, -4]])
     told = nothing_told(3)
@@ -376,7 +376,7 @@ def test_masks_of_every_step_are_used(human, recordings):
 @pytest.mark.parametrize("name", ["visual", "verbal"])
 @pytest.mark.parametrize("clear", [0, 1])
 @pytest.mark.parametrize("closing", [0, 1])
-def test_telling_at_a_step_counts_from_that_step_on(human, recordings, name, clear, closing):
+def test_a_message_counts_from_its_step_on(human, recordings, name, clear, closing):
     observation, actions = first_round(recordings)
     implants = sight(clear, closing)
     quiet = perceived(human, implants, observation, nothing_told(STEPS))
@@ -659,7 +659,7 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
         ),
     ],
 )
-def test_broken_contract_is_told_before_any_work(tmp_path, human, method, body, message):
+def test_a_broken_contract_is_reported_before_any_work(tmp_path, human, method, body, message):
     code = f"""
         class Mine(HumanModel):
             def {method}:

@@ -149,7 +149,7 @@ def test_outcomes_of_both_actions_in_full_view():
 
 
 @pytest.mark.parametrize("assuming", [True, False])
-def test_world_of_somebody_who_sees_one_cell_ahead(assuming):
+def test_world_of_a_person_who_sees_one_cell_ahead(assuming):
     plan = fixed_views(DRIVING, 1, torch.Generator(), (1.0, 0.0, 0.0, 0.0))
     assert list(plan.assumes) == ["clear", "closing"] and all(plan.assumes.values())
     plan = replace(plan, assumes=dict.fromkeys(plan.assumes, torch.tensor([assuming])))
@@ -184,7 +184,7 @@ def test_world_of_somebody_who_sees_one_cell_ahead(assuming):
     assert not rounds.visible["verbal"][0, :, 1:].any()
 
 
-def test_whoever_is_told_knows_from_then_on(generator):
+def test_people_know_communicated_items_from_then_on(generator):
     plan = fixed_views(DRIVING, 1, generator, (0.0, 0.0, 0.0, 0.0))
     plan.noise["verbal"][..., 1] = 1.0
     plan.noise["verbal"][0, 1, 0, 1] = 0.0  # the car ahead is spoken of at step 1
@@ -195,7 +195,7 @@ def test_whoever_is_told_knows_from_then_on(generator):
     # Before, it was taken to be absent, of which there is no word.
     assert rounds.visible["verbal"][0, :, 0].tolist() == [False, True, True, True, True]
     assert rounds.visible["visual"].all()
-    # To somebody who does not remember, speech is only of the step at which it is heard.
+    # To a person who does not remember, speech is only of the step at which it is heard.
     open_to_it = dict.fromkeys(plan.assumes, torch.tensor([False]))
     plan = replace(plan, told=told, remembers=torch.tensor([False]), assumes=open_to_it)
     visible = experience(DRIVING, two_cars_near(), STAY4, plan).rounds.visible

@@ -213,7 +213,7 @@ def test_names_of_the_glossary_are_in_the_code():
             assert part in source, name
 
 
-def test_options_and_communicators_of_assist_are_told_as_they_are():
+def test_options_and_communicators_of_assist_are_as_on_the_page():
     text, options = page("docs/communicator.md"), assist.Options()
     shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
     assert shown.pop("communicator") == "all of them" and options.communicator == ()
@@ -224,7 +224,7 @@ def test_options_and_communicators_of_assist_are_told_as_they_are():
     assert tuple(re.findall(r"`([\w-]+)`", first)) == COMMUNICATORS
 
 
-def test_views_of_training_are_told_with_their_shares():
+def test_views_of_training_have_the_shares_of_the_page():
     rows = {row[0]: row for row in table_of(page("docs/self_model.md"), "View")}
     assert SelfModelOptions().kinds == training_views.KIND_PROBABILITIES
     assert "`SelfModelOptions.kinds`" in page("docs/self_model.md")
@@ -240,7 +240,7 @@ def test_views_of_training_are_told_with_their_shares():
         assert page(name).lower().count(share) == 2, name
 
 
-def test_priors_are_told_as_they_are(self_model):
+def test_priors_are_as_on_the_page(self_model):
     human = HumanModel(self_model)
     with pyro.plate("person", 1, dim=-2):
         sites = poutine.trace(human.prior).get_trace().nodes
@@ -265,7 +265,7 @@ def test_priors_are_told_as_they_are(self_model):
     assert rows["residual_out"] == f"Normal(0, {scale:.1f}), 9 x 2"
 
 
-def test_shortcuts_are_told_with_their_tolerances():
+def test_approximations_have_the_tolerances_of_the_page():
     text = page("docs/human_model.md")
     assert f"more than {Screening().margin:.0f} nats" in text
     assert f"of {Screening().policies} policies" in text
@@ -350,7 +350,7 @@ def test_the_example_on_the_page_is_the_file():
     assert any(block.strip() in source for block in blocks(page("docs/extending.md"), "python"))
 
 
-def test_groups_and_variables_of_results_are_told(results):
+def test_groups_and_variables_of_results_are_on_the_page(results):
     import arviz as az
 
     text = page("docs/human_model.md")
@@ -470,7 +470,7 @@ def known(human, people, reach_bin):
 
 
 @torch.no_grad()
-def test_a_late_person_is_told_from_a_prompt_one(self_model, generator):
+def test_a_late_person_is_distinguished_from_a_prompt_one(self_model, generator):
     late_person = type(load_human_model(f"{ROOT}/{EXAMPLE}", self_model))
 
     class InFullView(late_person):

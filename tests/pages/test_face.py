@@ -281,7 +281,7 @@ def test_nothing_is_no_recordings():
         mirror_ppl.infer(None)
 
 
-def test_weights_that_cannot_be_relied_on_are_told(fit, recordings, monkeypatch):
+def test_unreliable_weights_are_reported(fit, recordings, monkeypatch):
     monkeypatch.setattr("mirror_ppl.face.HIGH_PARETO_K", -9.0)
     with pytest.warns(UnreliableWeights, match="weights of person-01 are not to be relied on"):
         found = mirror_ppl.infer(

@@ -145,7 +145,7 @@ def commands_page():
     return module
 
 
-def test_commands_are_in_the_reference_as_their_help_tells_them(commands_page):
+def test_commands_are_in_the_reference_as_in_their_help(commands_page):
     text = commands_page.commands_sections()
     for name in COMMANDS:
         assert f"\n## mirror-ppl {name.replace('_', '-')}\n" in text

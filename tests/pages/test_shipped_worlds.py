@@ -39,7 +39,7 @@ def test_recordings_ship_of_every_setting_and_population(name):
             assert recorded.num_people == 10 and recorded.round_counts.min() == 40
 
 
-def test_who_defuses_bombs_waits_however_long_and_then_presses():
+def test_people_who_defuse_bombs_wait_however_long_and_then_press():
     """By the shipped self-model: beliefs bear forty steps of searching at each stage."""
     human = load_human_model(None, load_self_model(shipped_weights("bomb_defusal"))[0])
     world, model, number, when = human.domain, human.self_model, 600, 40

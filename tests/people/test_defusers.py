@@ -47,7 +47,7 @@ def tell(terminals=(), kind=False):
 
 
 def choices(someone, state, *told, mind_noise=0.9, guess=0.0):
-    """What somebody does at each step, who is unlucky and first takes the bomb for Type A."""
+    """What a person does at each step, who is unlucky and first takes the bomb for Type A."""
     mind_noises = torch.full((1, 1, SimulatedDefusers.mind_noises), mind_noise)
     mind_noises[..., 0] = guess
     memory, done = someone.start(1, mind_noise=mind_noises), []
@@ -60,17 +60,17 @@ def choices(someone, state, *told, mind_noise=0.9, guess=0.0):
     return done
 
 
-def test_who_finds_nothing_waits_and_who_is_shown_it_presses():
+def test_people_who_find_nothing_wait_and_people_who_are_shown_it_press():
     someone = person()
     assert choices(someone, bomb(), *[None] * 4) == [WAIT] * 4
     assert choices(someone, bomb(), None, tell([1, 3]), tell([2]), None) == [WAIT, WAIT, RED, WAIT]
     # What was found counts until the press, and not at the next stage.
     assert choices(someone, bomb(), tell([2]), tell([2]), tell([2])) == [RED] * 3
-    # Luck finds it.
+    # Noise finds it.
     assert choices(someone, bomb(), None, None, mind_noise=0.05) == [RED, RED]
 
 
-def test_the_type_is_a_guess_until_it_is_told():
+def test_the_type_is_a_guess_until_it_is_communicated():
     someone = person()
     for guess, pressed in ((0.2, RED), (0.8, YELLOW)):
         assert choices(someone, bomb(0), tell([2]), tell([2]), guess=guess) == [pressed] * 2
@@ -176,7 +176,7 @@ def test_branches_are_all_that_chance_may_decide():
     assert someone.kept(memory).mind_noise.shape == (1, 1, 0)
 
 
-def test_an_oracle_tells_what_is_worth_it():
+def test_an_oracle_communicates_what_gains():
     """Shown the lit terminal at each stage (0.3) and told the type at the first (0.5): 10.6."""
     state = bomb(1, 2)
     oracle = ReachableOracle(person(0.05), map_state(lambda part: part[0], state))

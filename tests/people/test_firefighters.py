@@ -166,7 +166,7 @@ def test_goals_are_kept_until_reached_or_ruled_out():
 # --- what is told -----------------------------------------------------------------------------
 
 
-def test_who_is_told_where_the_victim_is_thinks_again():
+def test_people_informed_of_the_victims_room_choose_anew():
     liked = torch.full((1, 8, 6, 6), 1e-9)
     liked[:, ALL, HOME, LEFT] = 1.0  # as long as they know nothing
     liked[:, 4, HOME, RIGHT] = 1.0  # with the victim at the top right
@@ -190,7 +190,7 @@ def test_who_is_told_where_the_victim_is_thinks_again():
     assert int(after.goal) == TOP_MIDDLE
 
 
-def test_told_of_an_obstacle_they_take_the_other_corridor():
+def test_people_informed_of_an_obstacle_take_the_other_corridor():
     someone = person()
     told = message(verbal=["left corridor"])
     _, memory = looking(someone, (7, 3), wanting(LEFT), told, blocked=1)
@@ -212,7 +212,7 @@ def test_they_see_by_radius_and_hear_nothing():
 # --- chance -----------------------------------------------------------------------------------
 
 
-def test_luck_chooses_actions_with_their_probabilities():
+def test_action_noise_chooses_actions_with_their_probabilities():
     chances = torch.tensor([0.1, 0.0, 0.6, 0.3])
     action_noise = (torch.arange(1000) + 0.5) / 1000
     counts = torch.bincount(act(chances.expand(1000, 4), action_noise), minlength=4)
@@ -222,7 +222,7 @@ def test_luck_chooses_actions_with_their_probabilities():
     assert two.tolist() == [1, 0]
 
 
-def test_fate_chooses_goals_with_their_probabilities(seed):
+def test_mind_noise_chooses_goals_with_their_probabilities(seed):
     generator = torch.Generator().manual_seed(seed)
     liked = torch.rand(1, 8, 6, 6, generator=generator) + 0.1
     someone, number = person(transitions=liked), 20_000
@@ -315,7 +315,7 @@ def test_habits_and_patience_are_learned_from_rounds():
         assert share(learned, *case).tolist() == pytest.approx(expected, abs=0.12), case
 
 
-def test_ways_are_as_long_as_somebody_knows():
+def test_ways_are_as_long_as_a_person_knows():
     """With patience 1 and no habits, the odds of the corridors are e to the steps by which."""
     liked = transitions_of(torch.zeros(1, 6, 6), torch.ones(1))[0].log()
     odds = liked[:, HOME, LEFT] - liked[:, HOME, RIGHT]

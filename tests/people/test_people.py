@@ -110,13 +110,13 @@ def test_a_car_seen_once_is_assumed_to_come_closer(position, assumed):
 
 
 @pytest.mark.parametrize("speed", [-1.0, 1.0])
-def test_two_sightings_tell_the_speed(speed):
+def test_two_sightings_give_the_speed(speed):
     memory = watch(see(5, 9, -9, -9), see(5 + int(speed), 9, -9, -9))
     assert car(memory) == (True, 5 + speed, speed, False)
 
 
 @pytest.mark.parametrize("speed", [-1, 1])
-def test_two_sightings_tell_the_speed_whatever_lies_between(speed):
+def test_two_sightings_give_the_speed_whatever_lies_between(speed):
     places = [5, 5 + speed, 5 + 2 * speed, 5 + 3 * speed]
     shown = {0: tell(visual=[0]), 3: tell(visual=[0])}
     memory = watch(*(see(place, 9, -9, -9) for place in places), reach=NOTHING, told=shown)
@@ -156,7 +156,7 @@ def test_a_known_speed_is_never_given_up():
     assert car(memory) == (True, 0.0, -1.0, False)
 
 
-def test_an_utterance_tells_position_and_speed():
+def test_an_utterance_gives_position_and_speed():
     world = see(7, 9, -6, -9, speed=(1, 1, -1, 1))
     memory = watch(world, reach=FOG, told={0: tell(verbal=[0, 2])})
     assert car(memory, 0) == (True, 7.0, 1.0, False)
@@ -244,7 +244,7 @@ def test_drivers_in_fog_do_not_react_to_what_they_cannot_see(fog_drivers):
     assert not torch.equal(seen, drive(clear, (6, 1, -9, -4), speed, actions))
 
 
-def test_drivers_react_to_what_they_are_told(fog_drivers):
+def test_drivers_react_to_messages(fog_drivers):
     # A car of the own lane is 3 cells ahead and comes closer; the other lane is free.
     world = ((3, 11, -11, -11), (-1, 1, -1, -1), [0])
     unaware = drive(fog_drivers, *world)[:, 0, 1]
@@ -257,7 +257,7 @@ def test_drivers_react_to_what_they_are_told(fog_drivers):
     assert torch.equal(silence, unaware)
 
 
-def test_drivers_act_later_on_what_they_were_told_once(fog_drivers):
+def test_drivers_act_later_on_earlier_messages(fog_drivers):
     # The car is at 11 when spoken of, and at 3, still out of sight, eight steps later.
     world = ((11, 11, -11, -11), (-1, 1, -1, -1), [0] * 9)
     told = [tell(verbal=[0])] + [tell()] * 8
@@ -451,7 +451,7 @@ def test_the_same_call_gives_the_same_recordings(fog):
 
 
 @pytest.mark.parametrize("domain", list(DOMAINS))
-def test_what_is_told_is_recorded_and_comes_about_as_often_as_asked_for(domain):
+def test_messages_are_recorded_and_as_frequent_as_asked_for(domain):
     """Of what can be told; the people are the same, and the rounds begin alike."""
     quiet = simulate(domain, people=2, rounds=20, seed=0)
     spoken_to = simulate(domain, people=2, rounds=20, seed=0, told=0.1)
@@ -468,7 +468,7 @@ def test_what_is_told_is_recorded_and_comes_about_as_often_as_asked_for(domain):
     assert spoken_to.provenance["told"] == 0.1 and "told" not in quiet.provenance
 
 
-def test_what_is_told_is_a_probability():
+def test_the_rate_of_messages_is_a_probability():
     with pytest.raises(ValueError, match="told must be from 0 to 1, not 2"):
         simulate(people=1, rounds=1, told=2.0)
 

@@ -227,7 +227,7 @@ def a_round(*messages):
     return past
 
 
-def test_share_known_is_of_what_was_seen_or_told_so_far():
+def test_share_known_counts_items_seen_or_communicated_so_far():
     # One of four sees two cells ahead, the others nothing; front-left comes from 3 cells ahead.
     bin_of_two = list(DOMAIN.reach_bins).index(2.0)
     someone = person(4, front_own=[bin_of_two, 0, 0, 0])
@@ -262,7 +262,7 @@ def test_share_seen_is_by_lane_and_distance():
 
 
 def knowledge(steps):
-    """Somebody who thinks from the start that front-left is 5 cells ahead."""
+    """A person who thinks from the start that front-left is 5 cells ahead."""
     memory = Memory.empty((steps,))
     known, position = memory.known.clone(), memory.position.clone()
     known[:, 0], position[:, 0] = True, 5.0
@@ -345,7 +345,7 @@ def stars(ax):
     return sum(line.get_marker() == (9, 1, 0) for line in ax.lines)
 
 
-def test_a_collision_is_told():
+def test_a_collision_is_marked():
     state = scene([0], [[1, 9, -4, -9]], [[-1, 1, 1, -1]])
     past = RoundSoFar.begin(DOMAIN, observed(state))
     following = DOMAIN.transition(state, torch.tensor([0]))

@@ -233,7 +233,7 @@ def test_outlines_are_drawn_where_the_truth_is_known(data):
     assert known - unknown == 2  # a line and its dark edge
 
 
-def test_explanation_tells_of_the_truth_only_where_there_is_one(rng):
+def test_explanation_mentions_the_truth_only_where_there_is_one(rng):
     for known in (True, False):
         data = made_up(rng, with_truth=known)
         texts = [text.get_text() for text in sight_picture(data).legends[0].get_texts()]
