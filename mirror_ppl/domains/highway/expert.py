@@ -45,7 +45,7 @@ class ExpertOptions:
         speeds: m/s, in shares of the speed limit, that it considers in each lane.
     """
 
-    horizon: int = 20
+    horizon: int = 30
     speeds: tuple[float, ...] = (0.0, 0.5, 0.8, 0.97)
 
     def __post_init__(self) -> None:
