@@ -45,8 +45,8 @@ class ExpertOptions:
         speeds: m/s, in shares of the speed limit, that it considers in each lane.
     """
 
-    horizon: int = 30
-    speeds: tuple[float, ...] = (0.0, 0.5, 0.8, 0.97)
+    horizon: int = 20
+    speeds: tuple[float, ...] = (0.0, 0.6, 0.97)
 
     def __post_init__(self) -> None:
         if self.horizon < 1 or not self.speeds:

@@ -87,7 +87,7 @@ _CUTS_IN = Car(
 )  # fmt: skip
 _MAKES_ROOM = Car((40.0, 55.0), (11.0, 12.0))
 _FAST_BEHIND = Car((-75.0, -55.0), (15.0, 17.0), headway=0.3)
-_OVERTAKES = Car((-60.0, -40.0), (15.0, 17.0), headway=0.5)
+_OVERTAKES = Car((-45.0, -30.0), (15.0, 17.0), headway=0.5)
 _CRAWLS = Car((70.0, 90.0), (1.5, 3.0))
 _SLOW_AHEAD = Car((35.0, 45.0), (5.0, 6.5))
 _LEFT, _RIGHT = (1, 2), (0, 1)
@@ -102,10 +102,10 @@ SCENARIOS: Mapping[str, Scenario] = {
     ),
     "fast car behind": Scenario({"rear": _FAST_BEHIND}),
     "fast car on the left, slow one ahead": Scenario(
-        {"rear-left": _OVERTAKES, "front": _SLOW_AHEAD}, _LEFT
+        {"rear-left": _OVERTAKES, "front-left": _MAKES_ROOM, "front": _SLOW_AHEAD}, _LEFT
     ),
     "fast car on the right, slow one ahead": Scenario(
-        {"rear-right": _OVERTAKES, "front": _SLOW_AHEAD}, _RIGHT
+        {"rear-right": _OVERTAKES, "front-right": _MAKES_ROOM, "front": _SLOW_AHEAD}, _RIGHT
     ),
     "braking ahead, fast car behind": Scenario({"front": _BRAKES, "rear": _FAST_BEHIND}),
 }

@@ -59,16 +59,16 @@ def test_it_does_not_foresee_manoeuvres():
 
 
 def test_it_gets_around_a_crawling_car_that_hits_whoever_coasts():
-    """Four seconds of four rounds with a short horizon; whoever does nothing has an accident."""
+    """Two seconds of four rounds with a short horizon; whoever does nothing has an accident."""
     generator = torch.Generator().manual_seed(0)
     index = torch.full((4,), WORLD.scenarios.index("car ahead crawls"))
     start = WORLD.initial(4, generator, index)
     x = start.x.clone()
-    x[:, 1] = 30.0
+    x[:, 1] = 18.0
     options = expert.ExpertOptions(horizon=14, speeds=(0.0, 0.97))
     now = idle = replace(start, x=x)
     ahead = 0.0
-    for _ in range(20):
+    for _ in range(12):
         gained = []
         for state, action in ((now, expert.act(now, options)), (idle, torch.zeros(4, 2))):
             following = WORLD.transition(state, action)
@@ -77,7 +77,7 @@ def test_it_gets_around_a_crawling_car_that_hits_whoever_coasts():
         (now, own), (idle, other) = gained
         ahead += own - other
     assert idle.over.all() and not now.over.any()
-    assert ahead > 30  # of 40 that an accident costs
+    assert ahead > 25  # of 40 that an accident costs
 
 
 def test_any_batch():

@@ -111,8 +111,8 @@ def test_idm_by_hand():
 
 def test_a_car_follows_at_the_distance_of_the_idm():
     """Behind a car at 8 m/s: speeds agree, and the gap is that of no acceleration."""
-    cars = [(60.0, 0.0, 0.0, 8.0), (0.0, 0.0, 0.0, 11.0)]
-    end = play(state_of((0.0, 8.0, 0.0, 8.0), cars), steps=200)
+    cars = [(35.0, 0.0, 0.0, 8.0), (0.0, 0.0, 0.0, 11.0)]
+    end = play(state_of((0.0, 8.0, 0.0, 8.0), cars), steps=100)
     assert end.speed[2].item() == pytest.approx(8.0, abs=0.05)
     gap = (10 + 8 * 1.5) / math.sqrt(1 - (8 / 11) ** 4)
     assert (end.x[1] - end.x[2]).item() == pytest.approx(gap, abs=0.5)
@@ -234,49 +234,62 @@ def test_cars_start_apart_on_their_lanes(name, generator):
     assert apart.min() > 2 * LENGTH - 1e-3
 
 
+@pytest.fixture(scope="module")
+def coasting():
+    """States ``[T + 1, scenarios, 25]`` of rounds in which the ego keeps its speed and lane."""
+    many = len(WORLD.scenarios)
+    index = torch.arange(many).repeat_interleave(25)
+    states = [WORLD.initial(len(index), torch.Generator().manual_seed(0), index)]
+    for _ in range(STEPS):
+        states.append(play(states[-1]))
+    return each(lambda *parts: torch.stack(parts).unflatten(1, (many, 25)), *states)
+
+
+def of(coasting, name):
+    """States ``[T + 1, 25]`` of one scenario."""
+    return each(lambda part: part[:, WORLD.scenarios.index(name)], coasting)
+
+
 def share(condition):
     return condition.float().mean().item()
 
 
-def test_the_car_ahead_brakes(generator):
-    start = rounds("car ahead brakes", 40, generator)
-    least = start.speed[:, 1]
-    state = start
-    for _ in range(70):
-        state = play(state)
-        least = torch.minimum(least, state.speed[:, 1])
-    went_on = ~state.crashed
-    assert share(state.crashed) > 0.3  # whoever coasts
-    assert (least[went_on] < 3.5).all()
+def test_the_car_ahead_brakes(coasting):
+    state = of(coasting, "car ahead brakes")
+    assert share(state.crashed[-1]) > 0.3  # whoever coasts
+    least = state.speed[..., 1].amin(0)
+    assert (least[~state.crashed[-1]] < 3.5).all()
 
 
 @pytest.mark.parametrize(("side", "car"), [("left", 5), ("right", 3)])
-def test_a_car_cuts_in(side, car, generator):
-    """Of rounds without a collision of a coasting ego, the car is in its lane soon after."""
-    state = rounds(f"car on the {side} cuts in", 40, generator)
-    lane = state.lane[:, 0]
-    began = torch.zeros(40, dtype=torch.bool)
-    arrived = began
-    for _ in range(70):
-        state = play(state)
-        began = began | (state.begun[:, car] < NEVER)
-        arrived = arrived | (began & (state.lane[:, car] == lane))
-    assert share(began) > 0.9 and share(arrived | state.crashed) > 0.9
+def test_a_car_cuts_in(side, car, coasting):
+    """It is in the ego's lane soon after, if it does not hit the ego before."""
+    state = of(coasting, f"car on the {side} cuts in")
+    began = state.begun[..., car] < NEVER
+    arrived = began & (state.lane[..., car] == state.lane[..., 0])
+    assert (began[0] == 0).all() and share(began.any(0)) > 0.9
+    assert share(arrived.any(0) | state.crashed[-1]) > 0.9
 
 
 @pytest.mark.parametrize("name", ["fast car behind", "braking ahead, fast car behind"])
-def test_a_fast_car_comes_close_from_behind(name, generator):
-    start = rounds(name, 40, generator)
-    least, state = -start.x[:, 4], start
-    for _ in range(70):
-        state = play(state)
-        least = torch.minimum(least, state.x[:, 0] - state.x[:, 4])
-    assert share((least < 20) | state.crashed) > 0.9
+def test_a_fast_car_comes_close_from_behind(name, coasting):
+    state = of(coasting, name)
+    gap = (state.x[..., 0] - state.x[..., 4]).amin(0)
+    assert share((gap < 20) | state.crashed[-1]) > 0.9
 
 
-def test_who_coasts_behind_a_crawling_car_hits_it(generator):
-    state = play(rounds("car ahead crawls", 40, generator), steps=STEPS)
-    assert share(state.crashed) > 0.9
+@pytest.mark.parametrize(("side", "car"), [("left", 5), ("right", 3)])
+def test_a_fast_car_passes_on_the_side_to_which_the_ego_would_escape(side, car, coasting):
+    """Behind at first and ahead before the ego reaches the slow car in front of it."""
+    state = of(coasting, f"fast car on the {side}, slow one ahead")
+    ahead = state.x[..., car] - state.x[..., 0]
+    assert (ahead[0] < -25).all() and share(ahead.amax(0) > 0) > 0.5
+    assert (state.lane[0, :, car] - state.lane[0, :, 0] == (-1 if side == "left" else 1)).all()
+    assert share(state.crashed[-1]) > 0.9
+
+
+def test_who_coasts_behind_a_crawling_car_hits_it(coasting):
+    assert share(of(coasting, "car ahead crawls").crashed[-1]) > 0.9
 
 
 def test_calm_traffic_does_nothing_unusual(generator):
