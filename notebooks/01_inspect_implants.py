@@ -15,27 +15,26 @@
 # %% [markdown]
 # # What can this person see, and how do they decide?
 #
-# A robot knows how to drive on a road with two lanes. It has watched ten people drive there in
-# fog: what there was to see, and what they did. Nobody recorded what they *saw*. This notebook
-# infers it for each person, together with how they decide, and asks whether to believe the
-# answer.
+# This tutorial is for researchers who recorded people in a task. You have their actions and what
+# could be observed at each step, but not what they *saw*. The notebook infers that for each
+# person, together with how they decide, and checks the model against the data.
 #
-# The people are simulated, so the truth is known and stands beside what was inferred. With your
-# own recordings everything works the same, without the truth; `docs/demonstrations.md` shows how
-# to write them.
+# The example has ten simulated people who drive on a road with two lanes in fog, so the truth is
+# known and shown beside the estimates. With your own recordings
+# ([format](../docs/demonstrations.md)) only the first cell below changes.
 #
-# The model in one sentence: a person is the robot's own model of the world, with **implants**
-# that limit what they see and change how they choose.
+# A person is modelled as the robot's own networks with **implants**, sample sites in which this
+# person may differ:
 #
-# | Implant | Question |
+# | Implant | Meaning |
 # |---|---|
-# | `sight_front_own`, `sight_front_other` | How many cells ahead do they see, by lane? |
-# | `sight_back_own`, `sight_back_other` | How many cells behind? |
-# | `assumes_clear` | Is a car that they never saw absent to them (1), or may it be there (0)? |
-# | `assumes_closing` | Does a car that they saw once come closer (1), or maybe not (0)? |
-# | `consistency` | How strictly do they choose the better action? |
-# | `lapse` | How often do they act without regard to what they believe? |
-# | `residual_...` | What else sets their choices apart? (Weights of a small network.) |
+# | `sight_front_own`, `sight_front_other` | cells that they see ahead, by lane |
+# | `sight_back_own`, `sight_back_other` | cells that they see behind |
+# | `assumes_clear` | whether a car that they never saw is absent to them (1) or may be there (0) |
+# | `assumes_closing` | whether a car that they saw once comes closer (1) or may go either way (0) |
+# | `consistency` | how strictly they choose the better action |
+# | `lapse` | probability of an action independent of their belief |
+# | `residual_...` | weights of a small network for all other differences in their choices |
 
 # %%
 import os
@@ -57,9 +56,8 @@ quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
 # %% [markdown]
 # ## Recordings
 #
-# Ten simulated people who differ in how far they see. (In the population `paper` all of them see
-# two cells ahead and nothing behind.) Each drove 40 rounds of 15 steps. Rounds 1 to 20 are learned
-# from, rounds 31 to 36 are held out. For your own file: `load_recordings("recordings.nc")`.
+# Ten people with 40 rounds of 15 steps each; how far they see differs. Rounds 1 to 20 are for
+# training, 31 to 36 are held out. Your own file: `load_recordings("recordings.nc")`.
 
 # %%
 recordings = mirror_ppl.load_recordings(setting="fog", population="diverse")
@@ -70,10 +68,9 @@ recordings
 # %% [markdown]
 # ## Fit
 #
-# `infer` conditions the human model, a Pyro program, on the recordings. To study another kind of
-# person, derive a class from `mirror_ppl.HumanModel`, override `prior`, `perceive`, `believe` or
-# `act`, and give it as `human=`. Fitting takes less than a minute. On the command line:
-# `python -m mirror_ppl.fit --setting fog --population diverse`.
+# `infer` conditions the human model, a Pyro program, on the recordings. It takes less than a
+# minute here. The command is `python -m mirror_ppl.fit --setting fog --population diverse`. For
+# another human model see notebook 04.
 
 # %%
 settings = {"draws": 20, "train_rounds": 4, "explore": 1} if quick else {}
@@ -81,9 +78,9 @@ fit = mirror_ppl.infer(recordings, **settings)
 fit
 
 # %% [markdown]
-# `fit.data` is an ArviZ `InferenceData`: draws from the prior and the posterior, what either
-# predicts, and what was recorded. `fit.save(folder)` writes it as netCDF, with a summary and
-# pictures. The file opens in any ArviZ tool without this package.
+# `fit.data` is an ArviZ `InferenceData` with prior and posterior draws, predictions and
+# recordings. `fit.save(folder)` writes it as netCDF, with a summary and pictures. ArviZ opens the
+# file without this package.
 
 # %%
 data = fit.data
@@ -92,26 +89,25 @@ for group in data.groups():
     print(f"{group}: {', '.join(names)}")
 
 # %% [markdown]
-# ## The road as each person sees it
+# ## What each person sees
 #
-# The road from above. A cell is light where the model is sure that the person sees a car, dark
-# where it is sure that they do not, and in between where the recordings do not tell. The orange
-# line surrounds what the person really sees.
+# The road from above. Brightness is the posterior probability that the person sees a car in a
+# cell: bright for seen, dark for not seen, grey where the data do not identify it. The orange line
+# surrounds what the person truly sees.
 
 # %%
 fit.plot.sight()
 
 # %% [markdown]
-# Sight ahead in the own lane is known best, above all where it is short: when a person drives up
-# to a car, the moment at which they leave the lane gives away when they saw it. Beyond three or
-# four cells the shades turn grey, since there is no hurry yet: who sees a car that far off, and
-# who does not, act alike. Cars in the other lane matter only to those who think about changing
-# lanes, so there, too, less is known.
+# Short sight ahead in the own lane is identified best: the step at which a driver leaves the lane
+# shows when they saw the car. Beyond three or four cells seeing and not seeing lead to the same
+# actions. Cars in the other lane matter only to drivers who consider a change of lanes, so their
+# sight there is identified less well.
 #
 # ## One person
 #
-# Each implant before (grey) and after (blue) seeing this person act. Where blue looks like grey,
-# nothing was learned.
+# Prior (grey) and posterior (blue) of each implant. Where they coincide, the data were not
+# informative.
 
 # %%
 person = "person-09"
@@ -121,9 +117,9 @@ fit.plot.implants(person)
 fit.person(person).implants.round(2)
 
 # %% [markdown]
-# ArviZ gives the mean, the standard deviation and the 90% highest-density interval. `kind="stats"`
-# leaves out effective sample size and r-hat: they are about Markov chains, and these draws come
-# from none.
+# `az.summary` gives mean, standard deviation and 90% highest-density interval. `kind="stats"`
+# leaves out effective sample size and r-hat, which describe Markov chains; these draws are
+# independent.
 
 # %%
 import arviz as az
@@ -140,13 +136,12 @@ numbers["truth"] = fit.person(person).implants["truth"]
 numbers.round(2)
 
 # %% [markdown]
-# ## What they did, and what was predicted
+# ## Actions and predictions
 #
-# The round in which this person changed lanes most often. Each lane is drawn over time, with
-# distance from the person upwards: a car that falls behind moves down. The shades are those of the
-# road above, so a car that leaves the dark comes into sight. The lowest panel shows how probable a
-# change of lanes was, by the posterior, at each step, and what the person did. Picked for its many
-# changes, the round holds some that nobody could have foreseen.
+# The round in which this person changed lanes most often. Each panel is a lane over time; distance
+# from the person points upwards, and brightness is the probability of sight as above. The lowest
+# panel shows the predicted probability of a change at each step and what the person did. The round
+# is selected for its many changes, so some are surprising.
 
 # %%
 from mirror_ppl.domains.driving.rounds import lane_changes
@@ -155,30 +150,28 @@ changes = lane_changes(data, "observed_data")
 fit.plot.round(person, int(changes.sel(person=person).values.argmax()))
 
 # %% [markdown]
-# A round that was not learned from:
+# A held-out round:
 
 # %%
 fit.plot.round(person, 2, held_out=True)
 
 # %% [markdown]
-# ## Does the model fit these people?
+# ## Does the model describe these people?
 #
-# **Before and after learning.** Left: how often each person changes lanes, and how often the
-# model says that they do. The prior leaves much room, and the posterior narrows it down around
-# what was observed. Right: a prediction is *calibrated* if, of all steps for which it says "they
-# switch with probability 0.3", 30% are switches; then the dots lie on the dotted line. Bars are
-# 90% intervals.
+# **Predictive checks.** Left: changes of lanes per person, observed and predicted; the prior is
+# wide, the posterior concentrates near the observations. Right: calibration of predictions. Of all
+# steps for which the model predicts "switch" with probability 0.3, 30% should be switches (dotted
+# line). Bars are 90% intervals.
 
 # %%
 fit.plot.predictive_check()
 
 # %% [markdown]
-# **Person by person.** Every fit compares what each person did with 2,000 replicates from the
-# posterior predictive: how often they switch, whether they act as the model said one step
-# *before*, what their actions earn, how surprising they are. Dark cells would be people who do
-# more (blue) or less (red) of something than the model says; frames mark p-values that make a
-# person *suspect*. Right: held-out actions as the model predicts them, beside
-# how often the person chose each action before, and beside the robot without implants.
+# **Model check of each person.** Posterior predictive p-values compare the recorded actions with
+# 2,000 replicates: how often the person switches, whether actions fit the prediction of one step
+# earlier, reward, surprise. Dark cells are statistics of which a person has more (blue) or less
+# (red) than predicted; a frame marks a *suspect* person. Right: held-out NLL beside the base rate
+# of each action and the robot without implants.
 
 # %%
 fit.plot.check()
@@ -187,17 +180,13 @@ fit.plot.check()
 fit.check.drop(columns="reasons").round(3)
 
 # %% [markdown]
-# *All of these people drive as the model says. `docs/trust.md` shows some who do not, and what
-# the check misses.*
+# *No person is suspect. [Trust in a posterior](../docs/trust.md#model-check) shows people who are,
+# and what the check misses.*
 #
-# The same check with ArviZ's own tools. Each line is what ten people might have done, by one draw
-# of the prior (left) or the posterior (right): the share of people with at most so many lane
-# changes a round. The black line is what they did.
-#
-# Each action is predicted from what had happened until then, as recorded. Averages over rounds
-# can therefore be compared with what people did. The spread between rounds cannot: who has
-# changed lanes just now need not do it again, but a prediction does not know what the one before
-# it was.
+# ArviZ's own plots take the same groups. Each line is one draw from the prior (left) or the
+# posterior (right) predictive: the share of people with at most so many lane changes per round.
+# The black line is the data. Actions are predicted given the recorded history, so averages over
+# rounds are comparable with the data; the spread between rounds is not.
 
 # %%
 import matplotlib.pyplot as plt
@@ -216,7 +205,7 @@ plt.show()
 
 # %% [markdown]
 # A Bayesian p-value of the average over all people: the share of posterior predictive draws below
-# the observed average (the dot). Values near 0 or 1 would be a warning.
+# the observed average (dot). Values near 0 or 1 would indicate misfit.
 
 # %%
 figure, ax = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
@@ -224,17 +213,13 @@ az.plot_bpv(checks, kind="t_stat", t_stat="mean", ax=ax, textsize=11)
 plt.show()
 
 # %% [markdown]
-# ## How well are held-out actions predicted?
+# ## Held-out prediction
 #
-# `held-out` is the negative log-likelihood of the actions in rounds that were not learned from,
-# in nats an action: lower is better, and guessing costs 0.69. `floor` is the entropy of the
-# simulated person's own choices: nobody can expect to predict better. (Over a few rounds one may,
-# by chance.)
-#
-# `leave-one-out` estimates the same from the rounds that were learned from, by ArviZ's PSIS-LOO
-# with a round as the unit; `its floor` is that of these rounds. It weights the draws as if one
-# round had not been seen. Where a few draws get most of the weight, the estimate is not to be
-# trusted: `doubtful` says for how many rounds. The held-out rounds need no such care.
+# `held-out` is the negative log-likelihood (NLL) of held-out actions in nats an action; a uniform
+# guess has 0.69. `floor` is the entropy of the simulated person's choices, which no prediction can
+# beat in expectation. `leave-one-out` is ArviZ's PSIS-LOO over training rounds, and `its floor`
+# the entropy in these rounds. `doubtful` counts the rounds whose Pareto *k* makes it unreliable;
+# held-out rounds have no such limit.
 
 # %%
 rows = []
@@ -270,11 +255,11 @@ print(f"held-out {average['held-out']:.3f}, floor {average['floor']:.3f} nats an
 # %% [markdown]
 # ## What to keep in mind
 #
-# - What is not known looks grey. Do not read a reach off the picture where its edge is blurred;
-#   read the interval.
-# - Blindness and habit can look alike. Somebody who ignores cars that they see acts like somebody
-#   who does not see them. The prior of the residual keeps such habits small, and `assumes_clear`
-#   says what people make of what they do not see; a wrong assumption there makes the model sure
-#   of a wrong reach.
-# - These people are simulated, and simpler than real ones: they see perfectly up to their reach,
-#   forget nothing, and react at once.
+# - Report intervals, not the edge of a grey area.
+# - A person who ignores cars acts like one who does not see them. The prior keeps the policy
+#   residual small, so that it does not replace sight; a wrong `assumes_clear` biases sight.
+# - These people are simulated. They see perfectly up to their reach, forget nothing and react at
+#   once.
+#
+# Next: a robot that plans messages to such a person (notebook 02), calibration and model
+# comparison (03), your own human model (04).

@@ -13,19 +13,19 @@
 # ---
 
 # %% [markdown]
-# # What should the robot tell this person, and when?
+# # Plan a robot's messages to one person
 #
-# A person drives on a road with two lanes, in fog. They see two cells ahead and nothing behind.
-# The robot sees the whole road. At each step it may show them cars, speak of cars, or be silent.
-# To show *n* cars costs 0.01 n², to speak of *n* cars costs 0.03 n². Who is told nothing runs into
-# cars; who is told everything pays for it.
+# This tutorial is for roboticists. Your robot observes more than the person whom it assists, and
+# may communicate: here it may show cars or speak of them. It needs to know which message to send,
+# and when to be silent.
 #
-# From twenty recorded rounds the robot has inferred what this person sees and how they decide
-# (notebook 01 looks at that). Here it plans with it. For each message that it could send it asks:
-# what would this person believe, what would they do, and how would that end?
+# The example is a simulated person who drives in fog and sees two cells ahead and nothing behind.
+# Showing *n* cars in a step costs 0.01 n², *n* utterances cost 0.03 n². From recorded rounds the
+# robot has inferred what this person sees and how they decide (notebook 01). For each candidate
+# message it predicts beliefs, actions and return.
 #
-# We send messages by hand, replay a round with and without them, look closely at one decision, and
-# compare a few ways to speak.
+# The notebook calls the communicator from a loop of your own, replays a round with and without
+# messages, explains one decision, and compares communicators.
 
 # %%
 import os
@@ -48,39 +48,42 @@ torch.set_num_threads(1)
 quick = os.environ.get("MIRROR_PPL_QUICK") == "1"
 
 # %% [markdown]
-# ## The person, as the robot knows them
+# ## The person
 #
-# One of the ten people in the recordings that ship. The communicator plans with 64 draws from
-# their posterior. So it has not one opinion of what they see, but 64, and messages have to be
-# worth sending on average over these.
+# One of the ten people who ship. The communicator plans with 64 posterior draws of this person; a
+# message has to gain on average over these.
 
 # %%
 domain = get_domain("driving")
 recordings = mirror_ppl.load_recordings(setting="fog").select_people(["person-01"])
-settings = {"draws": 16, "train_rounds": 10} if quick else {"draws": 64}
+settings = {"draws": 8, "train_rounds": 4} if quick else {"draws": 64}
+if quick:
+    recordings = recordings.select_rounds(slice(0, 6))
 fit = mirror_ppl.infer(recordings, explore=0, **settings)
 fit.person().implants.round(2)
 
 # %% [markdown]
 # ## The communicator
 #
-# It plans messages for one person of a fit. The planner `mirror`, the default, looks for reward in
-# the domain's own simulator. `planner="mirror-self-model"` looks for it in what the robot has
-# learned of the world, and `planner="mirror-kl"` brings the person's belief close to the robot's.
+# The default planner, `mirror`, maximizes reward in the domain's own simulator.
+# `planner="mirror-self-model"` uses the world that the robot learned; `planner="mirror-kl"` brings
+# the person's belief close to the robot's. With a saved fit,
+# `mirror_ppl.Communicator("runs/demo/posterior.nc", "person-01")` is enough.
 
 # %%
 communicator = mirror_ppl.Communicator(fit)
 person = communicator.person
 
 # %% [markdown]
-# ## In your own simulator, or on your robot
+# ## In your simulator or robot
 #
-# No loop owns the world. `plan` is a function of the round so far: what there was to observe, what
-# the person was told, and what they did. You say what happened, it says what to tell them.
+# `plan` is a function of the round so far: observations, messages and actions. Your code reports
+# what happened and gets the message for now.
 #
-# Here is a road by hand. The person is in the left lane. A car 4 cells ahead of them slows down,
-# one 5 cells behind comes closer, and two are in the other lane. `domain.observe` writes that down
-# as tensors; on a robot, your perception does (`docs/driving.md` says what is in them).
+# Here is a state by hand. The person is in the left lane. A car 4 cells ahead comes closer, one 5
+# cells behind comes closer, and two are in the other lane. `domain.observe` turns the state into
+# tensors; on a robot your perception does ([their content](../docs/driving.md)).
+# [`Companion`](../docs/communicator.md#in-python) keeps the round for you.
 
 # %%
 from mirror_ppl.domains.driving import DrivingState
@@ -96,8 +99,8 @@ print(decision.message)
 print(decision.why())
 
 # %% [markdown]
-# Now send `decision.message` (here there is nothing to send), and watch. Say the person stays in
-# their lane. Tell the communicator so, with what there is to observe afterwards, and ask again.
+# Send `decision.message` and observe. Suppose that the person stays in their lane. Report that with
+# the next observation, and plan again.
 
 # %%
 stay = domain.actions.index("stay")
@@ -108,9 +111,11 @@ print(decision.message)
 print(decision.why())
 
 # %% [markdown]
-# Below, somebody acts: the simulated person of these recordings. We know what they really think,
-# which is unknown for real people. `action_noise` holds the random numbers that choose actions.
-# With the same start and the same noise, rounds differ only in what was said.
+# ## A loop with a simulated person
+#
+# The simulated person of these recordings acts below. `action_noise` holds the random numbers that
+# choose actions, so rounds with the same start and noise differ only by messages. What the person
+# knows is available because they are simulated.
 
 # %%
 from mirror_ppl.domains.driving.participants import simulated_drivers
@@ -118,7 +123,7 @@ from mirror_ppl.domains.driving.people import Memory
 from mirror_ppl.people import draw_starts
 
 driver = simulated_drivers("fog", "paper", 10, 0).select([0])
-starts = draw_starts(1, 8 if quick else 60, 0, "notebook")
+starts = draw_starts(1, 2 if quick else 40, 0, "notebook")
 silence = {m.name: torch.zeros(len(m.items), dtype=torch.bool) for m in domain.modalities}
 
 
@@ -147,16 +152,16 @@ def drive(number, communicator=None):
     decisions, memories, rewards = [], [], []
     for step in range(domain.horizon):
         decision = communicator.plan(moments[-1]) if communicator else None
-        told = decision.told if decision else silence
-        heard = {name: mask[None, None] for name, mask in told.items()}
-        chances, memory = driver.step(memory, domain.observe(state), heard)
-        action = (starts.action_noise[0, number, step] < chances[..., 1]).long()
+        message = decision.told if decision else silence
+        received = {name: mask[None, None] for name, mask in message.items()}
+        probabilities, memory = driver.step(memory, domain.observe(state), received)
+        action = (starts.action_noise[0, number, step] < probabilities[..., 1]).long()
         following = domain.transition(state, action)
         terms = domain.rewards(state, action, following)
         rewards.append({name: float(value) for name, value in terms.items()})
         rewards[-1]["messages"] = -decision.cost if decision else 0.0
         state = following
-        moments.append(moments[-1].then(told, int(action), observe(state)))
+        moments.append(moments[-1].then(message, int(action), observe(state)))
         decisions.append(decision)
         memories.append(Memory(**{name: part[0, 0] for name, part in vars(memory).items()}))
     knowledge, rewards = Memory.stack(memories, 0), pd.DataFrame(rewards)
@@ -172,26 +177,25 @@ def collides(played):
 # %% [markdown]
 # ## A round that messages change
 #
-# Which round shall we look at? We play some with nobody speaking, and those with a collision once
-# more with the communicator.
+# Some rounds are played without messages, and those with a collision again with the communicator.
 
 # %%
-alone = {number: drive(number) for number in range(starts.action_noise.shape[1])}
-alone = {number: played for number, played in alone.items() if collides(played)}
-aided = {number: drive(number, communicator) for number in alone}
-prevented = [number for number in aided if not collides(aided[number])]
+count = starts.action_noise.shape[1]
+silent = {number: drive(number) for number in range(count)}
+silent = {number: played for number, played in silent.items() if collides(played)}
+assisted = {number: drive(number, communicator) for number in silent}
+prevented = [number for number in assisted if not collides(assisted[number])]
 print(
-    f"{len(alone)} of {starts.action_noise.shape[1]} rounds have a collision if nothing is said;",
-    f"the communicator prevents it in {len(prevented)} of these {len(alone)}",
+    f"{len(silent)} of {count} rounds without messages have a collision;",
+    f"messages prevent it in {len(prevented)} of these",
 )
 
 # %% [markdown]
-# Not every collision can be prevented: where all ways are blocked, words do not help. And this is a
-# selection. It says nothing about rounds that go well without help; the comparison at the end does.
+# Some collisions cannot be prevented, as where both lanes are blocked. This selection of rounds
+# says nothing about rounds that go well without messages; the comparison at the end does.
 #
-# Of the rounds in which the collision is prevented we leave out those in which it comes within
-# three steps, so that there is something to watch. Of the others we take the one with the message
-# of which the communicator expected most.
+# Among the rounds whose collision is prevented and comes at step 3 or later, the one with the
+# largest expected gain of a message is shown. Its total rewards by term:
 
 
 # %%
@@ -201,45 +205,44 @@ def crash_step(played):
 
 
 def decisive_step(played):
-    """The step with the message of which most was expected."""
+    """The step of the message with the largest expected gain."""
     gains = [decision.gain.mean if decision.message else 0.0 for decision in played.decisions]
     return gains.index(max(gains))
 
 
 number = max(
-    (number for number in prevented if crash_step(alone[number]) >= 3),
-    key=lambda number: aided[number].decisions[decisive_step(aided[number])].gain.mean,
+    (number for number in prevented if crash_step(silent[number]) >= 3),
+    key=lambda number: assisted[number].decisions[decisive_step(assisted[number])].gain.mean,
 )
-told_nothing, told = alone[number], aided[number]
+without, aided = silent[number], assisted[number]
 print(f"round {number}")
-totals = {"told nothing": told_nothing.rewards.sum(), "communicator": told.rewards.sum()}
+totals = {"silence": without.rewards.sum(), "communicator": aided.rewards.sum()}
 pd.DataFrame(totals).T.assign(net=lambda table: table.sum(axis=1)).round(2)
 
 # %% [markdown]
-# Everything that was said in it, and why:
+# All messages of this round, and why:
 
 # %%
-for step, decision in enumerate(told.decisions):
+for step, decision in enumerate(aided.decisions):
     if decision.message:
         print(f"step {step}: {decision.message}\n    {decision.why()}\n    gain {decision.gain}")
 
 # %% [markdown]
 # ## Frame by frame
 #
-# Left, nobody speaks; right, the communicator does. Each frame shows the road as it is, and below
-# it what the person knows, in the robot's view: a cell is light where they would see a car. The
-# number on a car says how sure the robot is that they know of it, the share of the 64 draws in
-# which they have seen it or been told of it. What the simulated person really thinks is outlined;
-# the robot has not seen these outlines.
+# Left without messages, right with the communicator. Each frame shows the road, and below it what
+# the person knows by the posterior: brightness is the share of the 64 draws in which a cell is
+# seen, the number on a car the share (in %) in which the person knows of it. An orange outline
+# marks where the simulated person thinks that a car is, which the robot does not observe.
 #
-# The frames are the step of the decisive message, the last one before the collision, and the
-# collision. (The README shows this picture; `.savefig("communicate.png")` makes a file of it.)
+# The frames are the step of the decisive message, the last step before the collision, and the
+# collision.
 
 # %%
 from mirror_ppl.domains.driving.replay import plot_frames
 
-crash, step = crash_step(told_nothing), decisive_step(told)
-rounds = {"told nothing": told_nothing, "with the communicator": told}
+crash, step = crash_step(without), decisive_step(aided)
+rounds = {"silence": without, "communicator": aided}
 plot_frames(
     person,
     {title: played.moments[-1] for title, played in rounds.items()},
@@ -249,7 +252,7 @@ plot_frames(
 )
 
 # %% [markdown]
-# Every frame, from the first step to the one after the collision:
+# All frames up to the step after the collision:
 
 # %%
 plot_frames(
@@ -262,20 +265,20 @@ plot_frames(
 # %% [markdown]
 # ## One decision
 #
-# A decision explains itself. `gain` is what the message is expected to be worth, compared with
-# silence, its cost taken off; in brackets the 90% interval of the mean over the 64 draws.
+# `gain` is the expected return over silence, costs deducted, with the 90% interval of its mean
+# over draws.
 
 # %%
-decision = told.decisions[step]
+decision = aided.decisions[step]
 print("message:", decision.message)
 print("gain:   ", decision.gain)
 print("why:    ", decision.why())
 
 # %% [markdown]
-# Every message was valued. The picture has the chosen one, the next best, everything at once, and
-# each car by itself. Silence is a candidate, too, and wins ties. Where a name has "in 1 step", the
-# candidate is a plan: this now, that later. Only what is for now is sent, and at the next step the
-# communicator plans anew.
+# The communicator valued every candidate. The picture has the chosen message, the next best,
+# everything at once, and each item alone. "in 1 step" marks a plan that sends part of a message
+# later; only its message for now is sent, and the next step is planned anew. Silence is a
+# candidate and wins ties.
 
 # %%
 from mirror_ppl.plots.communication import plot_action, plot_utilities
@@ -283,64 +286,59 @@ from mirror_ppl.plots.communication import plot_action, plot_utilities
 plot_utilities(decision)
 
 # %% [markdown]
-# The same as a table of all candidates, the best first. `later` is what would follow in the steps
-# after, `probability` the share of draws in which a candidate is better than silence, and
-# `p(switch)` how probable a change of lanes is now.
+# All candidates as a table, best first. `later` is the plan's message for later steps,
+# `probability` the share of draws in which the candidate beats silence, and `p(switch)` the
+# probability of a change of lanes now.
 
 # %%
 decision.alternatives.head(6).round(3)
 
 # %% [markdown]
-# How the message works: what the person is expected to do at this step and at the steps after it,
-# if they hear it, and if they do not.
+# How the message works: predicted actions now and at the next steps, with and without the message.
 
 # %%
 plot_action(decision)
 
 # %% [markdown]
-# ## How sure, how patient
+# ## Two settings
 #
-# Two settings change when it speaks.
+# - `patience=3`, the default, compares a message with the same message one or two steps later, as
+#   it may become needless. `patience=1` compares it with permanent silence.
+# - `min_standard_errors=2`, the default in driving, requires that the gain of a message and of
+#   each of its items exceeds two of its standard errors. 0 chooses the largest mean gain; 20 drops
+#   small gains.
 #
-# - **Patience.** `patience=3`, the default, compares each good message with the same message one or
-#   two steps later. What can wait waits: it may turn out not to be needed. `patience=1` asks
-#   only whether a message is better than silence for good.
-# - **How sure.** With `min_standard_errors=2`, the default, a message has to gain more than two
-#   standard errors of its gain, and so has each of its items, compared with leaving it out. With 0
-#   it takes what is best on average, however uncertain that is. With 20 it drops messages that gain
-#   little, and prefers a gain that is certain to one that is a bit larger.
-#
-# Here is what each would say in the round above, up to the step before the collision. All are given
-# the same past, in which the shipped settings spoke.
+# Messages of four communicators at four steps of the round above, from the step before the decisive
+# message on. All get the same past, with the messages of the default.
 
 # %%
 others = {
-    "as shipped": communicator,
-    "no patience": mirror_ppl.Communicator(fit, patience=1),
-    "0 s.e.": mirror_ppl.Communicator(fit, min_standard_errors=0.0),
-    "20 s.e.": mirror_ppl.Communicator(fit, min_standard_errors=20.0),
+    "default": communicator,
+    "patience=1": mirror_ppl.Communicator(fit, patience=1),
+    "min_standard_errors=0": mirror_ppl.Communicator(fit, min_standard_errors=0.0),
+    "min_standard_errors=20": mirror_ppl.Communicator(fit, min_standard_errors=20.0),
 }
+steps = range(max(step - 1, 0), crash + 1)[: 1 if quick else 4]
 pd.DataFrame(
     [
-        {name: str(other.plan(past).message) for name, other in others.items()}
-        for past in told.moments[: crash + 1]
-    ]
-).rename_axis("step")
+        {name: str(other.plan(aided.moments[each]).message) for name, other in others.items()}
+        for each in steps
+    ],
+    index=pd.Index(steps, name="step"),
+)
 
 # %% [markdown]
-# ## Is it worth it?
+# ## Do messages help?
 #
-# New rounds, which nobody selected, each with the same start and the same action noise for all.
-# `none` is silence, `all` sends everything at every step, `mirror` is the communicator. `oracle`
-# is the ceiling: it knows the person and the world exactly. `net` is the task's reward minus the
-# cost of messages, on average over rounds; `above none` is how much more that is than with
-# silence, and
-# `±` its standard error.
+# New rounds, not selected, with the same starts and noise for all. `none` is silence, `all` sends
+# everything at every step, `oracle` knows person and world exactly. `net` is reward less the cost
+# of messages, the mean over rounds; `above none` its difference to silence, and `±` the standard
+# error of that.
 
 # %%
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, play, speaker
 
-fresh = draw_starts(1, 2 if quick else 20, 0, "comparison")
+fresh = draw_starts(1, 1 if quick else 20, 0, "comparison")
 listener = Listener(domain, "fog", driver, fresh, person)
 rows, nothing = {}, None
 for name in ("none", "mirror", "all", "oracle"):
@@ -349,7 +347,7 @@ for name in ("none", "mirror", "all", "oracle"):
     above = pd.Series(played.net - nothing.net)
     rows[name] = {
         "collisions": sum(played.mishaps) / len(above),
-        "items told": sum(map(sum, played.items.values())) / len(above),
+        "items sent": sum(map(sum, played.items.values())) / len(above),
         "cost": sum(played.cost) / len(above),
         "net": played.net.mean(),
         "above none": above.mean(),
@@ -358,14 +356,14 @@ for name in ("none", "mirror", "all", "oracle"):
 pd.DataFrame(rows).T.round(2)
 
 # %% [markdown]
-# These are a few rounds of one person. `python -m mirror_ppl.assist` compares more ways to speak,
-# on all people of a posterior, with intervals.
+# These are few rounds of one person. `python -m mirror_ppl.assist` compares more communicators on
+# all people of a posterior, with intervals.
 #
 # ## What to keep in mind
 #
-# - The communicator is as good as the posterior. If the model is sure of something wrong about a
-#   person, it will be sure of a wrong message. Look at the person first, as in notebook 01.
-# - `gain` is what the model expects, not what happens. Its interval is that of a mean over
-#   posterior draws: it shrinks with more draws, and does not say how below a round will be.
-# - These people listen, understand and remember perfectly, and act on what they hear. Real people
-#   do not always. To them messages cost attention; the costs here are those of the paper.
+# - Messages are as good as the posterior. Check the person first (notebook 01), and the posterior
+#   (03).
+# - `gain` is an expectation under the model. Its interval is of a mean over draws: it shrinks with
+#   more draws and does not cover the outcome of one round.
+# - These people receive, understand and remember every message. The communicator infers whether
+#   messages reach a person, but assumes the rest. Costs are those of the paper.
