@@ -40,6 +40,7 @@ SITE = {
         "notebooks/01_inspect_implants",
         "notebooks/02_communicate",
         "notebooks/03_trust_the_posterior",
+        "notebooks/04_your_own_model",
     ],
     "How to": [
         "Use your recordings <docs/demonstrations>",

@@ -240,6 +240,22 @@ def test_memory_keeps_what_has_not_changed_and_what_lasts():
         assert memory.items(table.modalities)["visual"].tolist() == known
 
 
+def test_the_memory_of_the_page_keeps_what_moves():
+    names = {"__name__": "page"}
+    exec(FILE.read_text(), names)
+    (block,) = re.findall(r"```python\n(@dataclass.*?)```", PAGE, re.DOTALL)
+    exec(block, names)
+    counted = names["Counted"]()
+    assert faults_of(counted) == []
+    for table, known in ((names["RoundTable"](), False), (counted, True)):
+        knowledge = table.nothing_known(1)
+        for pot, seen in ((1.0, True), (2.0, False)):
+            now = {"visual": torch.tensor([[[pot], [3.0]]])}
+            masks = {"visual": torch.tensor([[seen, False]])}
+            knowledge = table.learn(knowledge, now, masks, lambda _, masks=masks: masks)
+        assert table.known(knowledge)["visual"].tolist() == [[known, False]]
+
+
 def test_people_whose_sight_is_a_settings_have_no_oracle(gone_through, monkeypatch, capsys):
     from mirror_ppl.commands import assist, fit
     from mirror_ppl.commands import simulate as simulate_command
