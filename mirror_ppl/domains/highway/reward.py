@@ -12,7 +12,7 @@ front_proximity   -2 if the lidar's sector that faces ahead sees a car within 20
 back_proximity    -2 likewise behind
 near              -4 if any sector sees a car within 1.6 m
 shoulder          -4 while the ego's body is over the line of the road
-accident          -40 for hitting a car, or leaving the shoulder; both end the round
+accident          -100 for hitting a car, or leaving the shoulder; both end the round
 ================  =====================================================================
 
 Departures, and what the supplement leaves open
@@ -26,7 +26,7 @@ Departures, and what the supplement leaves open
       the next lane is never within 20 m in it while the ego drives along its lane.
     - **Shoulder**: entered when the side of the ego's body crosses the line.
     - **Accident** is not in the list. A round ends with it, and without a penalty an ego with cars
-      close ahead and behind, at about -3 a decision, would gain by a collision.
+      close ahead and behind, at about -3 a decision, would soon gain by a collision.
     - A finished round earns nothing.
 """
 
@@ -61,7 +61,7 @@ TERMS = (
 )
 KMH = 3.6
 """km/h in a m/s."""
-LANE_CHANGE, PROXIMITY, NEAR, ROAD_SHOULDER, ACCIDENT = -1.0, -2.0, -4.0, -4.0, -40.0
+LANE_CHANGE, PROXIMITY, NEAR, ROAD_SHOULDER, ACCIDENT = -1.0, -2.0, -4.0, -4.0, -100.0
 PROXIMITY_RANGE, NEAR_RANGE = 20.0, 1.6
 """Metres."""
 

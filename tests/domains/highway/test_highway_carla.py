@@ -186,7 +186,7 @@ def test_a_collision_ends_the_round_and_the_next_one_begins_anew():
     env, world, asked = made(cars=[(6.0, 1.0, 2.0)], lane=1.0)
     env.reset(seed=0)
     *_, terminated, truncated, info = env.step(np.zeros(2, np.float32))
-    assert terminated and not truncated and info["rewards"]["accident"] == -40
+    assert terminated and not truncated and info["rewards"]["accident"] == -100
     assert info["state"]["tick"] < TICKS
     with pytest.raises(ResetNeeded):
         env.step(np.zeros(2, np.float32))

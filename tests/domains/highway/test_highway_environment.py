@@ -134,7 +134,7 @@ def test_leaving_the_road_terminates():
         if terminated:
             break
         assert info["rewards"]["accident"] == 0
-    assert terminated and info["rewards"]["accident"] == -40 and not info["state"]["crashed"]
+    assert terminated and info["rewards"]["accident"] == -100 and not info["state"]["crashed"]
     assert info["rewards"]["shoulder"] == -4
     assert info["state"]["y"][0] > 12
     with pytest.raises(ResetNeeded):
@@ -150,7 +150,7 @@ def test_a_collision_terminates():
         if terminated:
             break
     assert terminated and not truncated and info["state"]["crashed"]
-    assert info["rewards"]["accident"] == -40
+    assert info["rewards"]["accident"] == -100
     with pytest.raises(ResetNeeded):
         env.step(STILL)
 

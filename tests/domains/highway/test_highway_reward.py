@@ -102,12 +102,12 @@ def test_shoulder_and_the_end_of_the_road():
     for y in (12.1, -4.1):
         gone = state_of((0.0, y, 0.0, 10.0))
         assert gone.over
-        assert terms(gone)["accident"] == -40.0
+        assert terms(gone)["accident"] == -100.0
 
 
 def test_a_collision_costs_once_and_then_nothing_is_won_or_lost():
     crashed = state_of(cars=[(4.0, 4.0, 0.0, 0.0)], crashed=torch.tensor(True))
-    assert terms(crashed)["accident"] == -40.0
+    assert terms(crashed)["accident"] == -100.0
     assert set(terms(crashed, crashed, torch.ones(2)).values()) == {0.0}
 
 
