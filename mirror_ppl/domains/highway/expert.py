@@ -46,7 +46,7 @@ class ExpertOptions:
     """
 
     horizon: int = 20
-    speeds: tuple[float, ...] = (0.0, 0.6, 0.97)
+    speeds: tuple[float, ...] = (0.0, 0.5, 0.8, 0.97)
 
     def __post_init__(self) -> None:
         if self.horizon < 1 or not self.speeds:

@@ -210,12 +210,12 @@ def followed(flow: Flow) -> Tensor:
 
 def begin_manoeuvres(state: HighwayState) -> HighwayState:
     """Return the state with manoeuvres begun whose moment has come."""
-    tick = state.tick[..., None]
-    due = (state.begun == NEVER) & (tick >= state.cue_at)
+    now = state.tick[..., None]
+    due = (state.begun == NEVER) & (now >= state.cue_at)
     begins = due & (state.x - state.x[..., :1] >= state.cue_gap)
     return replace(
         state,
-        begun=torch.where(begins, tick, state.begun),
+        begun=torch.where(begins, now, state.begun),
         target_lane=torch.where(begins, state.cue_lane, state.target_lane),
     )
 

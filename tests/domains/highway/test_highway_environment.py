@@ -15,6 +15,7 @@ pytest.importorskip("highway_env", reason="highway-env is not installed (mirror_
 
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
+from paths import DOCS
 
 from mirror_ppl.domains.highway import Highway, HighwayState
 from mirror_ppl.domains.highway.environment import HighwayEnv
@@ -246,3 +247,21 @@ def test_pictures():
     silent.reset(seed=4)
     with pytest.warns(UserWarning, match="render_mode"):
         assert silent.render() is None
+
+
+# --- documentation ------------------------------------------------------------------------------
+
+
+def test_the_examples_of_the_page_run():
+    blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / "highway.md").read_text(), re.M | re.S)
+    assert len(blocks) == 2
+    scope = {}
+    for block in blocks:
+        exec(compile(block, "highway.md", "exec"), scope)
+    assert scope["seen"].shape == (3, 36) and scope["info"]["scenario"] in Highway.scenarios
+
+
+def test_the_page_has_every_scenario_and_term():
+    page = (DOCS / "highway.md").read_text()
+    rows = [line.split(" | ")[0].strip("| `") for line in page.splitlines() if line.startswith("|")]
+    assert set(Highway.scenarios) <= set(rows) and set(Highway.reward_terms) <= set(rows)

@@ -38,6 +38,8 @@ def test_equation_7():
     speed = kmh / 3.6
     speed[2] = LIMIT  # exactly
     assert speed_reward(speed).tolist() == pytest.approx(expected)
+    before, after = state_of((0.0, 4.0, 0.0, 2.0)), state_of((0.0, 4.0, 0.0, 8.0))
+    assert terms(after, before)["speed"] == pytest.approx(8 / LIMIT)  # of where a decision leads
 
 
 @pytest.mark.parametrize(
@@ -105,10 +107,11 @@ def test_shoulder_and_the_end_of_the_road():
         assert terms(gone)["accident"] == -100.0
 
 
-def test_a_collision_costs_once_and_then_nothing_is_won_or_lost():
+def test_an_accident_costs_once_and_then_nothing_is_won_or_lost():
     crashed = state_of(cars=[(4.0, 4.0, 0.0, 0.0)], crashed=torch.tensor(True))
-    assert terms(crashed)["accident"] == -100.0
-    assert set(terms(crashed, crashed, torch.ones(2)).values()) == {0.0}
+    for ended in (crashed, state_of((0.0, 12.5, 0.0, 10.0))):
+        assert terms(ended)["accident"] == -100.0
+        assert set(terms(ended, ended, torch.ones(2)).values()) == {0.0}
 
 
 def test_proximities_are_the_lidar_s(generator):
