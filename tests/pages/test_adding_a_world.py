@@ -256,7 +256,7 @@ def test_the_memory_of_the_page_keeps_what_moves():
         assert table.known(knowledge)["visual"].tolist() == [[known, False]]
 
 
-def test_people_whose_sight_is_a_settings_have_no_oracle(gone_through, monkeypatch, capsys):
+def test_people_with_the_sight_of_a_setting_have_no_oracle(gone_through, monkeypatch, capsys):
     from mirror_ppl.commands import assist, fit
     from mirror_ppl.commands import simulate as simulate_command
     from mirror_ppl.evaluation.learners import Group
@@ -277,7 +277,7 @@ def test_people_whose_sight_is_a_settings_have_no_oracle(gone_through, monkeypat
         assert ("oracle" in {cell.model for cell in cells}) == there
 
 
-def test_worlds_of_the_same_name_are_told_apart(tmp_path):
+def test_worlds_of_the_same_name_are_distinguished(tmp_path):
     source = FILE.read_text()
     specs = []
     for horizon in (5, 9):
@@ -288,7 +288,7 @@ def test_worlds_of_the_same_name_are_told_apart(tmp_path):
     assert [get_domain(spec).horizon for spec in (*specs, *specs)] == [5, 9, 5, 9]
 
 
-def test_what_follows_from_a_class_is_worked_out_anew_in_derived_ones():
+def test_derived_classes_recompute_derived_attributes():
     wide = Modality("visual", ("pot", "puddle", "cat"), ("offset",), ("places",), (5.0,), 0.01)
     base = load_world(WORLD)
     more = world(modalities=(wide,), levels={"offset": range(-5, 6)}, reward_terms=("purr",))
@@ -318,7 +318,7 @@ def test_sentences_are_read_as_sentences():
     assert talking.nearest(said | {"verbal": torch.tensor([[0.6]])})["verbal"].tolist() == [[1.0]]
 
 
-def test_a_robot_of_another_version_of_the_file_is_told(gone_through, monkeypatch, tmp_path):
+def test_a_robot_of_another_version_of_the_file_gives_a_warning(gone_through, monkeypatch, tmp_path):
     from mirror_ppl.errors import StaleSelfModel
     from mirror_ppl.models.weights import load_self_model
 
