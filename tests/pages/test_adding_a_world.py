@@ -318,7 +318,7 @@ def test_sentences_are_read_as_sentences():
     assert talking.nearest(said | {"verbal": torch.tensor([[0.6]])})["verbal"].tolist() == [[1.0]]
 
 
-def test_a_robot_of_another_version_of_the_file_gives_a_warning(gone_through, monkeypatch, tmp_path):
+def test_a_robot_of_another_version_of_the_file_is_warned_of(gone_through, monkeypatch, tmp_path):
     from mirror_ppl.errors import StaleSelfModel
     from mirror_ppl.models.weights import load_self_model
 
