@@ -174,6 +174,19 @@ def test_five_seconds_with_numbers_of_32_bits(generator):
         assert found["target_lane"] == found["begun"] == found["timer"] == 0
 
 
+def test_other_cars_pass_through_one_another(double):
+    """One moves into the car beside it; neither stops, here or there."""
+    start = state_of((-80.0, 8.0, 0.0, 10.0), [(0.0, 0.0, 0.0, 10.0), (1.0, 4.0, 0.0, 10.0)])
+    target = start.target_lane.clone()
+    target[1] = 1
+    met = False
+    for ours, theirs in both(replace(start, target_lane=target), torch.zeros(15, 2), torch.float64):
+        assert max(differences(ours, theirs).values()) < 1e-6
+        boxes = torch.stack([ours.x, ours.y, ours.heading], -1)
+        met = met or overlap(boxes[1], boxes[2]).item()
+    assert met
+
+
 def test_a_collision_here_is_one_there(double):
     start = state_of((0.0, 4.0, 0.0, 12.0), [(12.0, 4.0, 0.0, 0.5)])
     *_, (ours, theirs) = both(start, torch.zeros(5, 2), torch.float64)
