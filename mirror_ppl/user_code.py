@@ -1,4 +1,4 @@
-"""Code of users: loading of their files, and one-line descriptions of faults in them."""
+"""Code of users: loading of their files, one-line descriptions of faults, what is not theirs."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import importlib.util
 import os
 import sys
 import traceback
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TypeVar
+from types import FunctionType
+from typing import Any, TypeVar
 
 from mirror_ppl.errors import MirrorError
 
 Base = TypeVar("Base")
 _FILES: set[Path] = set()
+_LIBRARIES = ("mirror_ppl", "torch", "pyro", "builtins", "abc", "typing", "dataclasses")
 
 
 def class_in_file(path: Path, name: str, base: type[Base], error: type[MirrorError]) -> type[Base]:
@@ -86,6 +89,31 @@ def describe(error: BaseException, path: Path | None = None) -> str:
         return text
     line = (own or frames)[-1]
     return f"{text} ({Path(line.filename).name}, line {line.lineno})"
+
+
+def is_of_package(thing: object) -> bool:
+    """True if an object's class, its bases and all of their methods come with this package.
+
+    Methods that were replaced, in a class or in the object, are a user's.
+    """
+    kinds = type(thing).__mro__
+    return all(map(_from_libraries, kinds)) and all(
+        _functions_from_libraries(vars(one).values()) for one in (thing, *kinds) if vars(one)
+    )
+
+
+def _functions_from_libraries(values: Iterable[Any]) -> bool:
+    for value in values:
+        # Properties and bound, static and class methods hold the function.
+        for name in ("__func__", "fget", "func"):
+            value = getattr(value, name, value)  # noqa: PLW2901
+        if isinstance(value, FunctionType) and not _from_libraries(value):
+            return False
+    return True
+
+
+def _from_libraries(defined: FunctionType | type) -> bool:
+    return defined.__module__.partition(".")[0] in _LIBRARIES
 
 
 def passed_user_code(error: BaseException) -> bool:

@@ -431,7 +431,7 @@ def test_a_person_sees_as_far_as_their_radius_and_remembers():
     free = WORLD.observe(replace(states[0], blocked=torch.zeros_like(states[0].blocked)))
     assert torch.equal(view.imagined["visual"][2, 0], free["visual"])
     assert torch.equal(view.imagined["verbal"][2, 0], free["verbal"])
-    check_contract(human)
+    check_contract(human, shipped=True)
 
 
 def test_an_obstacle_of_which_nothing_is_known_may_be_taken_not_to_be_there():

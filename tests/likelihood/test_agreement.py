@@ -15,7 +15,6 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.inference.svi import SVIOptions
-from mirror_ppl.likelihood.agreement import check_agreement
 from mirror_ppl.likelihood.combination_sets import fixed_prior
 from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
 from mirror_ppl.likelihood.compiled import compile
@@ -29,6 +28,7 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.user_code import is_of_package
 
 PER_ITEM = VARIANTS["per-item"]
 
@@ -49,7 +49,30 @@ def rounds():
     SHIPPED,
 )
 def test_models_that_ship_agree(world, name):
-    check_agreement(load_human_model(name, load_self_model(shipped_weights(world))[0]))
+    human = load_human_model(name, load_self_model(shipped_weights(world))[0])
+    assert is_of_package(human) and is_of_package(human.self_model) and is_of_package(human.domain)
+    check_contract(human, shipped=True)
+
+
+def test_models_that_ship_are_not_checked_in_fits(self_model, monkeypatch):
+    def check(human):
+        raise AssertionError("checked")
+
+    def act(self, *given):
+        return HumanModel.act(self, *given)
+
+    class Mine(HumanModel):
+        pass
+
+    monkeypatch.setattr("mirror_ppl.likelihood.contract.check_agreement", check)
+    human, changed = HumanModel(self_model), HumanModel(self_model)
+    check_contract(human)
+    changed.act = MethodType(act, changed)
+    for other in (Mine(self_model), changed):
+        with pytest.raises(HumanModelError, match="checked"):
+            check_contract(other)
+    monkeypatch.setattr(HumanModel, "believe", act)
+    assert not is_of_package(human)
 
 
 # --- refused ------------------------------------------------------------------------------------
