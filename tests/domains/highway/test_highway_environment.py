@@ -210,7 +210,7 @@ def test_fog_hides_by_distance():
     for env in (clear, fog):
         env.reset(seed=3)
     shown = []
-    for _ in range(60):
+    for _ in range(45):
         full, *_, over, _, _ = clear.step(STILL)
         seen, *_ = fog.step(STILL)
         if over:

@@ -65,10 +65,10 @@ def test_it_gets_around_a_crawling_car_that_hits_whoever_coasts():
     start = WORLD.initial(4, generator, index)
     x = start.x.clone()
     x[:, 1] = 18.0
-    options = expert.ExpertOptions(horizon=14, speeds=(0.0, 0.97))
+    options = expert.ExpertOptions(horizon=12, speeds=(0.0, 0.97))
     now = idle = replace(start, x=x)
     ahead = 0.0
-    for _ in range(12):
+    for _ in range(11):
         gained = []
         for state, action in ((now, expert.act(now, options)), (idle, torch.zeros(4, 2))):
             following = WORLD.transition(state, action)
