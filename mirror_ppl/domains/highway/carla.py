@@ -6,7 +6,7 @@ written after CARLA's Python API 0.9.15. The client's package is given by whoeve
     import carla
     from mirror_ppl.domains.highway.carla import CarlaEnv
 
-    client = carla.Client("localhost", 2000)
+    client = carla.Client(host, 2000)
     env = CarlaEnv(carla, client, spawn, setting="fog")
 
 ``spawn(client, scenario, seed)`` places the ego and the traffic on a road of three lanes, sets the
