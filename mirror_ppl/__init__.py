@@ -55,6 +55,7 @@ for _folder, _name in (
     ("driving", "Driving"),
     ("search_rescue", "SearchRescue"),
     ("bomb_defusal", "BombDefusal"),
+    ("highway", "Highway"),
 ):
     _register(f"mirror_ppl/{_name}-v0", f"mirror_ppl.domains.{_folder}.environment:{_name}Env")
 

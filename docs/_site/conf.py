@@ -55,7 +55,7 @@ SITE = {
         "docs/trust",
         "docs/glossary",
     ],
-    "Worlds": ["docs/driving", "docs/search_rescue", "docs/bomb_defusal"],
+    "Worlds": ["docs/driving", "docs/search_rescue", "docs/bomb_defusal", "docs/highway"],
     "Results": ["docs/results", "docs/performance"],
     "Reference": ["docs/reference/index"],
     "More": [
