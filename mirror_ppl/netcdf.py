@@ -7,6 +7,7 @@ first.
 from __future__ import annotations
 
 import faulthandler
+import hashlib
 import io
 import math
 import os
@@ -42,6 +43,8 @@ IMPORTS = 2.0
 """Processor seconds that a new process needs to import its libraries."""
 START, SLOW = 20.0, 20.0
 """Seconds that another process may take to start, and allowed slowdown of a busy machine."""
+_READ: set[tuple[bytes, tuple[str, ...]]] = set()
+"""Hashes of contents, and their groups, that another process could read already."""
 READ_ALL = """
 import io, resource, sys
 most, seconds = int(sys.argv[1]), int(sys.argv[2])
@@ -87,8 +90,11 @@ def read_netcdf(
     def read(allow: Callable[[int], object] = lambda declared: None) -> dict[str, xr.Dataset]:
         return _read(content, engine, wanted, allow)
 
-    if engine == "h5netcdf" and not _ends(read, content):
-        raise failure(f"{path}: is truncated or damaged (it cannot be read to its end)")
+    key = hashlib.sha256(content).digest(), wanted
+    if engine == "h5netcdf" and key not in _READ:
+        if not _ends(read, content):
+            raise failure(f"{path}: is truncated or damaged (it cannot be read to its end)")
+        _READ.add(key)
     try:
         return read()
     # Nearly any exception can come of a damaged file, depending on where the damage is.

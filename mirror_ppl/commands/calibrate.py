@@ -151,7 +151,7 @@ def _infer(
 ) -> Inferred:
     from mirror_ppl.inference.engines import infer
 
-    return infer(human, recordings, options, seed, network)
+    return infer(human, recordings, options, seed, network, checked=True)
 
 
 def _show(calibration: Calibration, guide: str) -> None:

@@ -56,9 +56,14 @@ def folder(some, tmp_path_factory):
     return folder
 
 
-def short_fit(folder, out, steps=4):
+def short_fit(folder, out, *others, steps=4):
     some = "--demos", folder / "some.nc", "--out", folder / out
-    return *some, "--guide", "svi", "--steps", steps, "--draws", 10, "--explore", 2
+    return *some, "--guide", "svi", "--steps", steps, "--draws", 10, "--explore", 2, *others
+
+
+RADIUS = "--human-model", "one-radius"
+"""Arguments for a model with few combinations of perceptual implants, which is quick."""
+RESULTS_OF_RADIUS = RESULTS - {"sight.png", "samples.png"}
 
 
 def summary_of(folder):
@@ -156,7 +161,7 @@ def test_shipped_recordings_are_those_that_are_asked_for():
 
 
 def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, monkeypatch):
-    args = [str(arg) for arg in short_fit(folder, "killed", steps=80)]
+    args = [str(arg) for arg in short_fit(folder, "killed", *RADIUS, steps=80)]
     process = subprocess.Popen(
         [sys.executable, "-m", "mirror_ppl.fit", *args], stderr=subprocess.PIPE
     )
@@ -182,9 +187,9 @@ def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, mo
     monkeypatch.setattr(fit.Stages, "report", spy)
     assert command(fit, *args) == 0
     assert done[0] in (26, 51, 76)  # from a checkpoint, of which there is one in 25 steps
-    assert set(content(folder / "killed")) >= RESULTS
+    assert set(content(folder / "killed")) >= RESULTS_OF_RADIUS
     assert not checkpoint.exists()
-    assert command(fit, *short_fit(folder, "whole", steps=80)) == 0
+    assert command(fit, *short_fit(folder, "whole", *RADIUS, steps=80)) == 0
     assert summary_of(folder / "killed") == summary_of(folder / "whole")
 
 
@@ -427,9 +432,9 @@ def test_simulate_writes_recordings_that_can_be_fitted(tmp_path, capsys):
     assert one.equals(two)
     assert one.shape == (2, 2, 15)
     assert "--people 2 --rounds 2 --seed 5" in one.provenance["command"]
-    demos = "--demos", tmp_path / "b.nc", "--train-rounds", 1
-    assert command(fit, *demos, "--out", tmp_path / "out", "--steps", 1, "--draws", 4) == 0
-    assert set(content(tmp_path / "out")) == RESULTS
+    small = "--train-rounds", 1, "--draws", 4, "--explore", 1, *RADIUS
+    assert command(fit, "--demos", tmp_path / "b.nc", "--out", tmp_path / "out", *small) == 0
+    assert set(content(tmp_path / "out")) == RESULTS_OF_RADIUS
 
 
 @pytest.mark.parametrize("module", [assist, calibrate, evaluate, fit, train, simulate])

@@ -9,6 +9,8 @@ from mirror_ppl.inference.workers import PART, PEOPLE_OF_A_PROCESS, People, Work
 from mirror_ppl.timing import clocked, stage
 
 PEOPLE = 6
+QUICK = {"human": "one-radius", "draws": 20, "train_rounds": 3, "explore": 1}
+"""Few combinations of perceptual implants."""
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +20,7 @@ def recordings():
 
 @pytest.fixture(scope="module")
 def fit(recordings):
-    return mirror_ppl.infer(recordings, draws=20, train_rounds=3, explore=1)
+    return mirror_ppl.infer(recordings, **QUICK)
 
 
 def assert_same(data, other, tolerance=0.0):
@@ -35,7 +37,7 @@ def assert_same(data, other, tolerance=0.0):
 
 def test_processes_make_no_difference(fit, recordings):
     assert PEOPLE > PART  # or there would be one part
-    shared = mirror_ppl.infer(recordings, draws=20, train_rounds=3, explore=1, jobs=2)
+    shared = mirror_ppl.infer(recordings, **QUICK, jobs=2)
     assert_same(shared.data, fit.data)
     assert shared.summary == fit.summary
     assert set(shared.seconds) == {"compile", "infer", "predict", "identify"}
@@ -49,7 +51,7 @@ def test_what_is_kept_makes_no_difference(fit, recordings, tmp_path):
         if (name, done) == ("infer", PART):
             raise KeyboardInterrupt
 
-    options = {"draws": 20, "train_rounds": 3, "explore": 1, "checkpoint": tmp_path / "c"}
+    options = QUICK | {"checkpoint": tmp_path / "c"}
     with pytest.raises(KeyboardInterrupt):
         mirror_ppl.infer(recordings, report=stop, **options)
     assert told == [("infer", 0, PEOPLE), ("infer", PART, PEOPLE)]
@@ -68,7 +70,7 @@ def test_what_is_kept_makes_no_difference(fit, recordings, tmp_path):
 
 def test_no_person_depends_on_the_other_people(fit, recordings):
     """Of the first people; seeds of later ones are by their number."""
-    some = mirror_ppl.infer(recordings.part(range(3)), draws=20, train_rounds=3, explore=1)
+    some = mirror_ppl.infer(recordings.part(range(3)), **QUICK)
     for name, values in some.data.posterior.data_vars.items():
         own = fit.data.posterior[name].isel(person=slice(0, 3))
         np.testing.assert_array_equal(values, own)
@@ -86,7 +88,7 @@ def test_weights_have_eight_bits(fit):
 
 
 def test_all_draws_are_kept_if_asked_for(fit, recordings):
-    every = mirror_ppl.infer(recordings, draws=20, train_rounds=3, explore=1, keep="draws")
+    every = mirror_ppl.infer(recordings, **QUICK, keep="draws")
     probability = every.data.predictions["action_probability"]
     assert probability.sizes["draw"] == 20
     mean = fit.data.predictions["action_probability"]

@@ -118,7 +118,7 @@ def test_variants_are_special_cases(self_model, rounds):
 def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
     """Of the smallest, which has nothing discrete, of one that attends, and of one radius."""
     monkeypatch.chdir(tmp_path)
-    assert command(simulate, "--people", 3, "--rounds", 2, "--out", "people.nc") == 0
+    assert command(simulate, "--people", 1, "--rounds", 2, "--out", "people.nc") == 0
     for name in ("no-implants", "per-item", "one-radius"):
         given = "--human-model", name, "--demos", "people.nc"
         status = command(
@@ -133,7 +133,6 @@ def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
         status = command(
             assist, "--posterior", f"{name}/posterior.nc", "--human-model", name, "--rounds", 1,
             "--communicator", "none", "mirror", "--jobs", 1, "--draws", 8,
-            "--people", 1,
         )  # fmt: skip
         assert status == 0
 
