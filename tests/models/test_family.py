@@ -265,9 +265,9 @@ def test_kinds_are_distinguished(driving, kind, model, known):
 
 def test_a_fit_reports_the_probability_of_each_model(driving):
     recordings = of_kind(Late(driving), 100, **{LATE: 0.95, "consistency": 4.0})
-    few = {"proposals": 256, "enough": 100}
+    few = {"settings": {"proposals": 256, "enough": 100}, "draws": 100, "explore": 0}
     one = recordings.select_people([0])
-    fit = mirror_ppl.infer(one, human="all", engine="importance", settings=few, draws=100, seed=1, explore=0)
+    fit = mirror_ppl.infer(one, human="all", engine="importance", **few, seed=1)
     for number, person in enumerate(fit.summary["people"]):
         models = person["check"]["models"]
         assert list(models) == list(KINDS) and sum(models.values()) == pytest.approx(1)
