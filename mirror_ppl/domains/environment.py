@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.error import InvalidAction, ResetNeeded
+from torch import Tensor
 
 from mirror_ppl.domains.base import Domain, map_state, require_known, total_reward
 
@@ -19,11 +20,13 @@ EnvObservation = dict[str, Any]
 """Numpy arrays by name."""
 
 
-class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
+class DomainEnv(gymnasium.Env[EnvObservation, Any]):
     """A round of a domain, seen by an unaided person in one of the domain's settings.
 
     All mechanics are the domain's: this class only draws the round, hides what the setting hides
-    and counts steps. Each domain has a subclass with its observation space.
+    and counts steps. Each domain has a subclass with its observation space. Where another simulator
+    moves things, a subclass overrides `_begin` and `_advance`; with continuous actions also
+    `_actions` and `_checked`.
 
     Attributes:
         domain: the world.
@@ -60,7 +63,7 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
             require_known(render_mode, "render mode", RENDER_MODES)
         self.render_mode = render_mode
 
-        self.action_space = spaces.Discrete(len(domain.actions))
+        self.action_space = self._actions()
         self.observation_space = _observation_space(domain, self.limits)
         self._state: Any = None
         self._scenario_name = ""
@@ -76,28 +79,26 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
             index = int(self.np_random.integers(len(scenarios)))
         else:
             index = scenarios.index(self.scenario)
-        # The domain draws from torch's generators; this one depends on Gymnasium's seed.
-        generator = torch.Generator().manual_seed(int(self.np_random.integers(2**63 - 1)))
-        batch = self.domain.initial(1, generator, torch.tensor([index]))
-        self._state = map_state(lambda part: part[0], batch)
+        self._state = self._begin(index, int(self.np_random.integers(2**63 - 1)))
         self._scenario_name = scenarios[index]
         self._step = 0
         return self._observation(), self._info()
 
-    def step(self, action: np.int64) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
         """Play one step; see `gymnasium.Env.step`.
 
         Raises:
             ResetNeeded: before the first reset, and after the last step of a round.
             InvalidAction: if there is no such action.
         """
-        if self._state is None or self._ended():
+        before = self.state
+        if self._step == self.domain.horizon or bool(self.domain.over(before)):
             raise ResetNeeded("call reset() to start a round")
-        if not self.action_space.contains(action):
+        chosen = self._checked(action)
+        if chosen is None:
             raise InvalidAction(f"expected an action of {self.action_space}, given {action!r}")
-        chosen = torch.tensor(int(action))
-        following = self.domain.transition(self._state, chosen)
-        terms = self.domain.rewards(self._state, chosen, following)
+        following = self._advance(before, chosen)
+        terms = self.domain.rewards(before, chosen, following)
         self._state = following
         self._step += 1
         info = self._info()
@@ -108,8 +109,19 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         truncated = self._step == self.domain.horizon and not terminated
         return self._observation(), reward, terminated, truncated, info
 
+    @property
+    def state(self) -> Any:
+        """The true state, without batch, as the domain's functions take it.
+
+        Raises:
+            ResetNeeded: before the first reset.
+        """
+        if self._state is None:
+            raise ResetNeeded("call reset() to start a round")
+        return self._state
+
     def render(self) -> np.ndarray | None:
-        """Return a picture ``uint8 [height, width, 3]`` of the full state, seen or not.
+        """Return a picture ``uint8 [height, width, 3]`` of the state.
 
         Returns:
             The picture, or None if the environment was made without a render mode.
@@ -120,12 +132,30 @@ class DomainEnv(gymnasium.Env[EnvObservation, np.int64]):
         if self.render_mode is None:
             gymnasium.logger.warn('make the environment with render_mode="rgb_array" to render it')
             return None
-        if self._state is None:
-            raise ResetNeeded("call reset() to start a round")
-        return self.domain.render(self._state)
+        return self._picture(self.state)
 
-    def _ended(self) -> bool:
-        return self._step == self.domain.horizon or bool(self.domain.over(self._state))
+    def _actions(self) -> spaces.Space[Any]:
+        """Return the action space."""
+        return spaces.Discrete(len(self.domain.actions))
+
+    def _checked(self, action: Any) -> Tensor | None:
+        """Return an action as the domain takes it; None if there is no such action."""
+        return torch.tensor(int(action)) if self.action_space.contains(action) else None
+
+    def _begin(self, scenario: int, seed: int) -> Any:
+        """Return the state in which a round of a scenario begins, given by its index."""
+        # The domain draws from torch's generators; this one depends on Gymnasium's seed.
+        generator = torch.Generator().manual_seed(seed)
+        batch = self.domain.initial(1, generator, torch.tensor([scenario]))
+        return map_state(lambda part: part[0], batch)
+
+    def _advance(self, state: Any, action: Tensor) -> Any:
+        """Return the state after an action."""
+        return self.domain.transition(state, action)
+
+    def _picture(self, state: Any) -> np.ndarray:
+        """Draw the full state, seen or not."""
+        return self.domain.render(state)
 
     def _observation(self) -> EnvObservation:
         """Return what the person sees, as new numpy arrays."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import total_reward
+from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.highway.road import (
     LANES,
     LENGTH,
@@ -25,11 +25,11 @@ from mirror_ppl.domains.highway.road import (
     centre_of,
     wrapped,
 )
-from mirror_ppl.domains.highway.state import NEVER, HighwayState, each, flat
+from mirror_ppl.domains.highway.state import NEVER, HighwayState, flat
 from mirror_ppl.domains.highway.world import Highway
 
 HEADING_GAIN, LATERAL_GAIN, SPEED_GAIN = 2.0, 0.7, 1.5
-"""Of the controller, per second; softer than other vehicles', which steer at every tick."""
+"""Gains of the controller, per second; softer than other vehicles', which steer at every tick."""
 STEEPEST = 0.15
 """Radians to the road at which it changes lanes at most."""
 SLOWEST = 1.0
@@ -63,7 +63,7 @@ def act(
     speeds = start.x.new_tensor(options.speeds) * LIMIT
     lane = torch.arange(LANES, device=speeds.device).repeat_interleave(len(speeds))
     speed, many = speeds.repeat(LANES), len(lane)
-    now = each(lambda part: part[:, None].expand(-1, many, *part.shape[1:]), start)
+    now = map_state(lambda part: part[:, None].expand(-1, many, *part.shape[1:]), start)
     total = first = None
     for _ in range(options.horizon):
         action = drive_to(now, lane, speed)

@@ -21,7 +21,7 @@ RIGHT_EDGE = (LANES - 0.5) * LANE_WIDTH
 """``y`` of the lines between the outer lanes and the shoulders, in metres."""
 
 LENGTH, WIDTH = 5.0, 2.0
-"""Of every vehicle, in metres, as in highway-env."""
+"""Size of every vehicle in metres, as in highway-env."""
 OTHERS = 8
 """Number of other vehicles. The ego is vehicle 0 of ``1 + OTHERS``."""
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -91,11 +89,6 @@ class HighwayState:
         return self.crashed | self.off_road
 
 
-def each(function: Callable[..., Any], *states: HighwayState) -> HighwayState:
-    """Apply a function to each field of states."""
-    return map_state(function, *states)
-
-
 def where(condition: Tensor, yes: HighwayState, no: HighwayState) -> HighwayState:
     """Return states of ``yes`` where ``condition`` ``[...]`` is true, and of ``no`` elsewhere."""
 
@@ -103,7 +96,7 @@ def where(condition: Tensor, yes: HighwayState, no: HighwayState) -> HighwayStat
         wide = condition.reshape(condition.shape + (1,) * (one.dim() - condition.dim()))
         return torch.where(wide, one, other)
 
-    return each(choose, yes, no)
+    return map_state(choose, yes, no)
 
 
 def flat(state: HighwayState) -> tuple[HighwayState, torch.Size]:
@@ -118,4 +111,4 @@ def flat(state: HighwayState) -> tuple[HighwayState, torch.Size]:
 
 def shaped(state: HighwayState, shape: torch.Size) -> HighwayState:
     """Return a state ``[B]`` with a batch of another shape; undoes `flat`."""
-    return each(lambda part: part.reshape((*shape, *part.shape[1:])), state)
+    return map_state(lambda part: part.reshape((*shape, *part.shape[1:])), state)

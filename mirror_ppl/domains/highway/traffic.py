@@ -66,7 +66,7 @@ ON_LANE = LANE_WIDTH / 2 + 1.0
 """Metres from a lane's centre within which a vehicle counts as in that lane, for followers."""
 
 HEADING_GAIN, LATERAL_GAIN = 5.0, 1 / 0.6
-"""Of lane keeping, per second."""
+"""Gains of lane keeping, per second."""
 WHEEL_LIMIT = math.pi / 3
 """Radians of the front wheels of other vehicles."""
 SMALL = 1e-2
@@ -297,7 +297,7 @@ def _best_lane(flow: Flow, who: Tensor) -> Tensor:
     headway = flow.headway.gather(-1, many)
 
     def accelerated(follower: Tensor, leader: Tensor) -> Tensor:
-        """As the vehicle that decides would drive in the follower's place."""
+        """Return accelerations with the headway of the vehicle that decides, in another's place."""
         gap, closing = _towards(flow, follower, leader)
         at = follower.clamp(min=0)
         speed, intended = flow.speed.gather(-1, at), flow.intended.gather(-1, at)

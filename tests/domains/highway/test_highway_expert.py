@@ -6,10 +6,9 @@ import pytest
 import torch
 from highway_states import state_of
 
-from mirror_ppl.domains.base import total_reward
+from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.highway import Highway, expert
 from mirror_ppl.domains.highway.road import LIMIT
-from mirror_ppl.domains.highway.state import each
 
 WORLD = Highway()
 CRAWLS = (28.0, 4.0, 0.0, 1.5)
@@ -82,7 +81,7 @@ def test_it_gets_around_a_crawling_car_that_hits_whoever_coasts():
 
 def test_any_batch():
     one = state_of(cars=[CRAWLS])
-    grid = each(lambda part: part.expand(2, 3, *part.shape), one)
+    grid = map_state(lambda part: part.expand(2, 3, *part.shape), one)
     found = expert.act(grid, expert.ExpertOptions(horizon=3))
     assert found.shape == (2, 3, 2)
     assert torch.equal(found[1, 2], expert.act(one, expert.ExpertOptions(horizon=3)))

@@ -84,7 +84,7 @@ def test_inside_a_box_everything_is_at_no_distance():
 
 
 def test_sectors_agree_with_points_along_the_sides(generator):
-    """Of 2,000 points a side, the nearest in a sector is within a step of the exact distance."""
+    """The nearest of 2,000 points a side is within a step of the exact distance in each sector."""
     spread = torch.tensor([20.0, 20.0, 3.0], dtype=torch.float64)
     boxes = (torch.rand(100, 3, generator=generator, dtype=torch.float64) - 0.5) * spread
     boxes = boxes[clearance(boxes) > 0]

@@ -11,10 +11,10 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_states import state_of
 
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import traffic, vehicles
 from mirror_ppl.domains.highway.geometry import overlap
 from mirror_ppl.domains.highway.road import LANES, OTHERS, TICK, TICKS, centre_of
-from mirror_ppl.domains.highway.state import each
 from mirror_ppl.domains.highway.world import Highway
 
 WORLD = Highway()
@@ -58,7 +58,7 @@ def test_bicycle_model(generator, double):
     acceleration = torch.rand(state.x.shape, generator=generator) * 12 - 6
     moved = traffic.bicycle(state, steering, acceleration)
     for row in range(len(state.x)):
-        road = vehicles.make_road(each(lambda part, row=row: part[row], state))
+        road = vehicles.make_road(map_state(lambda part, row=row: part[row], state))
         for number, vehicle in enumerate(road.vehicles):
             vehicle.action = {
                 "steering": steering[row, number].item(),
@@ -77,7 +77,7 @@ def test_idm_and_steering(generator, double):
     steering = traffic.steer_to(traffic.Flow.of(state), centre_of(state.target_lane))
     behind_somebody = 0
     for row in range(len(state.x)):
-        road = vehicles.make_road(each(lambda part, row=row: part[row], state))
+        road = vehicles.make_road(map_state(lambda part, row=row: part[row], state))
         for number, car in enumerate(road.vehicles[1:], start=1):
             car.cue(0, vehicles.ego_of(road))
             IDMVehicle.act(car)
@@ -102,7 +102,7 @@ def test_lane_changes(generator, double):
     chosen = traffic.change_lanes(traffic.Flow.of(state), changes, changes & here)
     begun = given_up = 0
     for row in range(len(state.x)):
-        road = vehicles.make_road(each(lambda part, row=row: part[row], state))
+        road = vehicles.make_road(map_state(lambda part, row=row: part[row], state))
         for place, car in enumerate(road.vehicles[1:], start=1):
             kept = [other.target_lane_index for other in road.vehicles[1:]]
             car.change_lane_policy()
@@ -121,7 +121,7 @@ def test_collisions(generator, double):
     touching = overlap(boxes[:, :1], boxes[:, 1:])
     assert 0.1 < touching.double().mean() < 0.9
     for row in range(len(state.x)):
-        near = replace(each(lambda part, row=row: part[row], state), x=boxes[row, :, 0])
+        near = replace(map_state(lambda part, row=row: part[row], state), x=boxes[row, :, 0])
         ego, *cars = vehicles.make_road(near).vehicles
         assert [ego._is_colliding(car, 0.0)[0] for car in cars] == touching[row].tolist()
 
@@ -155,7 +155,7 @@ def differences(ours, theirs):
 @pytest.mark.parametrize("scenario", range(len(WORLD.scenarios)))
 def test_five_seconds(scenario, generator, double):
     """Every position, speed, lane and timer within 1e-6 of highway-env's, at each decision."""
-    start = each(lambda part: part[0], WORLD.initial(1, generator, torch.tensor([scenario])))
+    start = map_state(lambda part: part[0], WORLD.initial(1, generator, torch.tensor([scenario])))
     actions = torch.rand(FIVE_SECONDS, 2, generator=generator) - 0.5
     actions[:, 0] *= 0.1
     for ours, theirs in both(start, actions, torch.float64):
@@ -165,7 +165,7 @@ def test_five_seconds(scenario, generator, double):
 
 def test_five_seconds_with_numbers_of_32_bits(generator):
     """Within 2 cm and 2 cm/s, of 100 m driven: what rounding adds up to."""
-    start = each(lambda part: part[0], WORLD.initial(1, generator, torch.tensor([1])))
+    start = map_state(lambda part: part[0], WORLD.initial(1, generator, torch.tensor([1])))
     actions = torch.rand(FIVE_SECONDS, 2, generator=generator) - 0.5
     actions[:, 0] *= 0.1
     for ours, theirs in both(start, actions, torch.float32):
@@ -195,7 +195,7 @@ def test_a_collision_here_is_one_there(double):
 
 def test_a_state_is_read_back_as_it_was_made(generator, double):
     for _ in range(5):
-        state = each(lambda part: part[0], WORLD.initial(1, generator))
+        state = map_state(lambda part: part[0], WORLD.initial(1, generator))
         back = vehicles.read_road(vehicles.make_road(state), 0, state.controls.numpy())
         for name, part in vars(state).items():
             own = part[1:] if part.dim() and name not in ("controls", "x", "y") else part

@@ -7,9 +7,10 @@ import pytest
 import torch
 from highway_states import state_of
 
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import scenarios, traffic
 from mirror_ppl.domains.highway.road import LANE_WIDTH, LENGTH, LIMIT, STEPS, TICK, TICKS
-from mirror_ppl.domains.highway.state import NEVER, each
+from mirror_ppl.domains.highway.state import NEVER
 from mirror_ppl.domains.highway.world import Highway
 
 WORLD = Highway()
@@ -17,7 +18,7 @@ STEP = TICK * TICKS
 
 
 def batched(state):
-    return each(lambda part: part[None], state)
+    return map_state(lambda part: part[None], state)
 
 
 def play(state, action=(0.0, 0.0), steps=1):
@@ -207,11 +208,11 @@ def test_the_same_seed_gives_the_same_round(seed):
 def test_rounds_of_a_batch_do_not_touch_each_other(generator):
     """Alone, in a batch, and in a batch of two dimensions; and nothing that is given changes."""
     start = WORLD.initial(12, generator)
-    kept = each(torch.clone, start)
+    kept = map_state(torch.clone, start)
     action = torch.rand(12, 2, generator=generator) * 0.2
     many = start
-    grid = each(lambda part: part.reshape(3, 4, *part.shape[1:]), start)
-    alone = each(lambda part: part[7], start)
+    grid = map_state(lambda part: part.reshape(3, 4, *part.shape[1:]), start)
+    alone = map_state(lambda part: part[7], start)
     for _ in range(15):
         many = WORLD.transition(many, action)
         grid = WORLD.transition(grid, action.reshape(3, 4, 2))
@@ -242,12 +243,12 @@ def coasting():
     states = [WORLD.initial(len(index), torch.Generator().manual_seed(0), index)]
     for _ in range(STEPS):
         states.append(play(states[-1]))
-    return each(lambda *parts: torch.stack(parts).unflatten(1, (many, 25)), *states)
+    return map_state(lambda *parts: torch.stack(parts).unflatten(1, (many, 25)), *states)
 
 
 def of(coasting, name):
     """States ``[T + 1, 25]`` of one scenario."""
-    return each(lambda part: part[:, WORLD.scenarios.index(name)], coasting)
+    return map_state(lambda part: part[:, WORLD.scenarios.index(name)], coasting)
 
 
 def share(condition):

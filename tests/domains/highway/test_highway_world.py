@@ -70,7 +70,7 @@ def test_unknown_settings_are_refused():
 
 
 def test_scenarios_are_drawn_or_given(generator):
-    """Of 900 rounds each of nine scenarios has about 100; cars that play a part show which."""
+    """Each of nine scenarios has about 100 of 900 rounds; cars that play a part show which."""
     state = WORLD.initial(900, generator)
     crawls = (state.cruise[:, 1] < 4).sum().item()
     assert abs(crawls - 100) < 4 * (900 * 8 / 81) ** 0.5
