@@ -308,7 +308,7 @@ def test_outputs_that_would_overwrite_are_refused(posterior, tmp_path, capsys):
 def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     posterior, tmp_path, capsys, quickly
 ):
-    quickly("mirror", "oracle")
+    quickly("mirror", "mirror-self-model")
     example = EXAMPLES / "late_reactions.py"
     late = ("--human-model", f"{example}:LatePerson")
     demos = ("--demos", posterior.parents[1] / "some.nc")
@@ -340,7 +340,7 @@ def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
 def test_nobody_plans_in_a_world_that_the_robot_was_taught_wrong_unless_asked_to(
     tmp_path, capsys, quickly
 ):
-    quickly("mirror-self-model")
+    quickly("mirror", "mirror-self-model")
     everybody = load_demonstrations(asset_path("bomb_defusal_unlabelled_paper.nc"))
     one = everybody.select_people([0]).select_rounds([0])
     save_demonstrations(tmp_path / "one.nc", one)

@@ -18,6 +18,12 @@ from mirror_ppl.errors import DemonstrationsError, PosteriorError
 from mirror_ppl.netcdf import read_netcdf
 
 
+@pytest.fixture(autouse=True)
+def nothing_read(monkeypatch):
+    """Forget what earlier tests read, so that another process reads each file first."""
+    monkeypatch.setattr(netcdf, "_READ", set())
+
+
 def refused(path):
     with pytest.raises(PosteriorError) as error:
         read_netcdf(path, PosteriorError)
@@ -66,6 +72,21 @@ def test_reading_that_does_not_end_or_crashes_is_noticed(tmp_path, monkeypatch):
         assert refused(path) == f"{path}: is truncated or damaged (it cannot be read to its end)"
     monkeypatch.setattr(netcdf, "_read", read)
     read_netcdf(path, PosteriorError)
+
+
+def test_another_process_reads_each_content_and_its_groups_once(tmp_path, monkeypatch):
+    path, tried, ends = tmp_path / "a.nc", [], netcdf._ends
+    monkeypatch.setattr(
+        netcdf, "_ends", lambda read, content: tried.append(content) or ends(read, content)
+    )
+    for value in (1.0, 2.0, 1.0):
+        data = xr.Dataset({"x": value})
+        data.to_netcdf(path, engine="h5netcdf")
+        for _ in range(2):
+            assert read_netcdf(path, PosteriorError)["/"].identical(data)
+    assert len(tried) == 2
+    read_netcdf(path, PosteriorError, ("other",))
+    assert len(tried) == 3
 
 
 def test_a_zeroed_heap_does_not_hang(tmp_path, monkeypatch):

@@ -9,8 +9,9 @@ from mirror_ppl.inference.workers import PART, PEOPLE_OF_A_PROCESS, People, Work
 from mirror_ppl.timing import clocked, stage
 
 PEOPLE = 6
-QUICK = {"human": "one-radius", "draws": 20, "train_rounds": 3, "explore": 1}
-"""Few combinations of perceptual implants."""
+SMALL = {"draws": 20, "train_rounds": 3, "explore": 1}
+RADIUS = SMALL | {"human": "one-radius"}
+"""A model with few combinations of perceptual implants, which is quick."""
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +21,12 @@ def recordings():
 
 @pytest.fixture(scope="module")
 def fit(recordings):
-    return mirror_ppl.infer(recordings, **QUICK)
+    return mirror_ppl.infer(recordings, **SMALL)
+
+
+@pytest.fixture(scope="module")
+def quick(recordings):
+    return mirror_ppl.infer(recordings, **RADIUS)
 
 
 def assert_same(data, other, tolerance=0.0):
@@ -37,13 +43,13 @@ def assert_same(data, other, tolerance=0.0):
 
 def test_processes_make_no_difference(fit, recordings):
     assert PEOPLE > PART  # or there would be one part
-    shared = mirror_ppl.infer(recordings, **QUICK, jobs=2)
+    shared = mirror_ppl.infer(recordings, **SMALL, jobs=2)
     assert_same(shared.data, fit.data)
     assert shared.summary == fit.summary
     assert set(shared.seconds) == {"compile", "infer", "predict", "identify"}
 
 
-def test_what_is_kept_makes_no_difference(fit, recordings, tmp_path):
+def test_what_is_kept_makes_no_difference(quick, recordings, tmp_path):
     told = []
 
     def stop(name, done, total, message):
@@ -51,26 +57,26 @@ def test_what_is_kept_makes_no_difference(fit, recordings, tmp_path):
         if (name, done) == ("infer", PART):
             raise KeyboardInterrupt
 
-    options = QUICK | {"checkpoint": tmp_path / "c"}
+    options = RADIUS | {"checkpoint": tmp_path / "c"}
     with pytest.raises(KeyboardInterrupt):
         mirror_ppl.infer(recordings, report=stop, **options)
     assert told == [("infer", 0, PEOPLE), ("infer", PART, PEOPLE)]
     told.clear()
     again = mirror_ppl.infer(recordings, report=lambda *one: told.append(one[:3]), **options)
     assert told[0] == ("infer", PART, PEOPLE)
-    assert_same(again.data, fit.data)
+    assert_same(again.data, quick.data)
     # A damaged part counts as missing.
     folder = tmp_path / "c.parts"
     for path in folder.iterdir():
         path.write_bytes(path.read_bytes()[:-100])
-    assert_same(mirror_ppl.infer(recordings, **options).data, fit.data)
+    assert_same(mirror_ppl.infer(recordings, **options).data, quick.data)
     Workers(folder=folder).clean()
     assert not folder.exists()
 
 
 def test_no_person_depends_on_the_other_people(fit, recordings):
     """Of the first people; seeds of later ones are by their number."""
-    some = mirror_ppl.infer(recordings.part(range(3)), **QUICK)
+    some = mirror_ppl.infer(recordings.part(range(3)), **SMALL)
     for name, values in some.data.posterior.data_vars.items():
         own = fit.data.posterior[name].isel(person=slice(0, 3))
         np.testing.assert_array_equal(values, own)
@@ -87,14 +93,14 @@ def test_weights_have_eight_bits(fit):
     assert (fit.data.posterior["consistency"].values.view(np.uint32) & 0xFFFF).any()
 
 
-def test_all_draws_are_kept_if_asked_for(fit, recordings):
-    every = mirror_ppl.infer(recordings, **QUICK, keep="draws")
+def test_all_draws_are_kept_if_asked_for(quick, recordings):
+    every = mirror_ppl.infer(recordings, **RADIUS, keep="draws")
     probability = every.data.predictions["action_probability"]
     assert probability.sizes["draw"] == 20
-    mean = fit.data.predictions["action_probability"]
+    mean = quick.data.predictions["action_probability"]
     assert mean.sizes["draw"] == 1
     np.testing.assert_allclose(probability.mean("draw"), mean.isel(draw=0), atol=1e-6)
-    assert "residual_in" in every.data.prior and "residual_in" not in fit.data.prior
+    assert "residual_in" in every.data.prior and "residual_in" not in quick.data.prior
 
 
 @pytest.mark.parametrize("what", ["", "all", 3])

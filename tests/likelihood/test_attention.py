@@ -429,7 +429,7 @@ def example(self_model):
 
 
 def test_the_example_is_a_mixture_of_seeing_and_not(self_model, recordings):
-    """Of rounds of a person who is away with some probability; by the package's own model."""
+    """Rounds of a person who is away with some probability; by the package's own model."""
     human = example(self_model)
     check_contract(human)
     one = recordings.select_people([0]).select_rounds([0])
@@ -497,7 +497,7 @@ def test_who_acts_as_if_they_saw_has_noticed(self_model, recordings):
 
 
 def test_rare_attention_is_found_out(self_model, recordings):
-    """Of a person who is hardly ever away, from what only a person who is would do."""
+    """A person who is hardly ever away does what only a person who is away would do."""
     human = example(self_model)
     draws = drawn(human, 200)
     draws |= {"distracted": torch.full((200, 1, 1), 0.02)}

@@ -110,7 +110,7 @@ def test_people_of_the_prior_come_with_their_truth(world):
 
 
 def test_entropy_is_that_of_the_choice(self_model):
-    """Of a person who throws a coin at every step."""
+    """A person throws a coin at every step."""
     human = HumanModel(self_model)
     known = {"consistency": torch.full((2, 1), 1e-6), "lapse": torch.tensor([[0.5], [0.999]])}
     known |= {"residual_out": torch.zeros(2, 1, RESIDUAL_HIDDEN + 1, 2)}
