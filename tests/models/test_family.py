@@ -274,6 +274,7 @@ def test_a_fit_reports_the_probability_of_each_model(driving):
         assert person["implants"][KIND]["most_probable"] == "late"
         assert person["implants"][KIND]["probability"] == pytest.approx(models["late"])
         assert fit.check["p(late)"].iloc[number] == models["late"] > 0.9
+        assert person["pareto_k"] < 0.7
 
 
 @pytest.mark.parametrize("known", [{SHARES_GOAL: -0.8}, {SHARES_GOAL: 1.0}])
