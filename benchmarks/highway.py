@@ -21,7 +21,7 @@ import tyro
 from torch import Tensor
 
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.highway import Highway, HighwayState, expert
+from mirror_ppl.domains.highway import DirectHighway, HighwayState, expert
 from mirror_ppl.domains.highway.pictures import picture
 
 Driver = Callable[[HighwayState], Tensor]
@@ -65,12 +65,15 @@ def main(options: Options) -> None:
     if options.picture:
         draw(options.picture)
         return
-    world = Highway()
+    world = DirectHighway()
     scenario = torch.arange(options.rounds) % len(world.scenarios)
     start = world.initial(options.rounds, torch.Generator().manual_seed(options.seed), scenario)
     noise = torch.Generator().manual_seed(options.seed + 1)
+    planning = expert.ExpertOptions(options.horizon, world.ticks)
     drivers: dict[str, Driver] = {
-        "expert": lambda state: expert.act(state, expert.ExpertOptions(options.horizon)),
+        "expert": lambda state: expert.act(
+            state, expert.ExpertOptions(options.horizon, ticks=world.ticks)
+        ),
         "nothing": lambda state: torch.zeros(*state.tick.shape, 2),
         "random": lambda state: torch.rand(*state.tick.shape, 2, generator=noise) * 2 - 1,
     }
@@ -96,7 +99,7 @@ def main(options: Options) -> None:
             writer.writerows(rows)
 
 
-def play_batched(world: Highway, start: HighwayState, driver: Driver) -> Played:
+def play_batched(world: DirectHighway, start: HighwayState, driver: Driver) -> Played:
     """Play all rounds at once, by the domain's physics."""
     began, state = time.monotonic(), start
     sums: dict[str, Tensor] = {}
@@ -109,7 +112,7 @@ def play_batched(world: Highway, start: HighwayState, driver: Driver) -> Played:
     return Played(sums, world.over(state), time.monotonic() - began)
 
 
-def play_environment(world: Highway, start: HighwayState, driver: Driver) -> Played:
+def play_environment(world: DirectHighway, start: HighwayState, driver: Driver) -> Played:
     """Play all rounds on highway-env, side by side, so that the driver decides for all at once."""
     from mirror_ppl.domains.highway import vehicles
     from mirror_ppl.domains.highway.road import TICKS
@@ -139,7 +142,7 @@ def play_environment(world: Highway, start: HighwayState, driver: Driver) -> Pla
 
 
 def rows_of(
-    simulator: str, driver: str, played: Played, scenario: Tensor, world: Highway
+    simulator: str, driver: str, played: Played, scenario: Tensor, world: DirectHighway
 ) -> list[dict[str, str | float]]:
     """Return a row for each scenario."""
     rows = []
@@ -162,7 +165,7 @@ def draw(path: Path) -> None:
     """Write the picture of docs/highway.md: the expert as a car cuts in, in clear and in fog."""
     from matplotlib.image import imsave
 
-    world = Highway()
+    world = DirectHighway()
     index = torch.tensor([world.scenarios.index("car on the left cuts in")])
     state = world.initial(1, torch.Generator().manual_seed(3), index)
     for _ in range(26):

@@ -1,8 +1,9 @@
 """Messages: the items communicated in one step, and their cost.
 
 A message is a set of items of the domain's modalities. Planners handle many at once as *flags*:
-boolean ``[..., N]``, one for each item of each modality in the order of the domain. Shape letters
-are those of `mirror_ppl.domains.base`; in addition, N is the number of all items.
+boolean ``[..., N]``, one for each item of each modality in the order of the domain; where a
+modality has groups, one for each group. Shape letters are those of `mirror_ppl.domains.base`; in
+addition, N is the number of all flags.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, Visibility, require_known
+from mirror_ppl.domains.base import Domain, Modality, Visibility, require_known
+from mirror_ppl.errors import UnknownNameError
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Message:
 
 
 class Channels:
-    """The layout of flags: which flag is which item of which modality.
+    """The layout of flags: which flag is which item, or group, of which modality.
 
     Args:
         domain: whose modalities they are.
@@ -56,21 +58,31 @@ class Channels:
 
     def __init__(self, domain: Domain) -> None:
         self.modalities = domain.modalities
-        self.sizes = [len(modality.items) for modality in domain.modalities]
-        self.pairs = [(m.name, item) for m in domain.modalities for item in m.items]
+        self.sizes = [len(modality.communicated) for modality in domain.modalities]
+        self.pairs = [(m.name, item) for m in domain.modalities for item in m.communicated]
 
     def __len__(self) -> int:
-        """Return the number of all items N."""
+        """Return the number of all flags N."""
         return len(self.pairs)
+
+    def flag_of(self, modality: str, item: int) -> int:
+        """Return the flag of an item of a modality, or of the group to which it belongs."""
+        begin = 0
+        for own, size in zip(self.modalities, self.sizes, strict=True):
+            if own.name == modality:
+                groups = [place for place, (_, items) in enumerate(own.groups) if item in items]
+                return begin + (groups[0] if groups else item)
+            begin += size
+        raise UnknownNameError.of("modality", modality, [own.name for own in self.modalities])
 
     def split(self, flags: Tensor) -> Visibility:
         """Split flags ``[..., N]`` into masks ``[..., K]`` by modality."""
         parts = flags.split(self.sizes, -1)
-        return {m.name: part for m, part in zip(self.modalities, parts, strict=True)}
+        return {m.name: _items(m, part) for m, part in zip(self.modalities, parts, strict=True)}
 
     def join(self, masks: Visibility) -> Tensor:
-        """Join masks ``[..., K]`` by modality into flags ``[..., N]``."""
-        return torch.cat([masks[modality.name] for modality in self.modalities], -1)
+        """Join masks ``[..., K]`` by modality into flags ``[..., N]``: groups with all items."""
+        return torch.cat([_groups(m, masks[m.name]) for m in self.modalities], -1)
 
     def marginal(self, number: int) -> Tensor:
         """Return each item's marginal cost ``[N]`` as the n-th of its modality in a step."""
@@ -80,8 +92,8 @@ class Channels:
 
     def cost(self, flags: Tensor) -> Tensor:
         """Return costs ``[...]`` in units of reward of flags ``[..., N]`` (supplement, Table I)."""
-        masks = self.split(flags)
-        costs = [modality.cost(masks[modality.name].sum(-1)) for modality in self.modalities]
+        parts = flags.split(self.sizes, -1)
+        costs = [m.cost(part.sum(-1)) for m, part in zip(self.modalities, parts, strict=True)]
         return torch.stack(costs).sum(0)
 
     def message(self, flags: Tensor) -> Message:
@@ -107,6 +119,23 @@ class Channels:
             for item in chosen:
                 flags[self.pairs.index((name, require_known(item, f"{name} item", known)))] = True
         return flags
+
+
+def _items(modality: Modality, flags: Tensor) -> Tensor:
+    """Return the items ``[..., K]`` of flagged groups."""
+    if not modality.groups:
+        return flags
+    owner = torch.empty(len(modality.items), dtype=torch.long, device=flags.device)
+    for group, (_, places) in enumerate(modality.groups):
+        owner[list(places)] = group
+    return flags[..., owner]
+
+
+def _groups(modality: Modality, mask: Tensor) -> Tensor:
+    """Return flags of groups all of whose items are in a mask ``[..., K]``."""
+    if not modality.groups:
+        return mask
+    return torch.stack([mask[..., list(places)].all(-1) for _, places in modality.groups], -1)
 
 
 def count_messages(allowed: Tensor, most: int | None = None) -> int:

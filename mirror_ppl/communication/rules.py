@@ -46,12 +46,11 @@ def nearest(domain: Domain, past: RoundSoFar, setting: str) -> Tensor:
     candidates = hidden & may & (distance <= domain.reach_bins[-1] / 2)
     if candidates.any():
         item = int(torch.where(candidates, distance, torch.inf).argmin())
-        masks = channels.split(flags)  # views into the flags
         spoken = domain.counterparts[item]
         if spoken is not None and may_say[item]:
-            masks["verbal"][spoken] = True
+            flags[channels.flag_of("verbal", spoken)] = True
         else:
-            masks["visual"][item] = True
+            flags[channels.flag_of("visual", item)] = True
     return flags
 
 
@@ -60,6 +59,8 @@ def at_random(
 ) -> Tensor:
     """Draw each allowed item with the probability of its modality, flags ``[N]``."""
     channels = Channels(domain)
-    chance = torch.cat([torch.full((len(m.items),), rates[m.name]) for m in domain.modalities])
+    chance = torch.cat(
+        [torch.full((len(m.communicated),), rates[m.name]) for m in domain.modalities]
+    )
     drawn = torch.rand(len(channels), generator=generator) < chance
     return drawn & channels.join(domain.communicable(past.now))

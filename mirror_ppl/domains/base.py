@@ -87,6 +87,8 @@ class Modality:
             in that order.
         utterances: for spoken items, the sentences about each by the value of its one feature: U
             sentences per item, for the values 0 to U - 1.
+        groups: names of sets of items that are communicated together, with the indices of their
+            items; each item is in one of them. Unless given, each item is communicated alone.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Modality:
     cost_coefficient: float
     image: tuple[int, int, int] | None = None
     utterances: tuple[tuple[str, ...], ...] = ()
+    groups: tuple[tuple[str, tuple[int, ...]], ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.features) == len(self.units) == len(self.scales):
@@ -108,9 +111,17 @@ class Modality:
                 f"modality {self.name!r}: each item needs a tuple of its utterances, expected "
                 f"{len(self.items)}, found {len(self.utterances)}"
             )
+        grouped = sorted(place for _, places in self.groups for place in places)
+        if self.groups and grouped != list(range(len(self.items))):
+            raise ValueError(f"modality {self.name!r}: each item belongs in exactly one group")
+
+    @property
+    def communicated(self) -> tuple[str, ...]:
+        """Names of what can be communicated: of groups, or else of items."""
+        return tuple(name for name, _ in self.groups) or self.items
 
     def cost(self, number: Tensor) -> Tensor:
-        """Return the cost in units of reward of communicating ``number`` items in one step."""
+        """Return the cost in units of reward of communicating ``number`` items (or groups)."""
         return self.cost_coefficient * number.to(torch.get_default_dtype()) ** 2
 
     def understand(self, utterance: str) -> tuple[int, int]:

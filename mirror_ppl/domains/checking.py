@@ -246,7 +246,7 @@ def _looks(world: World) -> list[str]:
         {n: v[:, :-1] for n, v in observation.items()},
         torch.stack(actions, 1),
     )
-    for name, value in observation.items():
+    for name, value in observation.items() if not world.partly_observed else ():
         if bool(((again[name] - value).abs() > TOLERANCE).any()):
             found.append(f"state_behind: {name} of the state is not what was observed")
         elif bool(((following[name] - value[:, 1:]).abs() > TOLERANCE).any()):

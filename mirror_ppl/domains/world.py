@@ -8,6 +8,7 @@ step-by-step guide.
 
 from __future__ import annotations
 
+import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -55,6 +56,8 @@ class World(ABC):
         record: this world's settings of training, planning and networks, its people and pictures;
             see :class:`~mirror_ppl.domains.record.Record`.
         mishap: reward term of a harmful event, and the plural of its name.
+        partly_observed: True if full observations do not determine states; `state_behind` is then
+            an estimate.
     """
 
     name: str
@@ -71,6 +74,7 @@ class World(ABC):
     lasting: tuple[str, ...] = ()
     record: Record = Record()
     mishap: tuple[str, str]
+    partly_observed: bool = False
 
     scenarios: tuple[str, ...] = ("any",)
     over_at_horizon: bool = True
@@ -178,7 +182,7 @@ class World(ABC):
         """Return the state ``[...]`` with this full observation.
 
         Unobserved parts must not matter: states with equal observations lead to equal observations
-        and rewards.
+        and rewards. In a world that is ``partly_observed`` this is an estimate.
         """
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
@@ -283,7 +287,9 @@ class World(ABC):
         return torch.zeros_like(far, dtype=torch.long), far
 
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
-        """Return the full observation after an action ``[...]``."""
+        """Return the full observation after an action ``[...]``; NaN if ``partly_observed``."""
+        if self.partly_observed:
+            return {name: torch.full_like(part, math.nan) for name, part in observation.items()}
         return self.observe(self.transition(self.state_behind(observation), action))
 
     def nearest(self, observation: Observation) -> Observation:

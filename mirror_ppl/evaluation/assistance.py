@@ -191,6 +191,9 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
     if own.oracle is not None:
         best = own.oracle(listener.driver, start)
         return lambda rounds, _: (best(torch.stack([past.actions for past in rounds])), None)
+    if (best_now := own.best_messages) is not None:
+        person = listener.driver
+        return lambda _, truth: (best_now(person, truth.state, truth.memory), None)
     knows = ReachableOracle(listener.driver, start)
     return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
 

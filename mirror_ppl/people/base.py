@@ -27,11 +27,14 @@ class DomainPeople:
         oracle: maps one person and the initial states of rounds to a function from actions
             ``[R, t]`` to the best messages ``[R, items]``; unless given, the oracle enumerates
             reachable states (:mod:`mirror_ppl.evaluation.reachable_oracle`).
+        best_messages: where states are too many for that, maps one person, the true states
+            ``[1, R]`` and their memories ``[1, R]`` to messages ``[R, items]``.
     """
 
     populations: tuple[str, ...]
     simulated: Callable[..., SimulatedPeople]
     oracle: Callable[[Any, Any], Callable[[Tensor], Tensor]] | None = None
+    best_messages: Callable[[Any, Any, Any], Tensor] | None = None
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,26 @@ from mirror_ppl.training.views import ViewPlan
 
 
 @dataclass(frozen=True)
+class Kept:
+    """What is kept of rounds, where it takes long to compute.
+
+    Attributes:
+        states: ``[B, T + 1]``.
+        values: the planner's, ``[B, T, A]``, if they are learned.
+    """
+
+    states: Any
+    values: Tensor | None = None
+
+    def window(self, rows: Tensor, begin: int, steps: int) -> Kept:
+        """Return some of these rounds, from a step on."""
+        return Kept(
+            map_state(lambda part: part[rows, begin : begin + steps + 1], self.states),
+            None if self.values is None else self.values[rows, begin : begin + steps],
+        )
+
+
+@dataclass(frozen=True)
 class Outcomes:
     """Outcomes of one action at some steps, to the best knowledge of the observer.
 
@@ -77,6 +97,7 @@ def experience(
     first: int = 0,
     stride: int = 1,
     discount: float | None = None,
+    kept: Kept | None = None,
 ) -> Experience:
     """Compute the experience of an observer with a view.
 
@@ -91,9 +112,13 @@ def experience(
         first: first step at which the outcomes of every action are computed.
         stride: distance between these steps.
         discount: discount of exact values, which are computed only if it is given.
+        kept: states of these rounds, if they are known; else they are computed. With values, no
+            outcomes are computed.
     """
-    states = roll_out(domain, start, actions)
-    visible, knowledge = follow(domain, plan, domain.observe(states))
+    states = roll_out(domain, start, actions) if kept is None else kept.states
+    values = None if kept is None else kept.values
+    observation = domain.observe(states)
+    seen_along, knowledge = follow(domain, plan, observation)
     believed = supposed(domain, plan, states, knowledge)
     current, so_far = (
         map_state(lambda part: part[:, :-1], whole) for whole in (believed, knowledge)
@@ -102,21 +127,15 @@ def experience(
     steps = slice(first, actions.shape[1], stride)
     some, known = (map_state(lambda part: part[:, steps], whole) for whole in (current, so_far))
 
-    def outcome(action: Tensor) -> Outcomes:
-        following = domain.transition(some, action)
-        observation = domain.observe(following)
-        seen, after = plan.look(domain, known, observation, 1 + first, stride)
-        taken = plan.taken(domain, after, observation)
-        return Outcomes(
-            reward=total_reward(domain.rewards(some, action, following)),
-            over=domain.over(following),
-            observation=observation,
-            visible={name: mask | taken[name] for name, mask in seen.items()},
-        )
-
-    observation = domain.observe(believed)
+    outcomes = ()
+    if values is None:
+        outcomes = _outcomes(domain, plan, some, known, 1 + first, stride)
+    if plan.assumes:
+        later, observation = domain.transition(current, actions), domain.observe(believed)
+    else:  # the world is as believed, and what followed is known
+        later = map_state(lambda part: part[:, 1:], states)
     taken = plan.taken(domain, knowledge, observation)
-    visible = {name: mask | taken[name] for name, mask in visible.items()}
+    visible = {name: mask | taken[name] for name, mask in seen_along.items()}
     informed = torch.stack(
         [(visible[name] | ~needed).all(-1) for name, needed in domain.decisive(observation).items()]
     ).all(0)
@@ -125,20 +144,51 @@ def experience(
             observation=observation,
             visible=visible,
             actions=actions,
-            rewards=total_reward(
-                domain.rewards(current, actions, domain.transition(current, actions))
-            ),
+            rewards=total_reward(domain.rewards(current, actions, later)),
         ),
-        outcomes=tuple(
-            outcome(torch.full_like(actions[:, steps], index))
-            for index in range(len(domain.actions))
-        ),
+        outcomes=outcomes,
         over=domain.over(some),
-        exact=None if discount is None else domain.reference_values(some, discount),
+        exact=_exact(domain, some, discount) if values is None else values[:, steps],
         informed=informed[:, steps],
         first=first,
         stride=stride,
     )
+
+
+def _exact(domain: Domain, states: Any, discount: float | None) -> Tensor | None:
+    return None if discount is None else domain.reference_values(states, discount)
+
+
+def _outcomes(
+    domain: Domain, plan: ViewPlan, states: Any, knowledge: Any, first: int, stride: int
+) -> tuple[Outcomes, ...]:
+    """Return the outcomes of each action in states ``[B, T']``.
+
+    Args:
+        domain: the world.
+        plan: views of B rounds.
+        states: as believed.
+        knowledge: in these states.
+        first: step after the first of these states.
+        stride: distance between their steps.
+    """
+    # All actions at once, as worlds may take many small steps.
+    number = len(domain.actions)
+    batch = map_state(lambda part: part.repeat(number, *(1,) * (part.dim() - 1)), states)
+    over = domain.over(states)
+    each = torch.arange(number, device=over.device).repeat_interleave(len(over))
+    tried = each[:, None].expand(-1, over.shape[1])
+    following = domain.transition(batch, tried)
+    earned = total_reward(domain.rewards(batch, tried, following)).chunk(number)
+    ends, observed = domain.over(following).chunk(number), domain.observe(following)
+    outcomes = []
+    for action, (reward, end) in enumerate(zip(earned, ends, strict=True)):
+        now = {name: value.chunk(number)[action] for name, value in observed.items()}
+        visible, after = plan.look(domain, knowledge, now, first, stride)
+        taken = plan.taken(domain, after, now)
+        visible = {name: mask | taken[name] for name, mask in visible.items()}
+        outcomes.append(Outcomes(reward, end, now, visible))
+    return tuple(outcomes)
 
 
 def follow(domain: Domain, plan: ViewPlan, observation: Observation) -> tuple[Visibility, Any]:
@@ -204,9 +254,11 @@ def drive(
         evidence = evidence + self_model.encoder.action(previous)
         belief = self_model.encoder(belief, evidence).mean
         action = self_model.action_values(belief).argmax(-1)
-        if expert > 0:
-            best = domain.reference_values(state, discount).argmax(-1)
-            action = torch.where(by_expert, best, action)
+        if by_expert.any():
+            led = map_state(lambda part: part[by_expert], state)
+            action = action.index_put(
+                (by_expert,), domain.reference_values(led, discount).argmax(-1)
+            )
         if epsilon > 0:
             lost = torch.rand(batch, generator=generator, device=device) < epsilon
             anything = torch.randint(

@@ -23,15 +23,18 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
-from mirror_ppl.domains.base import Domain, map_state
+from mirror_ppl.domains.base import Domain, map_state, roll_out
 from mirror_ppl.domains.record import settings_of
 from mirror_ppl.domains.registry import code_of, get_domain
 from mirror_ppl.domains.world import offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
-from mirror_ppl.training.experience import Experience, drive, experience
+from mirror_ppl.training.experience import Experience, Kept, drive, experience
 from mirror_ppl.training.views import KIND_PROBABILITIES, KINDS, draw_views
+
+VALUED = 1024
+"""States of which values are computed at once; bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class SelfModelOptions:
         world_weight: weight of the negative ELBO per observation.
         speech_weight: weight of messages in the ELBO; pictures have many more numbers.
         length: steps of a training round; the domain's horizon if 0.
+        window: steps of these rounds in a gradient step, from a random one on; all of them if 0.
+            States are then kept, which takes memory, and not recomputed, which would take time.
         stride: values are learned at one of every ``stride`` steps; the offset is random.
         difference_weight: weight of errors in the differences between actions, added to the errors
             themselves. Choices of people depend on these differences alone.
@@ -64,6 +69,9 @@ class SelfModelOptions:
             draws of the guide. Means are exact sooner where decisive items are clearly visible.
         exact: True to learn the exact planner's values, where there is one, for observers who know
             all decisive items, instead of bootstrapped values.
+        distil: True to learn the planner's values of the true state in every view: their mean,
+            given what is seen. They are computed once for each driven state; only for planners
+            whose values hold without further observations, and with ``window``.
     """
 
     phases: int = 40
@@ -81,11 +89,13 @@ class SelfModelOptions:
     world_weight: float = 0.01
     speech_weight: float = 1.0
     length: int = 0
+    window: int = 0
     stride: int = 1
     difference_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     at_means: bool = False
     exact: bool = False
+    distil: bool = False
 
     @classmethod
     def of(cls, domain: str, **changes: Any) -> Self:
@@ -106,6 +116,8 @@ class SelfModelOptions:
             raise ValueError(
                 f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
             )
+        if self.distil and not self.window:
+            raise ValueError("distil needs a window: values are kept with the states of rounds")
         if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:
             raise ValueError(
                 f"kinds must be {len(KINDS)} numbers, not negative and not all 0, not {self.kinds}"
@@ -151,6 +163,27 @@ def self_model_loss(
         evidence = self_model.evidence(rounds.observation, rounds.visible, rounds.actions)
         belief = self_model.believe(evidence[:, :-1])
     belief = belief[:, lived.steps]
+    goal = (
+        lived.exact if options.distil else _bootstrapped(self_model, target, lived, options, belief)
+    )
+    assert goal is not None
+    # Once a round is over (possibly in every round) actions do not matter.
+    error = (self_model.action_values(belief) - goal)[~lived.over]
+    unlike = error - error.mean(-1, keepdim=True)
+    bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
+    total = options.world_weight * negative_elbo + bellman + options.difference_weight * apart
+    return Loss(total, negative_elbo.detach(), bellman.detach())
+
+
+def _bootstrapped(
+    self_model: SelfModel,
+    target: torch.nn.Module,
+    lived: Experience,
+    options: SelfModelOptions,
+    belief: Tensor,
+) -> Tensor:
+    """Return the goals ``[B, T', A]`` of action values at beliefs ``[B, T', Z]``."""
+    steps = lived.rounds.actions.shape[1]
     goals = []
     with torch.no_grad():
         for action, outcome in enumerate(lived.outcomes):
@@ -165,12 +198,7 @@ def self_model_loss(
     goal = torch.stack(goals, -1)
     if lived.exact is not None:
         goal = torch.where(lived.informed[..., None], lived.exact, goal)
-    # Once a round is over (possibly in every round) actions do not matter.
-    error = (self_model.action_values(belief) - goal)[~lived.over]
-    unlike = error - error.mean(-1, keepdim=True)
-    bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
-    total = options.world_weight * negative_elbo + bellman + options.difference_weight * apart
-    return Loss(total, negative_elbo.detach(), bellman.detach())
+    return goal
 
 
 def train_self_model(
@@ -249,6 +277,7 @@ class _Trainer:
         )
         self.starts: list[Any] = []
         self.actions: list[Tensor] = []
+        self.kept: list[Kept] = []
         self.phase = 0
 
     def run(self, report: Callable[[int, str], None], checkpoint: Path | None) -> None:
@@ -328,8 +357,9 @@ class _Trainer:
     def _learn(self) -> str:
         options = self.options
         exact = options.exact and offers(self.domain, "reference_values")
-        starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
         actions = torch.cat(self.actions)
+        starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
+        kept = self._kept() if options.window else None
         elbo = bellman = 0.0
         for step in range(options.steps):
             chosen = torch.randint(
@@ -338,17 +368,23 @@ class _Trainer:
                 generator=self.generator,
                 device=self.generator.device,
             )
-            steps = actions.shape[1]
-            plan = draw_views(self.domain, options.batch, steps, self.generator, options.kinds)
-            start = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
+            acted, lived_through = actions[chosen], None
+            if kept is not None:
+                begin = self._drawn(actions.shape[1] - options.window + 1)
+                acted = acted[:, begin : begin + options.window]
+                lived_through = kept.window(chosen, begin, options.window)
+            plan = draw_views(
+                self.domain, options.batch, acted.shape[1], self.generator, options.kinds
+            )
             lived = experience(
                 self.domain,
-                start,
-                actions[chosen],
+                map_state(lambda part: part[chosen], starts),  # noqa: B023 - used at once
+                acted,
                 plan,
-                self._first(),
+                self._drawn(options.stride),
                 options.stride,
                 options.discount if exact else None,
+                lived_through,
             )
             means = options.at_means or step % 2 == 1
             loss = self_model_loss(self.self_model, self.target, lived, options, means)
@@ -362,12 +398,39 @@ class _Trainer:
             bellman += float(loss.bellman) / options.steps
         return f"elbo {elbo:.2f} per observation, bellman error {bellman:.3f}"
 
-    def _first(self) -> int:
-        """Random first step at which values are learned; the others follow every ``stride``."""
-        if self.options.stride == 1:
+    def _kept(self) -> Kept:
+        """Return all rounds, with what is kept of them."""
+        rounds = list(zip(self.starts, self.actions, strict=True))
+        for start, actions in rounds[len(self.kept) :]:
+            states = roll_out(self.domain, start, actions)
+            self.kept.append(Kept(states, self._values(states) if self.options.distil else None))
+        values = [one.values for one in self.kept if one.values is not None]
+        return Kept(
+            map_state(lambda *parts: torch.cat(parts), *(one.states for one in self.kept)),
+            torch.cat(values) if values else None,
+        )
+
+    def _values(self, states: Any) -> Tensor:
+        """Return the planner's values ``[B, T, A]`` of states ``[B, T + 1]``."""
+        before = map_state(lambda part: part[:, :-1], states)
+        batch, steps = self.domain.over(before).shape
+        rows = torch.arange(batch * steps, device=self.generator.device).split(VALUED)
+        flat = map_state(lambda part: part.flatten(0, 1), before)
+        parts = [
+            self.domain.reference_values(
+                map_state(lambda part: part[some], flat),  # noqa: B023 - used at once
+                self.options.discount,
+            )
+            for some in rows
+        ]
+        return torch.cat(parts).view(batch, steps, -1)
+
+    def _drawn(self, number: int) -> int:
+        """Return a random whole number from 0 to below another."""
+        if number == 1:
             return 0
         device = self.generator.device
-        return int(torch.randint(self.options.stride, (), generator=self.generator, device=device))
+        return int(torch.randint(number, (), generator=self.generator, device=device))
 
     @torch.no_grad()
     def _follow(self) -> None:

@@ -239,23 +239,23 @@ def test_messages_that_do_not_reach_a_person_change_nothing(driving):
         assert not torch.equal(seen(told, **hearing, **{f"hears_{other}": 0}), silent)
 
 
-def of_kind(human, seed, **known):
+def of_kind(human, seed, rounds=6, **known):
     implants = {name: value[0] for name, value in draw_prior(human, 2, 1, seed).items()}
     implants |= {name: torch.full((2, 1), value) for name, value in known.items()}
-    return play_rounds(human, implants, 12, "fog", torch.Generator().manual_seed(seed))
+    return play_rounds(human, implants, rounds, "fog", torch.Generator().manual_seed(seed))
 
 
 @pytest.mark.parametrize(
-    ("kind", "model", "known"),
+    ("kind", "model", "rounds", "known"),
     [
-        ("mirror", HumanModel, {"consistency": 4.0}),
-        ("preferring", Preferring, {"consistency": 4.0, SHARES_GOAL: -0.8}),
-        ("noticing", Noticing, {"consistency": 4.0, NOTICES: 0.5}),
-        ("forgetting", Forgetting, {"consistency": 4.0, FORGETS: 0.7}),
+        ("mirror", HumanModel, 6, {"consistency": 4.0}),
+        ("preferring", Preferring, 6, {"consistency": 4.0, SHARES_GOAL: -0.8}),
+        ("noticing", Noticing, 12, {"consistency": 4.0, NOTICES: 0.5}),
+        ("forgetting", Forgetting, 6, {"consistency": 4.0, FORGETS: 0.7}),
     ],
 )
-def test_kinds_are_distinguished(driving, kind, model, known):
-    recordings = of_kind(model(driving), 100, **known).select_people([0])
+def test_kinds_are_distinguished(driving, kind, model, rounds, known):
+    recordings = of_kind(model(driving), 100, rounds, **known).select_people([0])
     options = InferenceOptions("importance", 100, ImportanceOptions(proposals=256, enough=100))
     found = infer(AnyKind(driving), recordings, options, 1)
     own = (found.draws[KIND][:, :, 0] == list(KINDS).index(kind)).float().mean(0)
@@ -264,7 +264,7 @@ def test_kinds_are_distinguished(driving, kind, model, known):
 
 
 def test_a_fit_reports_the_probability_of_each_model(driving):
-    recordings = of_kind(Late(driving), 100, **{LATE: 0.95, "consistency": 4.0})
+    recordings = of_kind(Late(driving), 100, 8, **{LATE: 0.95, "consistency": 4.0})
     few = {"settings": {"proposals": 256, "enough": 100}, "draws": 100, "explore": 0}
     one = recordings.select_people([0])
     fit = mirror_ppl.infer(one, human="all", engine="importance", **few, seed=1)

@@ -16,7 +16,7 @@ class HighwayEnv(RoundEnv):
     """Three lanes, traffic with one manoeuvre that calls for a response, and lidar.
 
     ## Description
-    A round of `mirror_ppl.domains.highway.Highway`, seen by an unaided person in one of its
+    A round of `mirror_ppl.domains.highway.DirectHighway`, seen by an unaided person in one of its
     settings. Vehicles are highway-env's and move by its physics; observations and rewards are the
     domain's. The domain's own batched physics agrees with it, which tests compare.
 
@@ -33,12 +33,13 @@ class HighwayEnv(RoundEnv):
 
     | key           | shape   | type    | feature                    | unit  | range      |
     |---------------|---------|---------|----------------------------|-------|------------|
-    | `ego`         | (6,)    | float32 | lane                       | index | 0 to 2     |
+    | `ego`         | (7,)    | float32 | lane                       | index | 0 to 2     |
     |               |         |         | lane offset, to the right  | m     | -10 to 10  |
     |               |         |         | heading, clockwise         | rad   | -pi to pi  |
     |               |         |         | speed                      | m/s   | -1 to 20   |
     |               |         |         | last steering              | share | -1 to 1    |
     |               |         |         | last acceleration          | share | -1 to 1    |
+    |               |         |         | accident                   |       | 0 or 1     |
     | `visual`      | (36, 3) | float32 | distance                   | m     | 0 to 60    |
     |               |         |         | relative velocity along    | m/s   | -60 to 60  |
     |               |         |         | relative velocity across   | m/s   | -60 to 60  |

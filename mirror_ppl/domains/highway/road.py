@@ -27,10 +27,12 @@ OTHERS = 8
 
 TICK = 0.05
 """Seconds of a step of the physics (20 Hz)."""
+ROUND_TICKS = 480
+"""Ticks of a round: 24 seconds."""
+DECISION_TICKS = 10
+"""Ticks of a manoeuvre: people decide twice a second."""
 TICKS = 4
-"""Ticks of a decision: the driver decides five times a second."""
-STEPS = 120
-"""Decisions of a round: 24 seconds."""
+"""Ticks for which steering and acceleration are held: they are set five times a second."""
 
 MAX_STEERING = 0.2
 """Radians of the front wheels at a steering action of 1: at 40 km/h half a g across the road."""

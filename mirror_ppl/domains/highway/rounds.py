@@ -16,7 +16,7 @@ from mirror_ppl.domains.highway.lidar import RANGE
 from mirror_ppl.domains.highway.road import LANES, TICK, TICKS
 from mirror_ppl.domains.highway.speech import NOTHING
 from mirror_ppl.domains.highway.state import HighwayState
-from mirror_ppl.domains.highway.world import Highway
+from mirror_ppl.domains.highway.world import DirectHighway
 
 FASTEST = 60.0
 """m/s that no relative velocity exceeds."""
@@ -41,11 +41,11 @@ class RoundEnv(DomainEnv):
         "render_modes": list(RENDER_MODES),
         "render_fps": round(1 / (TICK * TICKS)),
     }
-    domain: ClassVar[Any] = Highway()
+    domain: ClassVar[Any] = DirectHighway()
     limits: ClassVar[Mapping[str, tuple[list[float], list[float]]]] = {
         "ego": (
-            [0.0, -10.0, -np.pi, -1.0, -1.0, -1.0],
-            [LANES - 1.0, 10.0, np.pi, 20.0, 1.0, 1.0],
+            [0.0, -10.0, -np.pi, -1.0, -1.0, -1.0, 0.0],
+            [LANES - 1.0, 10.0, np.pi, 20.0, 1.0, 1.0, 1.0],
         ),
         "visual": ([0.0, -FASTEST, -FASTEST], [RANGE, FASTEST, FASTEST]),
         "verbal": ([0.0], [float(NOTHING)]),
@@ -64,7 +64,7 @@ class RoundEnv(DomainEnv):
         """Return the simulator's state now, without batch."""
 
     def _actions(self) -> spaces.Space[Any]:
-        return spaces.Box(-1.0, 1.0, (len(self.domain.actions),), np.float32)
+        return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def _checked(self, action: Any) -> Tensor | None:
         if np.shape(action) != self.action_space.shape:

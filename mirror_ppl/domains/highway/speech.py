@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.highway.lidar import RANGE
-from mirror_ppl.domains.highway.road import LANES
 from mirror_ppl.domains.highway.state import HighwayState
 
 DIRECTIONS = ("front", "front-right", "rear-right", "rear", "rear-left", "front-left")
@@ -74,9 +73,3 @@ def utterances(state: HighwayState) -> Tensor:
     brakes = state.acceleration[..., 1:].gather(-1, nearest) <= -BRAKING
     said = torch.where(brakes, WORDS.index("braking"), said)
     return torch.where(least <= RANGE, said, NOTHING)
-
-
-def on_road(state: HighwayState) -> Tensor:
-    """Return whether there is a lane in each direction ``[..., 6]``."""
-    lane = state.lane[..., :1] + torch.tensor(SIDES, device=state.lane.device)
-    return (lane >= 0) & (lane < LANES)

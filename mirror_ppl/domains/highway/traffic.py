@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.highway.geometry import overlap
+from mirror_ppl.domains.highway.manoeuvres import controls
 from mirror_ppl.domains.highway.road import (
     EGO_SPEEDS,
     LANE_WIDTH,
@@ -73,19 +74,21 @@ SMALL = 1e-2
 """Speeds, distances: nothing is divided by less."""
 
 
-def transition(state: HighwayState, action: Tensor) -> HighwayState:
-    """Return the state a decision later; rounds that are over stay as they are.
+def transition(state: HighwayState, action: Tensor, ticks: int = TICKS) -> HighwayState:
+    """Return the state some ticks later; rounds that are over stay as they are.
 
     Args:
         state: ``[...]``.
-        action: the ego's steering (positive to the right) and acceleration ``[..., 2]``; values
-            beyond [-1, 1] count as the nearest within.
+        action: the ego's manoeuvre ``[...]``, which a controller carries out tick by tick; or
+            steering (positive to the right) and acceleration ``[..., 2]``, which are held.
+        ticks: number of ticks.
     """
-    action = action.clamp(-1, 1).to(state.x.dtype)
     start, shape = flat(state)
-    now = replace(start, controls=action.expand(*shape, 2).reshape(-1, 2))
-    for _ in range(TICKS):
-        later = tick(now)
+    held = action.is_floating_point()
+    action = action.expand(*shape, 2).reshape(-1, 2) if held else action.expand(shape).reshape(-1)
+    now = start
+    for _ in range(ticks):
+        later = tick(replace(now, controls=controls(now, action)))
         now = where(now.crashed, now, later) if now.crashed.any() else later
     return shaped(where(start.over, start, now) if start.over.any() else now, shape)
 

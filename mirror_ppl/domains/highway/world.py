@@ -3,9 +3,14 @@
 Description
     The person drives a car on a straight road of three lanes among eight others, as fast as 40 km/h
     allows. Others follow and change lanes as highway-env's vehicles do; in each scenario one or two
-    of them do something that calls for a response. Physics runs at 20 Hz, decisions at 5 Hz.
+    of them do something that calls for a response. Physics runs at 20 Hz, and people decide
+    twice a second.
 
-Actions, both in [-1, 1]
+Actions
+    Twelve manoeuvres (:mod:`mirror_ppl.domains.highway.manoeuvres`), each a lane to aim for and a
+    speed; a controller turns them into steering and acceleration. The functions of the domain also
+    take these themselves, both in [-1, 1], as the Gymnasium environment and CARLA do:
+
     ============  ==========================================================
     steering      share of 0.2 rad at the front wheels, positive to the right
     acceleration  share of 5 m/s2, negative to brake
@@ -19,6 +24,7 @@ Observations
     ego       speed            m/s
     ego       steering         share     of the last action
     ego       acceleration     share     of the last action
+    ego       accident         0 or 1    whether an accident has ended the round
     visual    distance         m         nearest car in each of 36 sectors; 60 m in an empty one
     visual    velocity_along   m/s       of that car relative to the ego, along its heading
     visual    velocity_across  m/s       and across it, to the right
@@ -33,7 +39,7 @@ Rewards
 
 Start and end
     See :mod:`mirror_ppl.domains.highway.scenarios` for the start. A round ends with an accident, or
-    after 120 decisions (24 s), when recording merely stops. All chance is in the start: the state
+    after 48 decisions (24 s), when recording merely stops. All chance is in the start: the state
     holds when manoeuvres begin.
 
 Version history
@@ -43,42 +49,93 @@ Version history
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
-from mirror_ppl.domains.highway import reward, scenarios, traffic
-from mirror_ppl.domains.highway.lidar import SECTORS, scan
-from mirror_ppl.domains.highway.messages import SEEN, SPOKEN
-from mirror_ppl.domains.highway.road import STEPS, centre_of, wrapped
-from mirror_ppl.domains.highway.speech import on_road, utterances
+from mirror_ppl.domains.highway import estimate, expert, reward, scenarios, traffic
+from mirror_ppl.domains.highway.lidar import RANGE, SECTORS, scan
+from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, controls
+from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SPOKEN, group_of
+from mirror_ppl.domains.highway.record import RECORD
+from mirror_ppl.domains.highway.road import (
+    DECISION_TICKS,
+    LANE_WIDTH,
+    LANES,
+    LIMIT,
+    ROUND_TICKS,
+    TICKS,
+    centre_of,
+    wrapped,
+)
+from mirror_ppl.domains.highway.speech import DIRECTIONS, NOTHING, SIDES, utterances
 from mirror_ppl.domains.highway.state import HighwayState
+from mirror_ppl.domains.world import World
 
 FOG_AHEAD, FOG_BEHIND = 15.0, 5.0
 """Metres that people see in fog, in sectors of the front half and in all others."""
+KNOTS = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, RANGE)
+"""Metres between which networks read distances, and possible thresholds of sight."""
+SIGHT_OF = (0, 1, 2, 3, 2, 1)
+"""Direction of sight of each group of sectors."""
+_DIRECTION_OF = tuple(SIGHT_OF[group_of(sector)] for sector in range(SECTORS))
+STRAIGHT = 0.15
+"""Radians, a typical heading."""
 
 
-class Highway:
-    """The highway domain; see the module's description.
+@dataclass(frozen=True)
+class Nothing:
+    """Knowledge of people who see afresh at each decision; beliefs alone remember.
 
-    States are batched, and all functions pure, as in other worlds. Actions are continuous, which
-    commands do not support yet, so that this world is not in the registry.
+    Attributes:
+        nothing: an empty tensor ``[..., 0]``.
     """
+
+    nothing: Tensor
+
+
+class Highway(World):
+    """The highway domain; see the module's description."""
 
     name = "highway"
     version = "1"
     modalities: tuple[Modality, ...] = (SEEN, SPOKEN)
-    ego_features = ("lane", "lane_offset", "heading", "speed", "steering", "acceleration")
-    ego_units = ("index", "m", "rad", "m/s", "share", "share")
-    actions = ("steering", "acceleration")
-    horizon = STEPS
+    ego_features: tuple[str, ...] = (
+        "lane", "lane_offset", "heading", "speed", "steering", "acceleration", "accident",
+    )  # fmt: skip
+    ego_units = ("index", "m", "rad", "m/s", "share", "share", "0 or 1")
+    levels: Mapping[str, range] = {"lane": range(LANES), "accident": range(2)}
+    actions: tuple[str, ...] = MANOEUVRES
+    ticks = DECISION_TICKS
+    horizon = ROUND_TICKS // DECISION_TICKS
     over_at_horizon = False
+    partly_observed = True
     settings: tuple[str, ...] = ("clear", "fog")
     scenarios: tuple[str, ...] = scenarios.NAMES
     reward_terms: tuple[str, ...] = reward.TERMS
     mishap = ("accident", "accidents")
+    directions: tuple[str, ...] = ("ahead", "ahead_aside", "behind_aside", "behind")
+    direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
+    reach_bins: tuple[float, ...] = KNOTS
+    reach_unit = "m"
+    partial_views: Mapping[str, tuple[float, ...]] = {
+        "fog": (FOG_AHEAD, FOG_AHEAD, FOG_BEHIND, FOG_BEHIND),
+        "ahead only": (RANGE, RANGE, 0.0, 0.0),
+    }
+    told_practice = 0.1
+    counterparts: tuple[int | None, ...] = tuple(group_of(sector) for sector in range(SECTORS))
+    symbol_sizes: Mapping[str, int] = {
+        "ego": LANES + 6,
+        "visual": len(KNOTS) + 2,
+        "verbal": NOTHING + 1,
+    }
+    record = RECORD
 
     def initial(
         self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
@@ -90,32 +147,29 @@ class Highway:
             generator: source of randomness; its device is that of the states.
             scenario: indices ``[batch]`` into ``scenarios``; drawn uniformly unless given.
         """
-        if scenario is None:
-            many, device = len(self.scenarios), generator.device
-            scenario = torch.randint(many, (batch,), generator=generator, device=device)
-        return scenarios.initial(scenario, generator)
+        return scenarios.initial(self.scenario(batch, generator, scenario), generator)
 
     def transition(self, state: HighwayState, action: Tensor) -> HighwayState:
         """Return the state after a decision; nothing moves once a round is over.
 
         Args:
             state: ``[...]``.
-            action: steering and acceleration ``[..., 2]``, cut to [-1, 1].
+            action: manoeuvres ``[...]``, or steering and acceleration ``[..., 2]``.
         """
-        return traffic.transition(state, action)
+        return traffic.transition(state, action, self.ticks)
 
     def rewards(
         self, state: HighwayState, action: Tensor, following: HighwayState
     ) -> dict[str, Tensor]:
         """Return reward terms ``[...]`` by name, in units of reward."""
-        return reward.rewards(state, action, following)
+        return reward.rewards(state, controls(state, action), following)
 
     def over(self, state: HighwayState) -> Tensor:
         """Return where ``[...]`` a collision or the end of the shoulder has ended the round."""
         return state.over
 
     def observe(self, state: HighwayState) -> Observation:
-        """Return everything: ego ``[..., 6]``, visual ``[..., 36, 3]``, verbal ``[..., 6, 1]``."""
+        """Return everything: ego ``[..., 7]``, visual ``[..., 36, 3]``, verbal ``[..., 6, 1]``."""
         lane = state.lane[..., 0]
         ego = [
             lane.to(state.x.dtype),
@@ -123,12 +177,24 @@ class Highway:
             wrapped(state.heading[..., 0]),
             state.speed[..., 0],
             *state.controls.unbind(-1),
+            state.over.to(state.x.dtype),
         ]
         return {
             "ego": torch.stack(ego, -1),
             "visual": scan(state),
             "verbal": utterances(state)[..., None].to(state.x.dtype),
         }
+
+    def state_behind(self, observation: Observation) -> HighwayState:
+        """Return an estimate ``[...]``, see :mod:`mirror_ppl.domains.highway.estimate`."""
+        return estimate.state_of(observation)
+
+    def reference_values(self, state: HighwayState, discount: float) -> Tensor:
+        """Return the expert's values ``[..., A]``: of keeping up each manoeuvre for 4 s.
+
+        They are those of a planner that looks ahead, not exact.
+        """
+        return expert.values(state, expert.ExpertOptions(ticks=self.ticks, discount=discount))
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
         """Return what an unaided person sees: sectors ``[..., 36]``, and no sentences ``[..., 6]``.
@@ -142,17 +208,85 @@ class Highway:
         said = torch.zeros_like(observation["verbal"][..., 0], dtype=torch.bool)
         return {"visual": distance <= reach, "verbal": said}
 
-    def communicable(self, state: HighwayState) -> Visibility:
-        """Return what may be communicated: groups and directions ``[..., 6]``.
+    def communicable(self, observation: Observation) -> Visibility:
+        """Return what may be communicated: sectors ``[..., 36]`` and directions ``[..., 6]``.
 
-        All groups may be shown. Directions in which there is no lane are not spoken of.
+        All sectors may be shown. Directions in which there is no lane are not spoken of.
         """
-        said = on_road(state)
-        return {"visual": torch.ones_like(said), "verbal": said}
+        shown = torch.ones_like(observation["visual"][..., 0], dtype=torch.bool)
+        sides = torch.tensor(SIDES, device=shown.device)
+        lane = observation["ego"][..., :1].round() + sides
+        return {"visual": shown, "verbal": (lane >= 0) & (lane < LANES)}
 
-    def describe(self, observation: Observation, item: int) -> str:
-        """Return the true sentence about a direction, from one observation."""
-        return SPOKEN.utterances[item][round(float(observation["verbal"][item, 0]))]
+    def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
+        """Return the direction of sight and the distance in metres of each sector ``[..., 36]``."""
+        distance = observation["visual"][..., 0]
+        own = torch.tensor(
+            [SIGHT_OF[group_of(sector)] for sector in range(SECTORS)], device=distance.device
+        )
+        return own.expand(distance.shape), distance
+
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> Any:
+        """Return knowledge ``[*batch]``: none."""
+        return Nothing(torch.zeros(*batch, 0, dtype=torch.bool, device=device))
+
+    def learn(
+        self, knowledge: Any, observation: Observation, visible: Visibility, sees: Any
+    ) -> Any:
+        """Return knowledge ``[...]`` after a step: none, as everything moves."""
+        del observation, visible, sees
+        return knowledge
+
+    def known(self, knowledge: Any) -> Visibility:
+        """Return known items ``[..., K]``: none."""
+        shape = knowledge.nothing.shape[:-1]
+        return {
+            m.name: torch.zeros(
+                *shape, len(m.items), dtype=torch.bool, device=knowledge.nothing.device
+            )
+            for m in self.modalities
+        }
+
+    def symbols(self, observation: Observation) -> dict[str, Tensor]:
+        """Encode observations for networks; distances by their place between ``KNOTS``."""
+        lane, offset, heading, speed, *others = observation["ego"].unbind(-1)
+        rest = [offset / LANE_WIDTH, heading / STRAIGHT, speed / LIMIT, *others]
+        ego = torch.cat(
+            [
+                one_hot(lane.round().long().clamp(0, LANES - 1), LANES).to(offset),
+                torch.stack(rest, -1),
+            ],
+            -1,
+        )
+        distance, *velocity = observation["visual"].unbind(-1)
+        knots = torch.tensor(KNOTS, dtype=distance.dtype, device=distance.device)
+        place = torch.searchsorted(knots[1:-1], distance.contiguous())
+        low, high = knots[place], knots[place + 1]
+        share = ((distance - low) / (high - low)).clamp(0, 1)
+        between = torch.zeros(
+            *distance.shape, len(KNOTS), dtype=distance.dtype, device=distance.device
+        )
+        between.scatter_(-1, place[..., None], (1 - share)[..., None])
+        between.scatter_add_(-1, place[..., None] + 1, share[..., None])
+        speeds = torch.stack(velocity, -1) / SEEN.scales[1]
+        said = observation["verbal"][..., 0].round().long().clamp(0, NOTHING)
+        return {
+            "ego": ego,
+            "visual": torch.cat([between, speeds], -1),
+            "verbal": one_hot(said, NOTHING + 1).to(offset),
+        }
+
+    def describe(self, observation: Observation, modality: str, item: str) -> str:
+        """Describe a sector, a group of sectors or a direction of one observation."""
+        if modality == "verbal":
+            place = DIRECTIONS.index(item)
+            return SPOKEN.utterances[place][round(float(observation["verbal"][place, 0]))]
+        places = GROUPS[DIRECTIONS.index(item)] if item in DIRECTIONS else (SEEN.items.index(item),)
+        sectors = observation["visual"][list(places)]
+        distance, along, _ = sectors[sectors[:, 0].argmin()].tolist()
+        if distance >= RANGE:
+            return f"{item}: no car within {RANGE:g} m"
+        return f"{item}: car at {distance:.0f} m, {along:+.0f} m/s"
 
     def render(self, state: HighwayState, setting: str = "clear") -> np.ndarray:
         """Draw the road and the lidar of one state, ``uint8 [height, width, 3]``."""
@@ -160,6 +294,13 @@ class Highway:
 
         observation = self.observe(state)
         return picture(state, observation, self.visibility(setting, observation)["visual"])
+
+
+class DirectHighway(Highway):
+    """The highway driven by steering and acceleration, which are set five times a second."""
+
+    ticks = TICKS
+    horizon = ROUND_TICKS // TICKS
 
 
 def sight(setting: str) -> Tensor:

@@ -18,13 +18,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 from torch import Tensor
 
-from mirror_ppl.arviz import az
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import get_domain
@@ -32,6 +31,9 @@ from mirror_ppl.files import write_whole
 from mirror_ppl.inference.results.identifiability import Identifiability
 from mirror_ppl.inference.results.predictions import Predictions
 from mirror_ppl.models.implants import SIGHT, in_units
+
+if TYPE_CHECKING:
+    import arviz as az
 
 
 def to_inference_data(
@@ -52,6 +54,9 @@ def to_inference_data(
         predicted: predictions of actions.
         attributes: attributes of the file.
     """
+    # Imported here, as it takes longer than all else that a command that fits nothing imports.
+    from mirror_ppl.arviz import az
+
     domain = get_domain(train.domain)
 
     def group(values: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

@@ -10,17 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import xarray as xr
 
-from mirror_ppl.arviz import az
 from mirror_ppl.checks import as_path
 from mirror_ppl.errors import PosteriorError
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.results.posterior_file import check_origin, read_results
 from mirror_ppl.models.implants import in_units, is_reach
+
+if TYPE_CHECKING:
+    import arviz as az
 
 SAMPLE = ("chain", "draw")
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 
-from mirror_ppl.domains.highway import Highway
+from mirror_ppl.domains.highway import DirectHighway
 from mirror_ppl.domains.highway.carla import CarlaEnv
 from mirror_ppl.domains.highway.road import MAX_STEERING, OTHERS, TICK, TICKS
 
@@ -158,7 +158,7 @@ def test_states_follow_the_road(yaw):
 def test_observations_and_rewards_are_the_domain_s():
     env, _, _ = made(setting="fog")
     observed, info = env.reset(seed=0)
-    before, domain = env.state, Highway()
+    before, domain = env.state, DirectHighway()
     values = domain.observe(before)
     seen = domain.visibility("fog", values)["visual"]
     assert observed["visual_mask"].tolist() == seen.int().tolist()

@@ -17,7 +17,7 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from paths import DOCS
 
-from mirror_ppl.domains.highway import Highway, HighwayState
+from mirror_ppl.domains.highway import DirectHighway, HighwayState
 from mirror_ppl.domains.highway.environment import HighwayEnv
 from mirror_ppl.domains.highway.lidar import RANGE
 from mirror_ppl.domains.highway.road import TICKS
@@ -40,7 +40,7 @@ def as_state(parts):
 # --- Gymnasium's contract -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("setting", Highway.settings)
+@pytest.mark.parametrize("setting", DirectHighway.settings)
 def test_gymnasium_s_checker_has_nothing_to_say(setting):
     env = gymnasium.make(NAME, setting=setting, render_mode="rgb_array")
     with warnings.catch_warnings():
@@ -52,15 +52,15 @@ WITHOUT_AND_WITH = f"""
 import sys
 sys.modules["highway_env"] = None
 import gymnasium, torch
-from mirror_ppl.domains.highway import Highway
-state = Highway().initial(2, torch.Generator())
-print(Highway().transition(state, torch.zeros(2, 2)).tick.tolist())
+from mirror_ppl.domains.highway import DirectHighway
+state = DirectHighway().initial(2, torch.Generator())
+print(DirectHighway().transition(state, torch.zeros(2, 2)).tick.tolist())
 try:
     gymnasium.make("{NAME}")
 except ImportError as error:
     print(error)
 del sys.modules["highway_env"]
-print(gymnasium.make("{NAME}").reset(seed=1)[1]["scenario"] in Highway.scenarios)
+print(gymnasium.make("{NAME}").reset(seed=1)[1]["scenario"] in DirectHighway.scenarios)
 """
 
 
@@ -178,9 +178,9 @@ def test_a_round_is_truncated_after_120_steps():
 # --- parity with the domain ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("setting", Highway.settings)
+@pytest.mark.parametrize("setting", DirectHighway.settings)
 def test_what_is_seen_is_the_domain_s(setting, rng):
-    domain, env = Highway(), HighwayEnv(setting)
+    domain, env = DirectHighway(), HighwayEnv(setting)
     hidden = 0
     observed, info = env.reset(seed=7)
     for action in (rng.uniform(-1, 1, (10, 2)) * [0.1, 1.0]).astype(np.float32):
@@ -206,7 +206,7 @@ def test_what_is_seen_is_the_domain_s(setting, rng):
 
 def test_fog_hides_by_distance():
     """A crawling car far ahead is hidden in fog until it is 15 m away."""
-    clear, fog = (HighwayEnv(s, scenario="car ahead crawls") for s in Highway.settings)
+    clear, fog = (HighwayEnv(s, scenario="car ahead crawls") for s in DirectHighway.settings)
     for env in (clear, fog):
         env.reset(seed=3)
     shown = []
@@ -223,7 +223,7 @@ def test_fog_hides_by_distance():
     assert min(shown) < 15 < max(shown) <= RANGE
 
 
-@pytest.mark.parametrize("scenario", Highway.scenarios)
+@pytest.mark.parametrize("scenario", DirectHighway.scenarios)
 def test_a_given_scenario_is_kept_in_every_round(scenario):
     env = HighwayEnv(scenario=scenario)
     assert {env.reset(seed=seed)[1]["scenario"] for seed in range(3)} == {scenario}
@@ -241,8 +241,8 @@ def test_pictures():
     env = HighwayEnv("fog", render_mode="rgb_array")
     env.reset(seed=4)
     state = env.state
-    assert np.array_equal(env.render(), Highway().render(state, "fog"))
-    assert not np.array_equal(env.render(), Highway().render(state, "clear"))
+    assert np.array_equal(env.render(), DirectHighway().render(state, "fog"))
+    assert not np.array_equal(env.render(), DirectHighway().render(state, "clear"))
     silent = HighwayEnv()
     silent.reset(seed=4)
     with pytest.warns(UserWarning, match="render_mode"):
@@ -258,10 +258,12 @@ def test_the_examples_of_the_page_run():
     scope = {}
     for block in blocks:
         exec(compile(block, "highway.md", "exec"), scope)
-    assert scope["seen"].shape == (3, 36) and scope["info"]["scenario"] in Highway.scenarios
+    assert scope["seen"].shape == (3, 36) and scope["info"]["scenario"] in DirectHighway.scenarios
 
 
 def test_the_page_has_every_scenario_and_term():
     page = (DOCS / "highway.md").read_text()
     rows = [line.split(" | ")[0].strip("| `") for line in page.splitlines() if line.startswith("|")]
-    assert set(Highway.scenarios) <= set(rows) and set(Highway.reward_terms) <= set(rows)
+    assert set(DirectHighway.scenarios) <= set(rows) and set(DirectHighway.reward_terms) <= set(
+        rows
+    )

@@ -7,10 +7,10 @@ import torch
 from highway_states import state_of
 
 from mirror_ppl.domains.base import map_state, total_reward
-from mirror_ppl.domains.highway import Highway, expert
+from mirror_ppl.domains.highway import DirectHighway, expert
 from mirror_ppl.domains.highway.road import LIMIT
 
-WORLD = Highway()
+WORLD = DirectHighway()
 CRAWLS = (28.0, 4.0, 0.0, 1.5)
 
 
@@ -64,7 +64,7 @@ def test_it_gets_around_a_crawling_car_that_hits_whoever_coasts():
     start = WORLD.initial(4, generator, index)
     x = start.x.clone()
     x[:, 1] = 18.0
-    options = expert.ExpertOptions(horizon=12, speeds=(0.0, 0.97))
+    options = expert.ExpertOptions(horizon=6)
     now = idle = replace(start, x=x)
     ahead = 0.0
     for _ in range(11):
@@ -87,7 +87,6 @@ def test_any_batch():
     assert torch.equal(found[1, 2], expert.act(one, expert.ExpertOptions(horizon=3)))
 
 
-@pytest.mark.parametrize("options", [{"horizon": 0}, {"speeds": ()}])
-def test_impossible_options_are_refused(options):
+def test_an_expert_that_looks_nowhere_is_refused():
     with pytest.raises(ValueError, match="horizon of at least 1"):
-        expert.ExpertOptions(**options)
+        expert.ExpertOptions(horizon=0)

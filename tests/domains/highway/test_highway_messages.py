@@ -3,8 +3,13 @@
 import pytest
 import torch
 
+from mirror_ppl.communication.messages import Channels
+from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.highway.lidar import SECTORS
-from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SHOWN, SPOKEN, cost, sectors_of
+from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SPOKEN, group_of
+from mirror_ppl.errors import UnknownNameError
+
+CHANNELS = Channels(Highway())
 
 
 def test_groups_part_the_sectors_and_are_mirrored():
@@ -13,14 +18,31 @@ def test_groups_part_the_sectors_and_are_mirrored():
     left_for_right = (0, 5, 4, 3, 2, 1)
     assert mirror == [sorted(GROUPS[each]) for each in left_for_right]
     assert 0 in GROUPS[0] and 18 in GROUPS[3]
+    assert all(sector in GROUPS[group_of(sector)] for sector in range(SECTORS))
 
 
-def test_sectors_that_groups_show():
-    shown = torch.zeros(2, 6, dtype=torch.bool)
-    shown[1, [0, 3]] = True
-    found = sectors_of(shown)
-    assert not found[0].any()
-    assert found[1].nonzero()[:, 0].tolist() == sorted(GROUPS[0] + GROUPS[3])
+def test_a_message_shows_all_sectors_of_its_groups():
+    flags = torch.zeros(2, len(CHANNELS), dtype=torch.bool)
+    flags[1, [0, 3]] = True
+    shown = CHANNELS.split(flags)["visual"]
+    assert not shown[0].any()
+    assert shown[1].nonzero()[:, 0].tolist() == sorted(GROUPS[0] + GROUPS[3])
+
+
+def test_a_group_is_communicated_if_all_its_sectors_are():
+    flags = torch.zeros(len(CHANNELS), dtype=torch.bool)
+    flags[[1, 9]] = True
+    masks = CHANNELS.split(flags)
+    assert torch.equal(CHANNELS.join(masks), flags)
+    masks["visual"][GROUPS[1][0]] = False
+    assert CHANNELS.join(masks).nonzero().squeeze(-1).tolist() == [9]
+
+
+def test_flags_of_items_are_those_of_their_groups():
+    assert CHANNELS.flag_of("visual", 18) == 3 and CHANNELS.flag_of("verbal", 2) == 8
+    assert CHANNELS.pairs[3] == ("visual", "rear") and CHANNELS.pairs[8] == ("verbal", "rear-right")
+    with pytest.raises(UnknownNameError, match="verbal, visual"):
+        CHANNELS.flag_of("touch", 0)
 
 
 @pytest.mark.parametrize(
@@ -29,9 +51,9 @@ def test_sectors_that_groups_show():
 )
 def test_costs_are_those_of_driving_in_table_i(shown, said, expected):
     items = torch.arange(6)
-    assert cost(items < shown, items < said).item() == pytest.approx(expected)
+    assert CHANNELS.cost(torch.cat([items < shown, items < said])).item() == pytest.approx(expected)
 
 
 def test_modalities_name_what_there_is():
     assert len(SEEN.items) == SECTORS and len(set(SEEN.items)) == SECTORS
-    assert SHOWN.items == SPOKEN.items and len(SHOWN.items) == 6
+    assert SEEN.communicated == SPOKEN.communicated == SPOKEN.items and len(SPOKEN.items) == 6

@@ -15,9 +15,9 @@ from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import traffic, vehicles
 from mirror_ppl.domains.highway.geometry import overlap
 from mirror_ppl.domains.highway.road import LANES, OTHERS, TICK, TICKS, centre_of
-from mirror_ppl.domains.highway.world import Highway
+from mirror_ppl.domains.highway.world import DirectHighway
 
-WORLD = Highway()
+WORLD = DirectHighway()
 FIELDS = ("x", "y", "heading", "speed", "acceleration", "target_lane", "timer", "begun", "crashed")
 FIVE_SECONDS = 25
 

@@ -9,7 +9,7 @@ from highway_states import state_of
 from mirror_ppl.domains.highway.lidar import AHEAD, BACK, RANGE, scan
 from mirror_ppl.domains.highway.reward import TERMS, proximities, rewards, speed_reward
 from mirror_ppl.domains.highway.road import LIMIT
-from mirror_ppl.domains.highway.world import Highway
+from mirror_ppl.domains.highway.world import DirectHighway
 
 STILL = torch.zeros(2, dtype=torch.float64)
 
@@ -29,7 +29,7 @@ def only(found, **expected):
 
 
 def test_names_and_order():
-    assert tuple(rewards(state_of(), STILL, state_of())) == TERMS == Highway.reward_terms
+    assert tuple(rewards(state_of(), STILL, state_of())) == TERMS == DirectHighway.reward_terms
 
 
 def test_equation_7():
@@ -116,7 +116,7 @@ def test_an_accident_costs_once_and_then_nothing_is_won_or_lost():
 
 def test_proximities_are_the_lidar_s(generator):
     """The reward looks at two sectors and at boxes; the lidar at all sectors. They agree."""
-    world = Highway()
+    world = DirectHighway()
     state = world.initial(300, generator)
     for _ in range(15):
         push = torch.rand(300, 2, generator=generator) * 2 - 1

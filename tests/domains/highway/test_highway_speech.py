@@ -15,7 +15,6 @@ from mirror_ppl.domains.highway.speech import (
     PLACES,
     UTTERANCES,
     WORDS,
-    on_road,
     utterances,
 )
 
@@ -84,15 +83,6 @@ def test_abreast_is_ahead_and_out_of_range_is_nothing():
 def test_cars_two_lanes_away_are_not_spoken_of():
     state = state_of((0.0, 0.0, 0.0, EGO), [(20.0, 8.0, 0.0, 1.0)])
     assert utterances(state).tolist() == [NOTHING] * 6
-
-
-def test_directions_without_a_lane():
-    left, right = (state_of((0.0, y, 0.0, EGO)) for y in (0.0, 8.0))
-    off = [
-        [d for d, there in zip(DIRECTIONS, on_road(s), strict=True) if not there]
-        for s in (left, right)
-    ]
-    assert off == [["rear-left", "front-left"], ["front-right", "rear-right"]]
 
 
 def test_words_are_the_sentences_of_the_modality():

@@ -9,11 +9,11 @@ from highway_states import state_of
 
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import scenarios, traffic
-from mirror_ppl.domains.highway.road import LANE_WIDTH, LENGTH, LIMIT, STEPS, TICK, TICKS
+from mirror_ppl.domains.highway.road import LANE_WIDTH, LENGTH, LIMIT, ROUND_TICKS, TICK, TICKS
 from mirror_ppl.domains.highway.state import NEVER
-from mirror_ppl.domains.highway.world import Highway
+from mirror_ppl.domains.highway.world import DirectHighway
 
-WORLD = Highway()
+WORLD = DirectHighway()
 STEP = TICK * TICKS
 
 
@@ -241,7 +241,7 @@ def coasting():
     many = len(WORLD.scenarios)
     index = torch.arange(many).repeat_interleave(25)
     states = [WORLD.initial(len(index), torch.Generator().manual_seed(0), index)]
-    for _ in range(STEPS):
+    for _ in range(ROUND_TICKS // TICKS):
         states.append(play(states[-1]))
     return map_state(lambda *parts: torch.stack(parts).unflatten(1, (many, 25)), *states)
 

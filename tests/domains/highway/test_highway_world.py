@@ -6,14 +6,14 @@ import torch
 from highway_states import state_of
 
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.highway import Highway
+from mirror_ppl.domains.highway import DirectHighway
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
 from mirror_ppl.domains.highway.pictures import ACROSS, BEHIND, CAR, EGO, SCALE, UNSEEN
 from mirror_ppl.domains.highway.road import OTHERS
 from mirror_ppl.domains.highway.speech import DIRECTIONS
 from mirror_ppl.errors import UnknownNameError
 
-WORLD = Highway()
+WORLD = DirectHighway()
 
 
 def test_shapes_are_those_of_the_contract(generator):
@@ -32,7 +32,7 @@ def test_shapes_are_those_of_the_contract(generator):
 def test_the_ego_by_hand():
     controls = torch.tensor([0.25, -0.5], dtype=torch.float64)
     state = state_of((3.0, 7.5, 0.1, 9.0), controls=controls)
-    expected = [2.0, -0.5, 0.1, 9.0, 0.25, -0.5]
+    expected = [2.0, -0.5, 0.1, 9.0, 0.25, -0.5, 0.0]
     assert WORLD.observe(state)["ego"].tolist() == pytest.approx(expected)
 
 
@@ -54,14 +54,20 @@ def test_sentences_are_only_heard():
     state = state_of(cars=[(20.0, 4.0, 0.0, 5.0)])
     for setting in WORLD.settings:
         assert not WORLD.visibility(setting, WORLD.observe(state))["verbal"].any()
-    assert WORLD.describe(WORLD.observe(state), 0) == "Car ahead, approaching fast."
-    assert WORLD.describe(WORLD.observe(state), 3) == "Nothing behind."
+    now = WORLD.observe(state)
+    assert WORLD.describe(now, "verbal", "front") == "Car ahead, approaching fast."
+    assert WORLD.describe(now, "verbal", "rear") == "Nothing behind."
+    assert WORLD.describe(now, "visual", "front") == "front: car at 18 m, -5 m/s"
+    assert WORLD.describe(now, "visual", "180 degrees") == "180 degrees: no car within 60 m"
 
 
 def test_lanes_that_do_not_exist_are_not_spoken_of():
-    left = WORLD.communicable(state_of((0.0, 0.0, 0.0, 10.0)))
+    left = WORLD.communicable(WORLD.observe(state_of((0.0, 0.0, 0.0, 10.0))))
     silent = [name for name, ok in zip(DIRECTIONS, left["verbal"], strict=True) if not ok]
     assert silent == ["rear-left", "front-left"] and left["visual"].all()
+    right = WORLD.communicable(WORLD.observe(state_of((0.0, 8.0, 0.0, 10.0))))
+    silent = [name for name, ok in zip(DIRECTIONS, right["verbal"], strict=True) if not ok]
+    assert silent == ["front-right", "rear-right"]
 
 
 def test_unknown_settings_are_refused():

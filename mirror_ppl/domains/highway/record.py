@@ -1,0 +1,31 @@
+"""The record of highway driving: settings of networks, training and planning."""
+
+from mirror_ppl.domains.record import Record
+
+RECORD = Record(
+    networks={
+        "latent": 128,
+        "encoder": 128,
+        "transition": 128,
+        "decoder": 128,
+        "reward": 128,
+        "q_network": 128,
+    },
+    training={
+        "phases": 8,
+        "rounds": 160,
+        "steps": 350,
+        "batch": 48,
+        "beta": 0.5,
+        "beta_decay": 0.5,
+        "epsilon": 0.4,
+        "epsilon_decay": 0.8,
+        "epsilon_floor": 0.1,
+        "discount": 1.0,
+        "window": 24,
+        "distil": True,
+        "kinds": (0.2, 0.1, 0.7),
+    },
+    people="mirror_ppl.domains.highway.participants:DRIVERS",
+    planning={"horizon": 8, "terminal_value": True},
+)
