@@ -69,11 +69,9 @@ def main(options: Options) -> None:
     scenario = torch.arange(options.rounds) % len(world.scenarios)
     start = world.initial(options.rounds, torch.Generator().manual_seed(options.seed), scenario)
     noise = torch.Generator().manual_seed(options.seed + 1)
-    planning = expert.ExpertOptions(options.horizon, world.ticks)
+    planning = expert.ExpertOptions(options.horizon)
     drivers: dict[str, Driver] = {
-        "expert": lambda state: expert.act(
-            state, expert.ExpertOptions(options.horizon, ticks=world.ticks)
-        ),
+        "expert": lambda state: expert.act(state, planning),
         "nothing": lambda state: torch.zeros(*state.tick.shape, 2),
         "random": lambda state: torch.rand(*state.tick.shape, 2, generator=noise) * 2 - 1,
     }

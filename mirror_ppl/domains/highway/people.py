@@ -7,7 +7,7 @@ own on coming near others and on accidents, and choose more or less consistently
 
 ``p(a_t | m_t) = softmax(consistency * Q(., m_t))``
 
-with ``Q(a, m_t)`` the return of keeping up manoeuvre ``a`` for four seconds among the cars known.
+with ``Q(a, m_t)`` the return of keeping up manoeuvre ``a`` for six seconds among the cars known.
 """
 
 from __future__ import annotations

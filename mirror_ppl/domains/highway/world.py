@@ -190,11 +190,11 @@ class Highway(World):
         return estimate.state_of(observation)
 
     def reference_values(self, state: HighwayState, discount: float) -> Tensor:
-        """Return the expert's values ``[..., A]``: of keeping up each manoeuvre for 4 s.
+        """Return the expert's values ``[..., A]``: of keeping up each manoeuvre for 6 s.
 
         They are those of a planner that looks ahead, not exact.
         """
-        return expert.values(state, expert.ExpertOptions(ticks=self.ticks, discount=discount))
+        return expert.values(state, expert.ExpertOptions(discount=discount))
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
         """Return what an unaided person sees: sectors ``[..., 36]``, and no sentences ``[..., 6]``.
