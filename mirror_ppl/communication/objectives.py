@@ -273,6 +273,41 @@ class _Tree:
 
 
 @dataclass(frozen=True)
+class ExpectedValue:
+    """``U(c) = E[ Q(z^R_t, a_t) ] - cost(c_t)``: the value of what the person does next.
+
+    Values are the robot's, who sees everything. Nothing is rolled out: after the next action, the
+    person is taken to act as the robot's values suppose. Only the message of the present step
+    counts. For worlds in which a roll-out costs too much, or values are of plans that are kept up.
+    """
+
+    one_step: ClassVar[bool] = True
+
+    def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
+        """Return the function that values candidates; steps left and seed are not used."""
+        del steps_left, seed
+        person = context.person
+        human = person.human
+        channels = Channels(human.domain)
+        robot = robot_belief(human.self_model, context.past)
+        true_values = human.self_model.action_values(robot.mean)
+
+        @torch.no_grad()
+        def value(candidates: Tensor) -> Valued:
+            message = candidates[:, 0]
+            state, index = context.told(message)
+            # Beliefs of each draw after each message, [S, C].
+            own = state.belief[index][:, person.percept].T
+            beliefs, values = state.mean, human.action_values(state.mean)
+            chances = person.act(beliefs[own], values[own]).exp()
+            utility = (chances * true_values).sum(-1).T
+            predicted = chances.mean(0)[:, None]
+            return Valued(utility - channels.cost(message)[:, None], predicted)
+
+        return value
+
+
+@dataclass(frozen=True)
 class Divergence:
     """``U(c) = - weight * KL( q(z^R_t) || q(zH_t | c) ) - cost(c_t)``: MIRROR-KL.
 

@@ -9,10 +9,16 @@ from typing import Any, Self
 from mirror_ppl.checks import real_number
 from mirror_ppl.communication.communicator import Communicator
 from mirror_ppl.communication.hearing import hearing
-from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective
+from mirror_ppl.communication.objectives import (
+    Divergence,
+    ExpectedUtility,
+    ExpectedValue,
+    Objective,
+)
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.rollouts import SelfModelWorld, SimulatorWorld, World
 from mirror_ppl.communication.search import Automatic
+from mirror_ppl.domains.base import require_known
 from mirror_ppl.domains.record import settings_of
 from mirror_ppl.domains.registry import get_domain
 from mirror_ppl.errors import UnknownNameError
@@ -32,6 +38,10 @@ class PlannerOptions:
         items: most items of a message, see :class:`Automatic`.
         min_standard_errors: standard errors that a gain must exceed, see :class:`Communicator`.
         terminal_value: see :class:`ExpectedUtility`.
+        predict_with: what ``mirror`` values the person's actions with: ``simulator``, rolled out;
+            ``self-model``, the robot's learned world model, rolled out; or ``values``, the robot's
+            action values without a roll-out (:class:`ExpectedValue`), which do not depend on the
+            settings before.
         hears: prior probability that messages of a modality reach the person
             (:mod:`mirror_ppl.communication.hearing`); 1 assumes that they do.
         kl_weight: units of reward per nat in mirror-kl.
@@ -47,9 +57,11 @@ class PlannerOptions:
     kl_weight: float = 1.0
     kl_measure: str = "kl"
     terminal_value: bool = False
+    predict_with: str = "simulator"
     hears: float = 0.9
 
     def __post_init__(self) -> None:
+        require_known(self.predict_with, "way to predict", tuple(PREDICTIONS))
         object.__setattr__(self, "hears", real_number(self.hears, "hears", LEAST_PROBABILITY, 1.0))
 
     @classmethod
@@ -65,12 +77,29 @@ def _utility(world: World, options: PlannerOptions) -> Objective:
     )
 
 
-def _mirror(person: Person, options: PlannerOptions) -> Objective:
+def _simulated(person: Person, options: PlannerOptions) -> Objective:
     return _utility(SimulatorWorld(planning_domain(person.human, person.draws)), options)
 
 
-def _mirror_self_model(person: Person, options: PlannerOptions) -> Objective:
+def _learned(person: Person, options: PlannerOptions) -> Objective:
     return _utility(SelfModelWorld(person.human.self_model), options)
+
+
+def _valued(person: Person, options: PlannerOptions) -> Objective:
+    del person, options
+    return ExpectedValue()
+
+
+PREDICTIONS: Mapping[str, Callable[[Person, PlannerOptions], Objective]] = {
+    "simulator": _simulated,
+    "self-model": _learned,
+    "values": _valued,
+}
+"""What ``mirror`` can value actions with, by name; see :class:`PlannerOptions`."""
+
+
+def _mirror(person: Person, options: PlannerOptions) -> Objective:
+    return PREDICTIONS[options.predict_with](person, options)
 
 
 def _mirror_kl(person: Person, options: PlannerOptions) -> Objective:
@@ -80,13 +109,14 @@ def _mirror_kl(person: Person, options: PlannerOptions) -> Objective:
 
 PLANNERS: Mapping[str, Callable[[Person, PlannerOptions], Objective]] = {
     "mirror": _mirror,
-    "mirror-self-model": _mirror_self_model,
+    "mirror-self-model": _learned,
     "mirror-kl": _mirror_kl,
 }
 """Constructors of objectives by name; a new objective is a function and its name here.
 
-``mirror`` maximizes reward in the domain's simulator, ``mirror-self-model`` in the robot's learned
-world model; ``mirror-kl`` minimizes the divergence of the person's belief from the robot's.
+``mirror`` maximizes reward in the domain's simulator, unless ``predict_with`` names something else;
+``mirror-self-model`` in the robot's learned world model. ``mirror-kl`` minimizes the divergence of
+the person's belief from the robot's.
 """
 
 

@@ -26,7 +26,8 @@ class ExpertOptions:
     """How far the expert plans.
 
     Attributes:
-        horizon: decisions of half a second that it looks ahead; a change of lanes pays only after four.
+        horizon: decisions of half a second that it looks ahead; changes of lanes pay only after
+            eight or more.
         discount: of rewards per decision.
     """
 

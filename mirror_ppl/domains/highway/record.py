@@ -27,5 +27,6 @@ RECORD = Record(
         "kinds": (0.2, 0.1, 0.7),
     },
     people="mirror_ppl.domains.highway.participants:DRIVERS",
-    planning={"horizon": 8, "terminal_value": True},
+    pictures="mirror_ppl.domains.highway.sight:PICTURES",
+    planning={"predict_with": "values", "items": 2},
 )

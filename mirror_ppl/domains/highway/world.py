@@ -119,7 +119,7 @@ class Highway(World):
     settings: tuple[str, ...] = ("clear", "fog")
     scenarios: tuple[str, ...] = scenarios.NAMES
     reward_terms: tuple[str, ...] = reward.TERMS
-    mishap = ("accident", "accidents")
+    mishap: tuple[str, str] = ("accident", "accidents")
     directions: tuple[str, ...] = ("ahead", "ahead_aside", "behind_aside", "behind")
     direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
     reach_bins: tuple[float, ...] = KNOTS
