@@ -166,7 +166,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
             discount=settings.discount,
             progress=lambda done, total: stages.report("measure", done, total, "views"),
         )
-    card = _described(options, settings, quality, "measured on 4000 rounds")
+    card = _described(options, settings, quality, f"measured on {domain.record.measured} rounds")
     save_self_model(self_model, out, card)
     return card
 

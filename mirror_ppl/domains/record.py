@@ -35,6 +35,7 @@ class Record:
         training: settings of :class:`~mirror_ppl.training.self_model.SelfModelOptions`, by name.
         planning: settings of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
         baselines: settings of baselines, by the baseline's name: ``bc`` and ``sqil``.
+        measured: rounds on which a self-model's returns and agreement are measured.
         slow: models that `evaluate` compares only on request, because they take minutes: `svi`
             with many values to sum over at each step, and SQIL with long rounds.
         people: the simulated people, a :class:`~mirror_ppl.people.base.DomainPeople`; those of
@@ -49,6 +50,7 @@ class Record:
     training: Mapping[str, Any] = field(default_factory=dict)
     planning: Mapping[str, Any] = field(default_factory=dict)
     baselines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    measured: int = 4000
     slow: tuple[str, ...] = ("mirror-svi", "sqil-everything", "sqil-pooled")
     people: Any = None
     human_models: Any = field(default_factory=dict)

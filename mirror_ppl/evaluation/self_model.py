@@ -89,7 +89,7 @@ def planner_actions(domain: Domain, start: Any, steps: int, discount: float) -> 
 @torch.no_grad()
 def self_model_quality(
     self_model: SelfModel,
-    rounds: int = 4000,
+    rounds: int | None = None,
     seed: int = 1,
     discount: float = 0.9,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -98,7 +98,7 @@ def self_model_quality(
 
     Args:
         self_model: the model.
-        rounds: number of rounds B.
+        rounds: number of rounds B; the world's own unless given, see `Record.measured`.
         seed: seed of the rounds.
         discount: the discount that the self-model was trained with.
         progress: called with the number of views that are done, and of all views.
@@ -116,6 +116,7 @@ def self_model_quality(
         are compared along rounds with one random action in five.
     """
     domain = self_model.domain.as_believed
+    rounds = rounds or domain.record.measured
     device = next(self_model.parameters()).device
     generator = torch.Generator(device).manual_seed(seed)
     start = domain.initial(rounds, generator)

@@ -31,9 +31,11 @@ from mirror_ppl.communication import (
     SimulatorWorld,
     every_message,
 )
+from mirror_ppl.communication.objectives import ExpectedValue
+from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.domains.base import total_reward
 from mirror_ppl.domains.driving import CARS, DrivingState
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, UnknownNameError
 from mirror_ppl.models import HumanModel
 
 ACTIONS = len(DOMAIN.actions)
@@ -524,6 +526,39 @@ def test_divergence_is_that_of_two_gaussians(generator, time, measure, weight):
     # Where all is still to tell, more than costs is at stake.
     apart = valued.utility + CHANNELS.cost(candidates[:, 0])[:, None]
     assert time > 0 or apart.std(0).max() > 0.1
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("time", [0, 3])
+def test_expected_values_are_those_of_the_next_action(generator, time):
+    """Of each draw: probabilities of actions after the message, times the robot's values."""
+    past, _ = random_round(time, generator)
+    someone = Person(human(), varied_draws(4, generator))
+    candidates = candidates_of(past, generator, 2)
+    valued = ExpectedValue().at(PlanningContext.of(someone, past), 5, 0)(candidates)
+    values = self_model().action_values(robot(past).mean)
+    assert valued.actions is not None and valued.actions.shape == (len(candidates), 1, ACTIONS)
+    for c, candidate in enumerate(candidates):
+        chances = []
+        for s in range(4):
+            draw = {name: value[s, None] for name, value in someone.draws.items()}
+            belief = told_belief({n: v[0] for n, v in draw.items()}, past, candidate[0]).mean
+            own = human().action_values(belief)
+            chances.append(Person(human(), draw).act(belief[None, None], own[None, None]).exp())
+            expected = (chances[-1][0, 0] * values).sum() - CHANNELS.cost(candidate[0])
+            torch.testing.assert_close(valued.utility[c, s], expected, rtol=1e-4, atol=1e-4)
+        mean = torch.cat(chances).mean(0)
+        torch.testing.assert_close(valued.actions[c], mean, rtol=1e-4, atol=1e-5)
+
+
+def test_what_mirror_predicts_with_is_chosen_by_name():
+    kinds = {
+        name: type(planner_of("mirror", person(), PlannerOptions(predict_with=name), 0).objective)
+        for name in ("simulator", "self-model", "values")
+    }
+    assert list(kinds.values()) == [ExpectedUtility, ExpectedUtility, ExpectedValue]
+    with pytest.raises(UnknownNameError, match="self-model, simulator, values"):
+        PlannerOptions(predict_with="luck")
 
 
 def test_models_without_a_density_are_refused(generator):

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torch.distributions import Normal
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.base import map_state, roll_out
 from mirror_ppl.domains.driving import ROAD_END, Driving, DrivingState
 from mirror_ppl.errors import AssetError, CheckpointError
 from mirror_ppl.evaluation.self_model import (
@@ -26,7 +26,7 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
 from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
 from mirror_ppl.training import self_model as self_model_training
-from mirror_ppl.training.experience import drive, experience
+from mirror_ppl.training.experience import Kept, drive, experience
 from mirror_ppl.training.self_model import (
     SelfModelOptions,
     self_model_loss,
@@ -256,7 +256,48 @@ def test_learning_looks_ahead_from_belief_to_belief(lived):
     torch.testing.assert_close(loss.bellman, error.square().mean(), rtol=1e-4, atol=1e-5)
 
 
+def test_states_that_are_kept_are_those_that_are_computed(lived, generator):
+    """A window of a whole round is the round; what is known is not computed again."""
+    start, actions = two_cars_near(), STAY4
+    plan = fixed_views(DRIVING, 1, torch.Generator(), speech=True)
+    kept = Kept(roll_out(DRIVING, start, actions), torch.full((1, 4, 2), 7.0))
+    whole = kept.window(torch.tensor([0]), 0, 4)
+    found = experience(DRIVING, start, actions, plan, kept=Kept(whole.states))
+    expected = experience(DRIVING, start, actions, plan)
+    for name, value in expected.rounds.observation.items():
+        assert torch.equal(found.rounds.observation[name], value)
+    assert torch.equal(found.rounds.rewards, expected.rounds.rewards)
+    assert torch.equal(found.outcomes[1].reward, expected.outcomes[1].reward)
+    valued = experience(DRIVING, start, actions, plan, stride=2, kept=whole)
+    assert not valued.outcomes and torch.equal(valued.exact, torch.full((1, 2, 2), 7.0))
+    part = kept.window(torch.tensor([0, 0]), 1, 2)
+    assert part.states.lane.shape == (2, 3) and part.values.shape == (2, 2, 2)
+    assert torch.equal(part.states.position[0], kept.states.position[0, 1:4])
+
+
 # --- training ---------------------------------------------------------------------------------
+
+
+def test_a_planner_s_values_are_learned_in_every_view():
+    """The planner is DRIVING's exact one; what is not seen is averaged over."""
+    options = SelfModelOptions(
+        phases=1, rounds=64, steps=150, batch=16, learning_rate=3e-3, window=3, distil=True
+    )
+    domain = ShortDriving()
+    robot = train_self_model(domain, options, torch.Generator().manual_seed(0))
+    rounds = experience(
+        domain,
+        two_cars_near(),
+        STAY4[:, :3],
+        fixed_views(domain, 1, torch.Generator(), speech=True),
+    ).rounds
+    with torch.no_grad():
+        evidence = robot.evidence(rounds.observation, rounds.visible, rounds.actions)
+        found = robot.action_values(robot.believe(evidence[:, :1])[:, 0])
+    exact = domain.reference_values(two_cars_near(), 0.9)
+    assert (found - exact).abs().max() < 0.5 < (exact[0, 0] - exact[0, 1]).abs()
+    with pytest.raises(ValueError, match="distil needs a window"):
+        SelfModelOptions(distil=True)
 
 
 class ShortDriving(Driving):

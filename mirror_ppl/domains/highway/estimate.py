@@ -30,6 +30,8 @@ from mirror_ppl.domains.highway.scenarios import HEADWAY
 from mirror_ppl.domains.highway.speech import AHEAD, BRAKING, DIRECTIONS, SIDES, WORDS
 from mirror_ppl.domains.highway.state import NEVER, HighwayState
 
+SAME = 1e-3
+"""m/s by which the motion of one car differs at most between two sectors."""
 SIDEWAYS = 0.7
 """m/s across the road from which a car counts as changing lanes."""
 AWAY = 1000.0
@@ -68,8 +70,7 @@ def cars_in(observation: Observation) -> Cars:
     """
     lane, offset, heading, speed = observation["ego"][..., :4].unbind(-1)
     distance, along, across = observation["visual"].unbind(-1)
-    angle = torch.arange(SECTORS, dtype=lane.dtype, device=lane.device) * SECTOR
-    turned = angle + heading[..., None]
+    turned = _angles(observation["visual"]) + heading[..., None]
     y = (centre_of(lane) + offset)[..., None] + distance * torch.sin(turned)
     x, hit = distance * torch.cos(turned), lane_of(y)
     sides = torch.tensor(SIDES, device=lane.device)
@@ -100,6 +101,21 @@ def cars_in(observation: Observation) -> Cars:
     )
 
 
+def _angles(visual: Tensor) -> Tensor:
+    """Return the angle ``[..., 36]`` to the ego's heading of the nearest point in each sector.
+
+    A car that is also in the next sector comes nearest at the line between both, or anywhere if it
+    is in both neighbours; one that is in no other may be anywhere, so that the middle is taken.
+    """
+    sectors = torch.arange(SECTORS, dtype=visual.dtype, device=visual.device)
+    seen = visual[..., 0] < RANGE
+    following, motion = seen.roll(-1, -1), visual[..., 1:]
+    same = (motion - motion.roll(-1, -2)).abs().amax(-1) < SAME
+    same = same & seen & following
+    side = same.to(visual.dtype) - same.roll(1, -1).to(visual.dtype)
+    return (sectors + side / 2) * SECTOR
+
+
 def state_of(observation: Observation) -> HighwayState:
     """Return an estimate ``[...]`` of the state with this full observation ``[..., K, F]``.
 
@@ -114,8 +130,10 @@ def state_with(ego: Tensor, cars: Cars) -> HighwayState:
     lane, offset, heading, speed, steering, acceleration, accident = ego.unbind(-1)
     y, zero = centre_of(lane) + offset, torch.zeros_like(speed)
     moves = cars.sideways.abs() > SIDEWAYS
-    own = lane_of(cars.y)
-    aim = torch.where(moves, own + cars.sideways.sign().long(), own).clamp(0, LANES - 1)
+    # Who moves aims for the next middle of a lane on that side.
+    across = cars.y / LANE_WIDTH
+    following = torch.where(cars.sideways > 0, across.ceil(), across.floor()).long()
+    aim = torch.where(moves, following.clamp(0, LANES - 1), lane_of(cars.y))
     fast = torch.hypot(cars.speed, torch.where(moves, cars.sideways, 0.0))
     slowed = (fast - HARD * SOON * TICK).clamp(min=0)
     slowing = torch.full_like(fast, -HARD)

@@ -26,6 +26,7 @@ RECORD = Record(
         "distil": True,
         "kinds": (0.2, 0.1, 0.7),
     },
+    measured=100,
     people="mirror_ppl.domains.highway.participants:DRIVERS",
     pictures="mirror_ppl.domains.highway.sight:PICTURES",
     planning={"predict_with": "values", "items": 2},
