@@ -6,6 +6,7 @@ observations, views and rewards are recomputed whenever a round is used for trai
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,22 +26,54 @@ from mirror_ppl.training.views import ViewPlan
 
 
 @dataclass(frozen=True)
-class Kept:
-    """What is kept of rounds, where it takes long to compute.
+class Course:
+    """What happened in rounds, which takes long to compute in some worlds.
 
     Attributes:
         states: ``[B, T + 1]``.
-        values: the planner's, ``[B, T, A]``, if they are learned.
+        observation: full observations ``[B, T + 1, ...]``.
+        rewards: of the actions ``[B, T]``.
+        values: the planner's action values ``[B, T, A]``, if they are learned.
     """
 
     states: Any
+    observation: Observation
+    rewards: Tensor
     values: Tensor | None = None
 
-    def window(self, rows: Tensor, begin: int, steps: int) -> Kept:
+    @classmethod
+    def of(cls, domain: Domain, start: Any, actions: Tensor) -> Course:
+        """Return the course of rounds from ``start`` ``[B]`` by ``actions`` ``[B, T]``."""
+        states = roll_out(domain, start, actions)
+        before, after = (
+            map_state(lambda part: part[:, steps], states)  # noqa: B023 - used at once
+            for steps in (slice(None, -1), slice(1, None))
+        )
+        rewards = total_reward(domain.rewards(before, actions, after))
+        return cls(states, domain.observe(states), rewards)
+
+    @classmethod
+    def join(cls, courses: Sequence[Course]) -> Course:
+        """Return the rounds of several courses, all of them with values or all without."""
+        values = [one.values for one in courses if one.values is not None]
+        return cls(
+            map_state(lambda *parts: torch.cat(parts), *(one.states for one in courses)),
+            {
+                name: torch.cat([one.observation[name] for one in courses])
+                for name in courses[0].observation
+            },
+            torch.cat([one.rewards for one in courses]),
+            torch.cat(values) if values else None,
+        )
+
+    def window(self, rows: Tensor, begin: int, steps: int) -> Course:
         """Return some of these rounds, from a step on."""
-        return Kept(
-            map_state(lambda part: part[rows, begin : begin + steps + 1], self.states),
-            None if self.values is None else self.values[rows, begin : begin + steps],
+        end = begin + steps
+        return Course(
+            map_state(lambda part: part[rows, begin : end + 1], self.states),
+            {name: part[rows, begin : end + 1] for name, part in self.observation.items()},
+            self.rewards[rows, begin:end],
+            None if self.values is None else self.values[rows, begin:end],
         )
 
 
@@ -97,7 +130,7 @@ def experience(
     first: int = 0,
     stride: int = 1,
     discount: float | None = None,
-    kept: Kept | None = None,
+    course: Course | None = None,
 ) -> Experience:
     """Compute the experience of an observer with a view.
 
@@ -112,14 +145,13 @@ def experience(
         first: first step at which the outcomes of every action are computed.
         stride: distance between these steps.
         discount: discount of exact values, which are computed only if it is given.
-        kept: states of these rounds, if they are known; else they are computed. With values, no
-            outcomes are computed.
+        course: of these rounds, if it is known; else it is computed. With values, no outcomes are
+            computed.
     """
-    states = roll_out(domain, start, actions) if kept is None else kept.states
-    values = None if kept is None else kept.values
-    observation = domain.observe(states)
+    course = course or Course.of(domain, start, actions)
+    observation, rewards, values = course.observation, course.rewards, course.values
     seen_along, knowledge = follow(domain, plan, observation)
-    believed = supposed(domain, plan, states, knowledge)
+    believed = supposed(domain, plan, course.states, knowledge)
     current, so_far = (
         map_state(lambda part: part[:, :-1], whole) for whole in (believed, knowledge)
     )
@@ -130,10 +162,9 @@ def experience(
     outcomes = ()
     if values is None:
         outcomes = _outcomes(domain, plan, some, known, 1 + first, stride)
-    if plan.assumes:
+    if plan.assumes:  # the world is not as believed
         later, observation = domain.transition(current, actions), domain.observe(believed)
-    else:  # the world is as believed, and what followed is known
-        later = map_state(lambda part: part[:, 1:], states)
+        rewards = total_reward(domain.rewards(current, actions, later))
     taken = plan.taken(domain, knowledge, observation)
     visible = {name: mask | taken[name] for name, mask in seen_along.items()}
     informed = torch.stack(
@@ -144,7 +175,7 @@ def experience(
             observation=observation,
             visible=visible,
             actions=actions,
-            rewards=total_reward(domain.rewards(current, actions, later)),
+            rewards=rewards,
         ),
         outcomes=outcomes,
         over=domain.over(some),

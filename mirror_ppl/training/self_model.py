@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,14 +23,14 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
-from mirror_ppl.domains.base import Domain, map_state, roll_out
+from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.domains.record import settings_of
 from mirror_ppl.domains.registry import code_of, get_domain
 from mirror_ppl.domains.world import offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
-from mirror_ppl.training.experience import Experience, Kept, drive, experience
+from mirror_ppl.training.experience import Course, Experience, drive, experience
 from mirror_ppl.training.views import KIND_PROBABILITIES, KINDS, draw_views
 
 VALUED = 1024
@@ -60,7 +60,7 @@ class SelfModelOptions:
         speech_weight: weight of messages in the ELBO; pictures have many more numbers.
         length: steps of a training round; the domain's horizon if 0.
         window: steps of these rounds in a gradient step, from a random one on; all of them if 0.
-            States are then kept, which takes memory, and not recomputed, which would take time.
+            What happened is then kept, which takes memory, and not computed again.
         stride: values are learned at one of every ``stride`` steps; the offset is random.
         difference_weight: weight of errors in the differences between actions, added to the errors
             themselves. Choices of people depend on these differences alone.
@@ -277,7 +277,7 @@ class _Trainer:
         )
         self.starts: list[Any] = []
         self.actions: list[Tensor] = []
-        self.kept: list[Kept] = []
+        self.courses: list[Course] = []
         self.phase = 0
 
     def run(self, report: Callable[[int, str], None], checkpoint: Path | None) -> None:
@@ -359,7 +359,7 @@ class _Trainer:
         exact = options.exact and offers(self.domain, "reference_values")
         actions = torch.cat(self.actions)
         starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
-        kept = self._kept() if options.window else None
+        course = self._course() if options.window else None
         elbo = bellman = 0.0
         for step in range(options.steps):
             chosen = torch.randint(
@@ -369,10 +369,10 @@ class _Trainer:
                 device=self.generator.device,
             )
             acted, lived_through = actions[chosen], None
-            if kept is not None:
+            if course is not None:
                 begin = self._drawn(actions.shape[1] - options.window + 1)
                 acted = acted[:, begin : begin + options.window]
-                lived_through = kept.window(chosen, begin, options.window)
+                lived_through = course.window(chosen, begin, options.window)
             plan = draw_views(
                 self.domain, options.batch, acted.shape[1], self.generator, options.kinds
             )
@@ -398,17 +398,15 @@ class _Trainer:
             bellman += float(loss.bellman) / options.steps
         return f"elbo {elbo:.2f} per observation, bellman error {bellman:.3f}"
 
-    def _kept(self) -> Kept:
-        """Return all rounds, with what is kept of them."""
+    def _course(self) -> Course:
+        """Return what happened in all rounds."""
         rounds = list(zip(self.starts, self.actions, strict=True))
-        for start, actions in rounds[len(self.kept) :]:
-            states = roll_out(self.domain, start, actions)
-            self.kept.append(Kept(states, self._values(states) if self.options.distil else None))
-        values = [one.values for one in self.kept if one.values is not None]
-        return Kept(
-            map_state(lambda *parts: torch.cat(parts), *(one.states for one in self.kept)),
-            torch.cat(values) if values else None,
-        )
+        for start, actions in rounds[len(self.courses) :]:
+            course = Course.of(self.domain, start, actions)
+            if self.options.distil:
+                course = replace(course, values=self._values(course.states))
+            self.courses.append(course)
+        return Course.join(self.courses)
 
     def _values(self, states: Any) -> Tensor:
         """Return the planner's values ``[B, T, A]`` of states ``[B, T + 1]``."""

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torch.distributions import Normal
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.domains.base import map_state, roll_out
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import ROAD_END, Driving, DrivingState
 from mirror_ppl.errors import AssetError, CheckpointError
 from mirror_ppl.evaluation.self_model import (
@@ -26,7 +26,7 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
 from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
 from mirror_ppl.training import self_model as self_model_training
-from mirror_ppl.training.experience import Kept, drive, experience
+from mirror_ppl.training.experience import Course, drive, experience
 from mirror_ppl.training.self_model import (
     SelfModelOptions,
     self_model_loss,
@@ -256,23 +256,26 @@ def test_learning_looks_ahead_from_belief_to_belief(lived):
     torch.testing.assert_close(loss.bellman, error.square().mean(), rtol=1e-4, atol=1e-5)
 
 
-def test_states_that_are_kept_are_those_that_are_computed(lived, generator):
-    """A window of a whole round is the round; what is known is not computed again."""
+def test_what_is_kept_of_rounds_is_what_is_computed():
+    """A window of a whole round is the round; with values, no outcomes are computed."""
     start, actions = two_cars_near(), STAY4
     plan = fixed_views(DRIVING, 1, torch.Generator(), speech=True)
-    kept = Kept(roll_out(DRIVING, start, actions), torch.full((1, 4, 2), 7.0))
-    whole = kept.window(torch.tensor([0]), 0, 4)
-    found = experience(DRIVING, start, actions, plan, kept=Kept(whole.states))
+    course = Course.of(DRIVING, start, actions)
+    found = experience(DRIVING, start, actions, plan, course=course.window(torch.tensor([0]), 0, 4))
     expected = experience(DRIVING, start, actions, plan)
     for name, value in expected.rounds.observation.items():
         assert torch.equal(found.rounds.observation[name], value)
     assert torch.equal(found.rounds.rewards, expected.rounds.rewards)
     assert torch.equal(found.outcomes[1].reward, expected.outcomes[1].reward)
-    valued = experience(DRIVING, start, actions, plan, stride=2, kept=whole)
-    assert not valued.outcomes and torch.equal(valued.exact, torch.full((1, 2, 2), 7.0))
-    part = kept.window(torch.tensor([0, 0]), 1, 2)
-    assert part.states.lane.shape == (2, 3) and part.values.shape == (2, 2, 2)
-    assert torch.equal(part.states.position[0], kept.states.position[0, 1:4])
+    joined = Course.join([replace(course, values=torch.full((1, 4, 2), 7.0 + n)) for n in (0, 1)])
+    second = joined.window(torch.tensor([1]), 0, 4)
+    valued = experience(DRIVING, start, actions, plan, stride=2, course=second)
+    assert not valued.outcomes and torch.equal(valued.exact, torch.full((1, 2, 2), 8.0))
+    part = joined.window(torch.tensor([1, 0]), 1, 2)
+    assert torch.equal(part.values[:, 0, 0], torch.tensor([8.0, 7.0]))
+    assert torch.equal(part.states.position[1], course.states.position[0, 1:4])
+    assert torch.equal(part.observation["visual"][0], course.observation["visual"][0, 1:4])
+    assert torch.equal(part.rewards[0], course.rewards[0, 1:3])
 
 
 # --- training ---------------------------------------------------------------------------------

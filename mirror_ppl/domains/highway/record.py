@@ -12,9 +12,9 @@ RECORD = Record(
         "q_network": 128,
     },
     training={
-        "phases": 8,
+        "phases": 10,
         "rounds": 160,
-        "steps": 350,
+        "steps": 650,
         "batch": 48,
         "beta": 0.5,
         "beta_decay": 0.5,
