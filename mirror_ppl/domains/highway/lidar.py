@@ -22,6 +22,8 @@ AHEAD, BACK = 0, SECTORS // 2
 """Sectors that face ahead and back."""
 RANGE = 60.0
 """Metres beyond which the lidar sees nothing; distance of a sector in which there is nothing."""
+RESOLUTION = 1 / 32
+"""Metres, and m/s, to which measurements are rounded; recordings are half as large for it."""
 FEATURES = ("distance", "velocity_along", "velocity_across")
 UNITS = ("m", "m/s", "m/s")
 
@@ -35,7 +37,7 @@ def scan(state: HighwayState) -> Tensor:
     Returns:
         ``[..., 36, 3]``: distance in metres, and the velocity of the nearest vehicle relative to
         the ego in m/s, along the ego's heading and across it to the right. An empty sector has
-        distance ``RANGE`` and no velocity.
+        distance ``RANGE`` and no velocity. All are rounded to ``RESOLUTION``.
     """
     boxes = seen_boxes(state)
     middles = torch.arange(SECTORS, dtype=boxes.dtype, device=boxes.device) * SECTOR
@@ -45,7 +47,8 @@ def scan(state: HighwayState) -> Tensor:
     across = speed * torch.sin(turned)
     hit = distance < RANGE
     motion = [torch.where(hit, each.gather(-1, nearest), 0.0) for each in (along, across)]
-    return torch.stack([torch.where(hit, distance, RANGE), *motion], -1)
+    measured = torch.stack([torch.where(hit, distance, RANGE), *motion], -1)
+    return (measured / RESOLUTION).round() * RESOLUTION
 
 
 def seen_boxes(state: HighwayState) -> Tensor:

@@ -13,8 +13,8 @@ from mirror_ppl.domains.highway.people import HighwayDrivers
 from mirror_ppl.domains.highway.world import FOG_AHEAD, FOG_BEHIND, Highway
 from mirror_ppl.people.base import DomainPeople, derived_generator
 
-CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 3.0, 0.35
-"""Median over drivers of the consistency, and spread of its logarithm, as in driving."""
+CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 1.0, 0.35
+"""Median over drivers of the consistency, and spread of its logarithm."""
 CAUTION_SPREAD = 0.3
 """Standard deviation over drivers of the logarithm of their caution."""
 SETTING_REACH = {

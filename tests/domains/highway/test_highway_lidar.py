@@ -7,9 +7,11 @@ import torch
 from highway_states import state_of
 
 from mirror_ppl.domains.highway.geometry import clearance, corners, overlap
-from mirror_ppl.domains.highway.lidar import RANGE, SECTOR, SECTORS, distances, scan
+from mirror_ppl.domains.highway.lidar import RANGE, RESOLUTION, SECTOR, SECTORS, distances, scan
 
 DEGREE = math.pi / 180
+HALF = RESOLUTION / 2 + 1e-9
+"""Largest error of a measurement."""
 
 
 def measured(*cars, ego=(0.0, 4.0, 0.0, 10.0)):
@@ -31,10 +33,10 @@ def test_a_car_straight_ahead():
 
 def test_a_car_straight_behind():
     found = measured((-12.0, 4.0, 0.0, 12.0))
-    assert found[18].tolist() == pytest.approx([9.5, 2.0, 0.0])
+    assert found[18].tolist() == pytest.approx([9.5, 2.0, 0.0], abs=HALF)
     # At 9.5 m, 5 degrees are 0.83 m: both neighbours see the rest of its front, 1 m wide.
     edge = 9.5 / math.cos(5 * DEGREE)
-    assert found[[17, 19], 0].tolist() == pytest.approx([edge, edge])
+    assert found[[17, 19], 0].tolist() == pytest.approx([edge, edge], abs=HALF)
     assert (found[[16, 20], 0] == RANGE).all()
 
 
@@ -44,7 +46,9 @@ def test_a_car_abreast_on_the_right():
     # Each sector's nearest point is on the bound that is nearer to abreast.
     for turned in range(1, 5):
         expected = 3 / math.cos((10 * turned - 5) * DEGREE)
-        assert found[[9 - turned, 9 + turned], 0].tolist() == pytest.approx([expected] * 2)
+        assert found[[9 - turned, 9 + turned], 0].tolist() == pytest.approx(
+            [expected] * 2, abs=HALF
+        )
     assert found[9, 0].item() == pytest.approx(3.0)
     seen = (found[:, 0] < RANGE).nonzero()[:, 0].tolist()
     # The near side ends within the sectors at 40 degrees; the far corner is at 26.6 degrees.
@@ -58,7 +62,9 @@ def test_left_and_right_are_mirrored_and_motion_turns_with_the_ego():
     shown = turned[turned[:, 0] < RANGE][:, 1:]
     expected = [12 * math.cos(30 * DEGREE) - 10, -12 * math.sin(30 * DEGREE)]
     assert len(shown) > 0
-    assert torch.allclose(shown, torch.tensor(expected, dtype=shown.dtype).expand_as(shown))
+    assert torch.allclose(
+        shown, torch.tensor(expected, dtype=shown.dtype).expand_as(shown), atol=HALF
+    )
 
 
 def test_the_nearest_car_hides_the_one_behind_it():
@@ -69,11 +75,13 @@ def test_the_nearest_car_hides_the_one_behind_it():
 def test_a_crossing_car_fills_sectors_without_a_corner_in_them():
     """Across the road, 3 m ahead to its side, it is wider than the sector that faces ahead."""
     found = measured((4.0, 4.0, 90 * DEGREE, 5.0))
-    assert found[0].tolist() == pytest.approx([3.0, -10.0, 5.0])
+    assert found[0].tolist() == pytest.approx([3.0, -10.0, 5.0], abs=HALF)
 
 
 def test_beyond_the_range_there_is_nothing():
-    assert measured((RANGE + 2.4, 4.0, 0.0, 7.0))[0].tolist() == pytest.approx([59.9, -3.0, 0.0])
+    assert measured((RANGE + 2.4, 4.0, 0.0, 7.0))[0].tolist() == pytest.approx(
+        [59.9, -3.0, 0.0], abs=HALF
+    )
     assert measured((RANGE + 2.6, 4.0, 0.0, 7.0))[0].tolist() == [RANGE, 0.0, 0.0]
 
 
