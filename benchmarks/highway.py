@@ -2,9 +2,10 @@
 
     python -m benchmarks.highway
 
-Rounds of the domain's batched physics and rounds of the Gymnasium environment on highway-env, from
-the same starts. None of the three drivers depends on what can be seen, so that there is one row
-for both settings.
+Rounds of manoeuvres, as people drive; rounds of steering and acceleration, in the batched physics
+and in the Gymnasium environment on highway-env; all from the same starts. Doing nothing is to keep
+the lane at full speed, or no steering and no pedal. No driver depends on what can be seen, so that
+there is one row for both settings.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ import tyro
 from torch import Tensor
 
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.highway import DirectHighway, HighwayState, expert
+from mirror_ppl.domains.highway import DirectHighway, Highway, HighwayState, expert
+from mirror_ppl.domains.highway.manoeuvres import SPEEDS
 from mirror_ppl.domains.highway.pictures import picture
 
 Driver = Callable[[HighwayState], Tensor]
+"""Maps states to actions."""
 
 
 @dataclass(frozen=True)
@@ -59,28 +62,42 @@ class Played:
         return torch.stack(list(self.terms.values())).sum(0)
 
 
+Play = Callable[[Highway, HighwayState, Driver], Played]
+"""Plays rounds from their starts."""
+
+
 def main(options: Options) -> None:
     """Run the study."""
     torch.set_num_threads(1)
     if options.picture:
         draw(options.picture)
         return
-    world = DirectHighway()
-    scenario = torch.arange(options.rounds) % len(world.scenarios)
-    start = world.initial(options.rounds, torch.Generator().manual_seed(options.seed), scenario)
+    scenario = torch.arange(options.rounds) % len(Highway.scenarios)
+    generator = torch.Generator().manual_seed(options.seed)
+    start = Highway().initial(options.rounds, generator, scenario)
     noise = torch.Generator().manual_seed(options.seed + 1)
     planning = expert.ExpertOptions(options.horizon)
-    drivers: dict[str, Driver] = {
+    direct: dict[str, Driver] = {
         "expert": lambda state: expert.act(state, planning),
         "nothing": lambda state: torch.zeros(*state.tick.shape, 2),
         "random": lambda state: torch.rand(*state.tick.shape, 2, generator=noise) * 2 - 1,
     }
-    simulators = {"batched": play_batched}
+    manoeuvres: dict[str, Driver] = {
+        "expert": lambda state: expert.values(state, planning).argmax(-1),
+        "nothing": lambda state: (state.lane[..., 0] + 1) * len(SPEEDS) - 1,
+        "random": lambda state: torch.randint(
+            len(Highway.actions), state.tick.shape, generator=noise
+        ),
+    }
+    simulators: dict[str, tuple[Highway, Play, dict[str, Driver]]] = {
+        "manoeuvres": (Highway(), play_batched, manoeuvres),
+        "direct": (DirectHighway(), play_batched, direct),
+    }
     if options.environment:
-        simulators["highway-env"] = play_environment
+        simulators["highway-env"] = DirectHighway(), play_environment, direct
     rows = []
     print(f"{'simulator':<12} {'driver':<8} {'return':>8} {'s.e.':>6} {'accidents':>9} {'s':>6}")
-    for simulator, play in simulators.items():
+    for simulator, (world, play, drivers) in simulators.items():
         for name, driver in drivers.items():
             played = play(world, start, driver)
             error = played.total.std() / options.rounds**0.5
@@ -97,7 +114,7 @@ def main(options: Options) -> None:
             writer.writerows(rows)
 
 
-def play_batched(world: DirectHighway, start: HighwayState, driver: Driver) -> Played:
+def play_batched(world: Highway, start: HighwayState, driver: Driver) -> Played:
     """Play all rounds at once, by the domain's physics."""
     began, state = time.monotonic(), start
     sums: dict[str, Tensor] = {}
@@ -110,7 +127,7 @@ def play_batched(world: DirectHighway, start: HighwayState, driver: Driver) -> P
     return Played(sums, world.over(state), time.monotonic() - began)
 
 
-def play_environment(world: DirectHighway, start: HighwayState, driver: Driver) -> Played:
+def play_environment(world: Highway, start: HighwayState, driver: Driver) -> Played:
     """Play all rounds on highway-env, side by side, so that the driver decides for all at once."""
     from mirror_ppl.domains.highway import vehicles
     from mirror_ppl.domains.highway.road import TICKS
@@ -140,7 +157,7 @@ def play_environment(world: DirectHighway, start: HighwayState, driver: Driver) 
 
 
 def rows_of(
-    simulator: str, driver: str, played: Played, scenario: Tensor, world: DirectHighway
+    simulator: str, driver: str, played: Played, scenario: Tensor, world: Highway
 ) -> list[dict[str, str | float]]:
     """Return a row for each scenario."""
     rows = []

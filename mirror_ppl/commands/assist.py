@@ -67,17 +67,18 @@ class Options:
     """Posterior draws that are planned with."""
     horizon: int | None = None
     """Steps that planners look ahead; 10 in driving, 16 in search_rescue and 12 in bomb_defusal
-    unless given."""
+    unless given. In highway they value the next action alone, without looking ahead."""
     discount: float = 1.0
     """Worth of a reward one step later, from above 0 to 1."""
     min_standard_errors: float | None = None
     """How many standard errors of its gain a message has to gain to be sent; 0 is enough for the
-    best on average. 2 in driving, 1 in search_rescue and 0 in bomb_defusal unless given."""
+    best on average. 2 in driving and highway, 1 in search_rescue and 0 in bomb_defusal unless
+    given."""
     patience: int | None = None
     """Steps over which a message is compared with saying it later; 1 compares with silence only."""
     enumerate_above: float | None = None
     """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
-    course a draw; 0.1 in driving and 0.4 in the other domains unless given."""
+    course a draw; 0.1 in driving and 0.4 in search_rescue and bomb_defusal unless given."""
     hears: float = 0.9
     """Probability that messages of a channel reach a person, before anything was told: what they do
     after messages tells. 1 takes it for granted."""

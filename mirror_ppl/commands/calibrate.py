@@ -44,8 +44,8 @@ class Options:
     """What to calibrate, and where the results go."""
 
     domain: str = "driving"
-    """The world: driving, search_rescue, bomb_defusal, or one of your own, path/to/file.py:Class,
-    whose code is run."""
+    """The world: driving, search_rescue, bomb_defusal, highway, or one of your own,
+    path/to/file.py:Class, whose code is run."""
     setting: str | None = None
     """The setting under which rounds are recorded; what people see is up to their implants.
     Default: the one in which people see less."""

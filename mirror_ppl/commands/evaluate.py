@@ -51,7 +51,7 @@ class Options:
     study: Positional[Literal["prediction", "assistance", "relevance"]]
     """What is compared."""
     domain: tuple[str, ...] = ("driving",)
-    """One or several worlds: driving, search_rescue, bomb_defusal, or of your own,
+    """One or several worlds: driving, search_rescue, bomb_defusal, highway, or of your own,
     path/to/file.py:Class, whose code is run."""
     setting: tuple[str, ...] = ()
     """Settings: by default all of prediction, and the one in which people see least otherwise."""

@@ -45,12 +45,13 @@ class Options:
     demos: Path | None = None
     """Recordings in the format of docs/demonstrations.md."""
     domain: str | None = None
-    """The world of the shipped recordings: driving (unless given), search_rescue or bomb_defusal.
+    """The world of the shipped recordings: driving (unless given), search_rescue,
+    bomb_defusal or highway.
     Of --demos of a world of your own, path/to/file.py:Class, whose code is run."""
     setting: str | None = None
-    """The setting of the shipped recordings: clear or fog in driving, clear or smoke in
-    search_rescue, labelled or unlabelled in bomb_defusal. Default: the one in which people see
-    less."""
+    """The setting of the shipped recordings: clear or fog in driving and highway, clear or
+    smoke in search_rescue, labelled or unlabelled in bomb_defusal. Default: the one in which
+    people see less."""
     population: str | None = None
     """The people of the shipped recordings: paper (unless given; sight limited by the setting
     alone, in bomb_defusal as quick at every terminal) or diverse (each their own sight)."""

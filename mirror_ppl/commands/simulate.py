@@ -38,13 +38,14 @@ class Options:
     """The netCDF file to write; one that is there is replaced, missing folders are created."""
     domain: str = "driving"
     """The world: driving (two lanes, four cars that never yield), search_rescue (a burning house,
-    a victim, two corridors) or bomb_defusal (three stages, six terminals);
-    or one of your own, path/to/file.py:Class, whose code is run (docs/adding_a_world.md)."""
+    a victim, two corridors), bomb_defusal (three stages, six terminals) or highway (three lanes,
+    lidar); or one of your own, path/to/file.py:Class, whose code is run
+    (docs/adding_a_world.md)."""
     setting: str | None = None
     """Its setting: of driving clear (the whole road in sight) or fog (2 cells ahead, nothing
     behind), of search_rescue clear (the whole house in sight) or smoke (1.5 cells around), of
-    bomb_defusal labelled (the type can be read) or unlabelled. Default: the one in which people see
-    less."""
+    bomb_defusal labelled (the type can be read) or unlabelled, of highway clear or fog (15 m ahead,
+    5 m behind). Default: the one in which people see less."""
     population: str = "paper"
     """Who: paper (sight limited by the setting alone; in bomb_defusal as quick at every terminal)
     or diverse (each their own sight)."""

@@ -42,17 +42,18 @@ class Options:
     the domain."""
     domain: str = "driving"
     """The world to learn: driving (two lanes, four cars that never yield), search_rescue (a
-    burning house, a victim, two corridors) or bomb_defusal (three stages, six terminals);
-    or one of your own, path/to/file.py:Class, whose code is run (docs/adding_a_world.md)."""
+    burning house, a victim, two corridors), bomb_defusal (three stages, six terminals) or highway
+    (three lanes, lidar); or one of your own, path/to/file.py:Class, whose code is run
+    (docs/adding_a_world.md)."""
     phases: int | None = None
     """Of a self-model: phases of acting and learning; 2 to try it out. Default: what makes a good
-    one, of driving 40, of search_rescue 400 and of bomb_defusal 200."""
+    one, of driving 40, of search_rescue 400, of bomb_defusal 200 and of highway 12."""
     steps: int | None = None
     """Of a self-model: gradient steps of a phase. Default: of driving 300,
-    of search_rescue 40, of bomb_defusal 30."""
+    of search_rescue 40, of bomb_defusal 30, of highway 650."""
     learning_rate: float | None = None
     """Of a self-model: learning rate at the start; it falls to a hundredth. Default: of driving
-    0.001, of the others 0.002."""
+    and highway 0.001, of the others 0.002."""
     speech: str = "words"
     """Of a self-model: what makes numbers of utterances, words or gpt2 (the supplement's; needs the
     extra "speech" and its weights)."""

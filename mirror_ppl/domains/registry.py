@@ -12,6 +12,7 @@ from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.bomb_defusal import BombDefusal
 from mirror_ppl.domains.checking import require_sound
 from mirror_ppl.domains.driving import Driving
+from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.search_rescue import SearchRescue
 from mirror_ppl.domains.world import World
 from mirror_ppl.errors import DomainError, UnknownNameError, shown
@@ -22,7 +23,11 @@ ENTRY_POINTS = "mirror_ppl.domains"
 DOMAINS: dict[str, Domain] = {
     domain.name: domain for domain in (Driving(), SearchRescue(), BombDefusal())
 }
-"""The package's own worlds by name."""
+"""The package's own worlds by name, of which a self-model ships."""
+UNTRAINED: dict[str, Domain] = {domain.name: domain for domain in (Highway(),)}
+"""Those of which none ships: `train` makes one."""
+OWN = DOMAINS | UNTRAINED
+"""All worlds of the package, of which recordings ship."""
 CODE = "_hash_of_file"
 """Attribute of the class of a user's world."""
 _ADDED: dict[str, World] = {}
@@ -37,7 +42,7 @@ def added_worlds() -> tuple[World, ...]:
 
 def known_domains() -> tuple[Domain, ...]:
     """Return the package's own worlds and those that were added."""
-    return (*DOMAINS.values(), *_ADDED.values())
+    return (*OWN.values(), *_ADDED.values())
 
 
 def load_world(specification: str | type[World] | World) -> World:
@@ -61,7 +66,7 @@ def load_world(specification: str | type[World] | World) -> World:
             raise DomainError(f"{world.__name__} cannot be made: {describe(error)}") from error
     if not isinstance(world, World):
         raise DomainError(f"a world is derived from mirror_ppl.World, not {type(world).__name__}")
-    if world.name in DOMAINS:
+    if world.name in OWN:
         raise DomainError(f"{type(world).__name__}: mirror_ppl has a world {world.name} itself")
     return world
 
@@ -84,7 +89,7 @@ def code_of(domain: Domain) -> str:
 
     It is computed once and kept by the class: other processes do not have the file.
     """
-    if domain.name in DOMAINS:
+    if domain.name in OWN:
         return ""
     kind = type(domain)
     if CODE not in vars(kind):
@@ -121,9 +126,9 @@ def get_domain(name: str) -> Domain:
         DomainError: the file or class is missing, does not import, or is no world.
     """
     if not isinstance(name, str):
-        raise UnknownNameError.of("domain", name, DOMAINS)
-    if name in DOMAINS:
-        return DOMAINS[name]
+        raise UnknownNameError.of("domain", name, OWN)
+    if name in OWN:
+        return OWN[name]
     if name in _ADDED:
         return _ADDED[name]
     if ".py:" in name:
@@ -138,7 +143,7 @@ def get_domain(name: str) -> Domain:
             raise DomainError(f"{entry.value}: is called {world.name}, but its entry point {name}")
         return world
     installed = [entry.name for entry in entry_points(group=ENTRY_POINTS)]
-    known = dict.fromkeys([*DOMAINS, *_ADDED, *installed])
+    known = dict.fromkeys([*OWN, *_ADDED, *installed])
     message = f"{UnknownNameError.of('domain', name, known)}"
     raise UnknownNameError(f"{message}; a world of your own is --domain path/to/file.py:Class")
 

@@ -162,7 +162,7 @@ def experience(
     outcomes = ()
     if values is None:
         outcomes = _outcomes(domain, plan, some, known, 1 + first, stride)
-    if plan.assumes:  # the world is not as believed
+    if any(makes.any() for makes in plan.assumes.values()):  # the world is not as believed
         later, observation = domain.transition(current, actions), domain.observe(believed)
         rewards = total_reward(domain.rewards(current, actions, later))
     taken = plan.taken(domain, knowledge, observation)

@@ -31,7 +31,12 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
 from mirror_ppl.training.experience import Course, Experience, drive, experience
-from mirror_ppl.training.views import KIND_PROBABILITIES, KINDS, draw_views
+from mirror_ppl.training.views import (
+    ASSUMPTION_PROBABILITY,
+    KIND_PROBABILITIES,
+    KINDS,
+    draw_views,
+)
 
 VALUED = 1024
 """States of which values are computed at once; bounds memory."""
@@ -65,6 +70,9 @@ class SelfModelOptions:
         difference_weight: weight of errors in the differences between actions, added to the errors
             themselves. Choices of people depend on these differences alone.
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
+        assumed: share of sight views in which each assumption is made. At 0 the robot does not
+            learn what follows from assumptions, which suits worlds where an item that is imagined
+            is like one that is seen.
         at_means: True to learn values at the encoder's means in every step, False to alternate with
             draws of the guide. Means are exact sooner where decisive items are clearly visible.
         exact: True to learn the exact planner's values, where there is one, for observers who know
@@ -93,6 +101,7 @@ class SelfModelOptions:
     stride: int = 1
     difference_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
+    assumed: float = ASSUMPTION_PROBABILITY
     at_means: bool = False
     exact: bool = False
     distil: bool = False
@@ -122,7 +131,15 @@ class SelfModelOptions:
             raise ValueError(
                 f"kinds must be {len(KINDS)} numbers, not negative and not all 0, not {self.kinds}"
             )
-        for name in ("beta", "beta_decay", "epsilon", "epsilon_decay", "epsilon_floor", "discount"):
+        for name in (
+            "beta",
+            "beta_decay",
+            "epsilon",
+            "epsilon_decay",
+            "epsilon_floor",
+            "discount",
+            "assumed",
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
 
@@ -335,7 +352,9 @@ class _Trainer:
         options, domain = self.options, self.domain
         start = domain.anywhere(options.rounds, self.generator)
         length = options.length or domain.horizon
-        plan = draw_views(domain, options.rounds, length, self.generator, options.kinds)
+        plan = draw_views(
+            domain, options.rounds, length, self.generator, options.kinds, options.assumed
+        )
         epsilon = options.epsilon * options.epsilon_decay**self.phase
         expert = options.beta * options.beta_decay**self.phase
         if not offers(domain, "reference_values"):
@@ -374,7 +393,12 @@ class _Trainer:
                 acted = acted[:, begin : begin + options.window]
                 lived_through = course.window(chosen, begin, options.window)
             plan = draw_views(
-                self.domain, options.batch, acted.shape[1], self.generator, options.kinds
+                self.domain,
+                options.batch,
+                acted.shape[1],
+                self.generator,
+                options.kinds,
+                options.assumed,
             )
             lived = experience(
                 self.domain,

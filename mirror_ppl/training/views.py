@@ -132,6 +132,7 @@ def draw_views(
     steps: int,
     generator: torch.Generator,
     kinds: Sequence[float] = KIND_PROBABILITIES,
+    assumed: float = ASSUMPTION_PROBABILITY,
 ) -> ViewPlan:
     """Draw a view for each of ``batch`` rounds of ``steps`` actions.
 
@@ -141,6 +142,7 @@ def draw_views(
         steps: actions of a round.
         generator: source of randomness.
         kinds: share of rounds with a view of each of ``KINDS``.
+        assumed: share of sight views in which each assumption is made.
     """
     device = generator.device
 
@@ -178,8 +180,6 @@ def draw_views(
         keep=keep,
         told=told,
         remembers=sight,
-        assumes={
-            name: sight & (uniform(batch) < ASSUMPTION_PROBABILITY) for name in domain.assumptions
-        },
+        assumes={name: sight & (uniform(batch) < assumed) for name in domain.assumptions},
         noise=noise,
     )

@@ -26,9 +26,9 @@ from mirror_ppl.domains.highway.state import HighwayState
 
 SPEEDS = (0.0, 0.5, 0.8, 0.97)
 """Speeds in shares of the limit; the fastest leaves room for errors, which the reward punishes."""
-SPEED_NAMES = ("0 km/h", "20 km/h", "32 km/h", "39 km/h")
+SPEED_NAMES = ("stop", "slow", "medium", "fast")
 LANE_NAMES = ("left", "middle", "right")
-MANOEUVRES = tuple(f"{lane} lane at {speed}" for lane in LANE_NAMES for speed in SPEED_NAMES)
+MANOEUVRES = tuple(f"{lane} lane {speed}" for lane in LANE_NAMES for speed in SPEED_NAMES)
 """Lane and speed of each manoeuvre in words; the lane changes slowest."""
 
 HEADING_GAIN, LATERAL_GAIN, SPEED_GAIN = 2.0, 0.7, 1.5

@@ -25,7 +25,7 @@ from mirror_ppl.domains.highway.lidar import RANGE
 from mirror_ppl.domains.highway.road import DECISION_TICKS, TICK, centre_of, lane_of
 from mirror_ppl.domains.highway.speech import AHEAD, DIRECTIONS, NOTHING, SIDES, WORDS
 from mirror_ppl.domains.highway.world import SIGHT_OF, Highway
-from mirror_ppl.models.implants import SIGHT
+from mirror_ppl.models.implants import ASSUMES, SIGHT
 from mirror_ppl.people.base import SimulatedPeople
 
 SECONDS = TICK * DECISION_TICKS
@@ -146,10 +146,9 @@ class HighwayDrivers(SimulatedPeople):
         return reach.view(len(reach), *(1,) * (ego.dim() - 2), -1).expand(*ego.shape[:-1], -1)
 
     def truth(self) -> dict[str, Tensor]:
-        """Return their sight thresholds."""
-        return {
-            SIGHT + name: self.reach[:, place] for place, name in enumerate(self.domain.directions)
-        }
+        """Return their sight thresholds, and that they take for granted what they do not see."""
+        own = {SIGHT + name: self.reach[:, i] for i, name in enumerate(self.domain.directions)}
+        return own | {ASSUMES + "clear": torch.ones_like(self.consistency)}
 
 
 def _told(ego: Tensor, said: Tensor) -> Memory:

@@ -12,7 +12,7 @@ RECORD = Record(
         "q_network": 128,
     },
     training={
-        "phases": 10,
+        "phases": 12,
         "rounds": 160,
         "steps": 650,
         "batch": 48,
@@ -25,6 +25,7 @@ RECORD = Record(
         "window": 24,
         "distil": True,
         "kinds": (0.2, 0.1, 0.7),
+        "assumed": 0.0,
     },
     measured=100,
     people="mirror_ppl.domains.highway.participants:DRIVERS",

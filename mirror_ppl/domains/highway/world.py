@@ -128,6 +128,7 @@ class Highway(World):
         "fog": (FOG_AHEAD, FOG_AHEAD, FOG_BEHIND, FOG_BEHIND),
         "ahead only": (RANGE, RANGE, 0.0, 0.0),
     }
+    assumptions: tuple[str, ...] = ("clear",)
     told_practice = 0.1
     counterparts: tuple[int | None, ...] = tuple(group_of(sector) for sector in range(SECTORS))
     symbol_sizes: Mapping[str, int] = {
@@ -246,6 +247,19 @@ class Highway(World):
             )
             for m in self.modalities
         }
+
+    def assume(
+        self, knowledge: Any, observation: Observation
+    ) -> tuple[dict[str, Visibility], Observation]:
+        """Return the assumption ``clear``: where nothing is seen, no car is."""
+        del knowledge
+        visual = observation["visual"]
+        nothing = visual.new_tensor([RANGE, 0.0, 0.0]).expand(visual.shape)
+        about = {
+            "visual": torch.ones_like(visual[..., 0], dtype=torch.bool),
+            "verbal": torch.zeros_like(observation["verbal"][..., 0], dtype=torch.bool),
+        }
+        return {"clear": about}, {**observation, "visual": nothing}
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Encode observations for networks; distances by their place between ``KNOTS``."""

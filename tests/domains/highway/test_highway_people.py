@@ -50,7 +50,7 @@ def test_who_sees_a_crawling_car_makes_way_and_who_does_not_drives_on():
         assert probability.sum().item() == pytest.approx(1)
         return MANOEUVRES[int(probability[0].argmax())]
 
-    goes_on = "middle lane at 39 km/h"
+    goes_on = "middle lane fast"
     assert lane(60.0, 60.0, 60.0, 60.0) != goes_on and lane(10.0, 10.0, 10.0, 10.0) == goes_on
     for told in (message(visual=["front"]), message(verbal=["front"])):
         assert lane(10.0, 10.0, 10.0, 10.0, told=told) != goes_on
@@ -104,7 +104,7 @@ def test_a_seed_gives_the_same_people_and_populations_are_known_by_name():
     assert torch.equal(three.reach, five.reach[:3]) and torch.equal(three.caution, five.caution[:3])
     alike = simulated_highway_drivers("fog", "paper", 2, 1)
     assert alike.reach.tolist() == [[15.0, 15.0, 5.0, 5.0]] * 2
-    assert set(three.truth()) == {f"sight_{name}" for name in WORLD.directions}
+    assert set(three.truth()) == {*(f"sight_{name}" for name in WORLD.directions), "assumes_clear"}
     with pytest.raises(UnknownNameError, match="diverse, paper"):
         simulated_highway_drivers("fog", "nobody", 1, 1)
 

@@ -1,0 +1,50 @@
+"""The highway among the worlds of the package: recordings ship, a self-model has to be trained."""
+
+import os
+
+import pytest
+import torch
+
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.domains import DOMAINS, add_domain, get_domain
+from mirror_ppl.domains.checking import faults_of
+from mirror_ppl.domains.highway import Highway
+from mirror_ppl.errors import AssetError, DomainError
+from mirror_ppl.models.weights import shipped_weights
+from mirror_ppl.people import act, draw_starts, populations_of, simulated_people
+
+RECORDINGS = [(s, p) for s in Highway.settings for p in ("diverse", "paper")]
+
+
+def test_it_is_a_sound_world_of_the_package():
+    world = get_domain("highway")
+    assert isinstance(world, Highway) and "highway" not in DOMAINS
+    assert faults_of(world) == [] and populations_of("highway") == ("diverse", "paper")
+    with pytest.raises(DomainError, match="mirror_ppl has a world highway itself"):
+        add_domain(Highway)
+
+
+@pytest.mark.parametrize(("setting", "population"), RECORDINGS)
+def test_recordings_are_of_the_drivers_that_a_seed_gives(setting, population):
+    """What all ten did first in their 40 rounds, and who they are."""
+    recorded = load_demonstrations(asset_path(f"highway_{setting}_{population}.nc"))
+    assert (recorded.domain, recorded.setting) == ("highway", setting)
+    assert recorded.shape == (10, 40, 48) and int(recorded.lengths.max()) == 48
+    world, people = Highway(), simulated_people("highway", setting, population, 10, 0)
+    start = draw_starts(10, 40, 0, "rounds", setting, domain=world)
+    now = world.observe(start.state)
+    for name, value in now.items():
+        torch.testing.assert_close(recorded.observation()[name][:, :, 0], value)
+    probability, _ = people.step(people.start(40), now)
+    first = act(probability, start.action_noise[..., 0])
+    # Sums of rewards differ by rounding between batches of other sizes.
+    assert (first == recorded.actions[..., 0]).float().mean() > 0.99
+    for name, value in people.truth().items():
+        assert torch.equal(recorded.truth[name], value)
+
+
+def test_without_a_self_model_a_fit_says_how_to_train_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(AssetError, match="mirror_ppl.train --domain highway"):
+        shipped_weights("highway")
+    assert not os.listdir(tmp_path)
