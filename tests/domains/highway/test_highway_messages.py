@@ -2,7 +2,9 @@
 
 import pytest
 import torch
+from highway_states import state_of
 
+from mirror_ppl.communication import RoundSoFar, rules
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.highway.lidar import SECTORS
@@ -57,3 +59,27 @@ def test_costs_are_those_of_driving_in_table_i(shown, said, expected):
 def test_modalities_name_what_there_is():
     assert len(SEEN.items) == SECTORS and len(set(SEEN.items)) == SECTORS
     assert SEEN.communicated == SPOKEN.communicated == SPOKEN.items and len(SPOKEN.items) == 6
+
+
+# --- rules by hand -------------------------------------------------------------------------------
+
+
+def begun(*cars):
+    world = Highway()
+    now = world.observe(state_of(cars=cars, dtype=torch.float32))
+    return RoundSoFar.begin(world, now)
+
+
+def test_the_nearest_hidden_car_is_shown_with_its_group():
+    """15 m ahead are seen in fog, 5 m behind; of two hidden cars the one behind is nearer."""
+    near, far = (-14.0, 4.0, 0.0, 10.0), (25.0, 4.0, 0.0, 10.0)
+    for cars, spoken in (((far, near), "rear"), ((far,), "front")):
+        flags = rules.nearest(Highway(), begun(*cars), "fog")
+        assert list(CHANNELS.message(flags)) == [("verbal", spoken)]
+    assert not rules.nearest(Highway(), begun((12.0, 4.0, 0.0, 10.0)), "fog").any()
+
+
+def test_random_messages_are_of_groups():
+    generator = torch.Generator().manual_seed(0)
+    flags = rules.at_random(Highway(), begun(), {"visual": 1.0, "verbal": 0.0}, generator)
+    assert flags.tolist() == [True] * 6 + [False] * 6
