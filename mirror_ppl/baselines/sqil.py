@@ -129,9 +129,10 @@ class SoftQ(RecurrentNetworks):
             can_be = domain.communicable(observation)
             heard = {name: torch.zeros_like(may) for name, may in can_be.items()}
             if told is not None and told.any():
-                for name, may in can_be.items():
-                    noise = [torch.rand(may.shape[1:], generator=own) for own in generators]
-                    heard[name] = may & (torch.stack(noise) < told[:, None, None])
+                for m in domain.modalities:
+                    shape = (rounds, len(m.communicated))
+                    noise = torch.stack([torch.rand(shape, generator=own) for own in generators])
+                    heard[m.name] = can_be[m.name] & m.items_of(noise < told[:, None, None])
             seen, heard, knowledge = look(
                 domain, self.sight, setting, knowledge, observation, heard
             )

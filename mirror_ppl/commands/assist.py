@@ -67,7 +67,7 @@ class Options:
     """Posterior draws that are planned with."""
     horizon: int | None = None
     """Steps that planners look ahead; 10 in driving, 16 in search_rescue and 12 in bomb_defusal
-    unless given. In highway they value the next action alone, without looking ahead."""
+    unless given. In highway mirror values the next action alone, without looking ahead."""
     discount: float = 1.0
     """Worth of a reward one step later, from above 0 to 1."""
     min_standard_errors: float | None = None

@@ -16,7 +16,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Domain, Modality, Visibility, require_known
+from mirror_ppl.domains.base import Domain, Visibility, require_known
 from mirror_ppl.errors import UnknownNameError
 
 
@@ -78,11 +78,11 @@ class Channels:
     def split(self, flags: Tensor) -> Visibility:
         """Split flags ``[..., N]`` into masks ``[..., K]`` by modality."""
         parts = flags.split(self.sizes, -1)
-        return {m.name: _items(m, part) for m, part in zip(self.modalities, parts, strict=True)}
+        return {m.name: m.items_of(part) for m, part in zip(self.modalities, parts, strict=True)}
 
     def join(self, masks: Visibility) -> Tensor:
         """Join masks ``[..., K]`` by modality into flags ``[..., N]``: groups with all items."""
-        return torch.cat([_groups(m, masks[m.name]) for m in self.modalities], -1)
+        return torch.cat([m.groups_in(masks[m.name]) for m in self.modalities], -1)
 
     def marginal(self, number: int) -> Tensor:
         """Return each item's marginal cost ``[N]`` as the n-th of its modality in a step."""
@@ -119,23 +119,6 @@ class Channels:
             for item in chosen:
                 flags[self.pairs.index((name, require_known(item, f"{name} item", known)))] = True
         return flags
-
-
-def _items(modality: Modality, flags: Tensor) -> Tensor:
-    """Return the items ``[..., K]`` of flagged groups."""
-    if not modality.groups:
-        return flags
-    owner = torch.empty(len(modality.items), dtype=torch.long, device=flags.device)
-    for group, (_, places) in enumerate(modality.groups):
-        owner[list(places)] = group
-    return flags[..., owner]
-
-
-def _groups(modality: Modality, mask: Tensor) -> Tensor:
-    """Return flags of groups all of whose items are in a mask ``[..., K]``."""
-    if not modality.groups:
-        return mask
-    return torch.stack([mask[..., list(places)].all(-1) for _, places in modality.groups], -1)
 
 
 def count_messages(allowed: Tensor, most: int | None = None) -> int:

@@ -40,8 +40,8 @@ class PlannerOptions:
         terminal_value: see :class:`ExpectedUtility`.
         predict_with: what ``mirror`` values the person's actions with: ``simulator``, rolled out;
             ``self-model``, the robot's learned world model, rolled out; or ``values``, the robot's
-            action values without a roll-out (:class:`ExpectedValue`), which do not depend on the
-            settings before.
+            action values without a roll-out (:class:`ExpectedValue`), where horizon, discount,
+            enumerate_above, patience and terminal_value have no effect.
         hears: prior probability that messages of a modality reach the person
             (:mod:`mirror_ppl.communication.hearing`); 1 assumes that they do.
         kl_weight: units of reward per nat in mirror-kl.

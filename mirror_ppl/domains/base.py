@@ -114,11 +114,28 @@ class Modality:
         grouped = sorted(place for _, places in self.groups for place in places)
         if self.groups and grouped != list(range(len(self.items))):
             raise ValueError(f"modality {self.name!r}: each item belongs in exactly one group")
+        if len({name for name, _ in self.groups}) < len(self.groups):
+            raise ValueError(f"modality {self.name!r}: groups need different names")
 
     @property
     def communicated(self) -> tuple[str, ...]:
         """Names of what can be communicated: of groups, or else of items."""
         return tuple(name for name, _ in self.groups) or self.items
+
+    def items_of(self, communicated: Tensor) -> Tensor:
+        """Return masks of items ``[..., K]`` from those of what is communicated ``[..., N]``."""
+        if not self.groups:
+            return communicated
+        owner = torch.empty(len(self.items), dtype=torch.long, device=communicated.device)
+        for group, (_, places) in enumerate(self.groups):
+            owner[list(places)] = group
+        return communicated[..., owner]
+
+    def groups_in(self, mask: Tensor) -> Tensor:
+        """Return which groups ``[..., N]`` have all their items in a mask ``[..., K]``."""
+        if not self.groups:
+            return mask
+        return torch.stack([mask[..., list(places)].all(-1) for _, places in self.groups], -1)
 
     def cost(self, number: Tensor) -> Tensor:
         """Return the cost in units of reward of communicating ``number`` items (or groups)."""

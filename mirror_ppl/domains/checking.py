@@ -272,7 +272,7 @@ def _of_one(world: World, states: Any, observations: Mapping[str, Tensor]) -> li
     _call(world, "next_observation", now, torch.tensor(0))
     _call(world, "render", state)
     for modality in world.modalities:
-        for item in modality.items:
+        for item in (*modality.items, *(name for name, _ in modality.groups)):
             _call(world, "describe", now, modality.name, item)
     for action in range(len(world.actions)):
         _call(world, "deed", now, None, action)

@@ -319,6 +319,10 @@ class World(ABC):
     def describe(self, observation: Observation, modality: str, item: str) -> str:
         """Describe an item of one observation, such as "key: row 1 cells, column 3 cells"."""
         own = next(m for m in self.modalities if m.name == modality)
+        groups = dict(own.groups)
+        if item in groups:
+            each = (self.describe(observation, modality, own.items[i]) for i in groups[item])
+            return f"{item} ({'; '.join(each)})"
         place = own.items.index(item)
         if own.utterances:
             return own.utterances[place][round(float(observation[modality][place, 0]))]

@@ -180,7 +180,10 @@ class Planning:
 
 
 def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
-    """The oracle: optimal messages or, for people who follow the human model, a planner's."""
+    """The oracle: optimal messages, in some worlds greedy ones (`DomainPeople.best_messages`).
+
+    For people who follow the human model, those of a planner with their true implants.
+    """
     if (known := listener.driver.modelled()) is not None:
         planner = planner_of("mirror", Person(*known), replace(options, hears=1.0), seed)
         return Planning(planner)

@@ -94,16 +94,22 @@ class Tally:
         """Count messages ``[R, N]`` and communicable items of a step."""
         self.steps += int(under_way.sum())
         self.cost += self.channels.cost(flags)
-        messages, may = self.channels.split(flags), self.domain.communicable(observation)
+        may = self._by_modality(self.channels.join(self.domain.communicable(observation))[0])
+        messages = self._by_modality(flags)
         for name, mask in messages.items():
             self.items[name] += mask.sum(-1)
-            self.chances[name] += int(may[name][0, under_way].sum())
+            self.chances[name] += int(may[name][under_way].sum())
         for notion, masks in self.domain.relevance(observation).items():
             counts = self.relevant.setdefault(
                 notion, {name: torch.zeros_like(count) for name, count in self.items.items()}
             )
+            relevant = self._by_modality(self.channels.join(masks)[0])
             for name, mask in messages.items():
-                counts[name] += (mask & masks[name][0]).sum(-1)
+                counts[name] += (mask & relevant[name]).sum(-1)
+
+    def _by_modality(self, flags: Tensor) -> dict[str, Tensor]:
+        """Split flags ``[R, N]``; a group counts as one item."""
+        return dict(zip(self.items, flags.split(self.channels.sizes, -1), strict=True))
 
     def add_rewards(self, terms: Mapping[str, Tensor]) -> None:
         """Add rewards ``[1, R]`` of a step, by term."""

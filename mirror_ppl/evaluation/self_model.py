@@ -116,7 +116,7 @@ def self_model_quality(
         are compared along rounds with one random action in five.
     """
     domain = self_model.domain.as_believed
-    rounds = rounds or domain.record.measured
+    rounds = domain.record.measured if rounds is None else rounds
     device = next(self_model.parameters()).device
     generator = torch.Generator(device).manual_seed(seed)
     start = domain.initial(rounds, generator)

@@ -149,12 +149,13 @@ def _told(
     can_be = domain.communicable(observation)
     if not chance:
         return {name: torch.zeros_like(mask) for name, mask in can_be.items()}
-    return {
-        name: mask
-        & under_way[..., None]
-        & (torch.rand(mask.shape, generator=generator, device=mask.device) < chance)
-        for name, mask in can_be.items()
-    }
+    told = {}
+    for m in domain.modalities:
+        mask = can_be[m.name]
+        shape = (*mask.shape[:-1], len(m.communicated))
+        noise = torch.rand(shape, generator=generator, device=mask.device)
+        told[m.name] = mask & under_way[..., None] & m.items_of(noise < chance)
+    return told
 
 
 def simulate_from_prior(

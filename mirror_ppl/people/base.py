@@ -27,8 +27,8 @@ class DomainPeople:
         oracle: maps one person and the initial states of rounds to a function from actions
             ``[R, t]`` to the best messages ``[R, items]``; unless given, the oracle enumerates
             reachable states (:mod:`mirror_ppl.evaluation.reachable_oracle`).
-        best_messages: where states are too many for that, maps one person, the true states
-            ``[1, R]`` and their memories ``[1, R]`` to messages ``[R, items]``.
+        best_messages: a greedy oracle, where states are too many for that: maps one person, the
+            true states ``[1, R]`` and their memories ``[1, R]`` to messages ``[R, items]``.
     """
 
     populations: tuple[str, ...]

@@ -181,9 +181,10 @@ def _told(
     can_be = domain.communicable(observation)
     if message_noise is None:
         return {name: torch.zeros_like(mask) for name, mask in can_be.items()}
-    below = (message_noise < rate).split([len(part.items) for part in domain.modalities], -1)
+    sizes = [len(part.communicated) for part in domain.modalities]
+    below = (message_noise < rate).split(sizes, -1)
     return {
-        part.name: can_be[part.name] & own & under_way[..., None]
+        part.name: can_be[part.name] & part.items_of(own) & under_way[..., None]
         for part, own in zip(domain.modalities, below, strict=True)
     }
 
@@ -248,7 +249,7 @@ def _message_noise(
     device: torch.device | str,
 ) -> Tensor:
     """Draw noise ``[P, B, T, N]`` that chooses messages, with a generator per person."""
-    items = sum(len(part.items) for part in domain.modalities)
+    items = sum(len(part.communicated) for part in domain.modalities)
     drawn = []
     for person in range(people):
         generator = derived_generator(seed, "told", setting, person, device=device)

@@ -1,6 +1,7 @@
 """Experience of the robot: rounds that it drove, and the outcomes of every action.
 
-Only the initial states and the actions of rounds are stored. The world is deterministic, so
+Only the initial states and the actions of rounds are stored, unless a `Course` is kept, which
+worlds with slow transitions need. The world is deterministic, so
 observations, views and rewards are recomputed whenever a round is used for training.
 """
 

@@ -6,6 +6,9 @@ samples rounds from all experience so far, each under a newly drawn view, and mi
 
     - ELBO / (B (T + 1)) * world_weight  +  mean squared Bellman error of both actions.
 
+With ``distil``, the planner's values in the true state take the place of outcomes, in every view;
+the error that is reported is then that of the regression.
+
 The Bellman error uses the outcomes of *every* action, from the robot's simulator, not only of the
 action taken. Where the observer knows everything, the targets can also be the values of the exact
 planner (the expert) instead of bootstrapped values.
@@ -26,7 +29,7 @@ from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.domains.record import settings_of
 from mirror_ppl.domains.registry import code_of, get_domain
-from mirror_ppl.domains.world import offers
+from mirror_ppl.domains.world import World, offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
@@ -71,8 +74,7 @@ class SelfModelOptions:
             themselves. Choices of people depend on these differences alone.
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
         assumed: share of sight views in which each assumption is made. At 0 the robot does not
-            learn what follows from assumptions, which suits worlds where an item that is imagined
-            is like one that is seen.
+            learn what follows from assumptions; imagined items are then like seen ones to it.
         at_means: True to learn values at the encoder's means in every step, False to alternate with
             draws of the guide. Means are exact sooner where decisive items are clearly visible.
         exact: True to learn the exact planner's values, where there is one, for observers who know
@@ -125,6 +127,10 @@ class SelfModelOptions:
             raise ValueError(
                 f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
             )
+        if self.window < 0 or self.length < 0:
+            raise ValueError("window and length must not be negative")
+        if self.distil and self.exact:
+            raise ValueError("distil and exact are two ways to learn a planner's values")
         if self.distil and not self.window:
             raise ValueError("distil needs a window: values are kept with the states of rounds")
         if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:
@@ -256,6 +262,23 @@ def train_self_model(
     return trainer.self_model.eval()
 
 
+def _require_fitting(domain: Domain, options: SelfModelOptions) -> None:
+    """Refuse options that do not fit a world.
+
+    Raises:
+        ValueError: a window is longer than rounds, or ends where nothing is known to follow; or
+            assumptions are to be learned that the world does not work out.
+    """
+    rounds = options.length or domain.horizon
+    if options.window > rounds:
+        raise ValueError(f"window is {options.window}, longer than rounds of {rounds} steps")
+    if options.window and domain.over_at_horizon and not options.distil:
+        raise ValueError(f"with a window, values of {domain.name} can only be distilled")
+    works_out = not isinstance(domain, World) or offers(domain, "supposed")
+    if options.assumed and domain.assumptions and not works_out:
+        raise ValueError(f"assumed must be 0, as {domain.name} has no supposed()")
+
+
 class _Trainer:
     """State of a training run, as checkpoints hold it."""
 
@@ -269,6 +292,7 @@ class _Trainer:
         sizes: Sizes,
         kind: type[SelfModel],
     ) -> None:
+        _require_fitting(domain, options)
         self.domain = domain
         self.options = options
         self.run_id = {

@@ -281,8 +281,27 @@ def test_what_is_kept_of_rounds_is_what_is_computed():
 # --- training ---------------------------------------------------------------------------------
 
 
-def test_a_planner_s_values_are_learned_in_every_view():
-    """The planner is DRIVING's exact one; what is not seen is averaged over."""
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"window": -1}, "must not be negative"),
+        ({"distil": True}, "distil needs a window"),
+        ({"distil": True, "window": 3, "exact": True}, "distil and exact are two ways"),
+        ({"distil": True, "window": 5, "length": 4}, "window is 5, longer than rounds of 4 steps"),
+    ],
+)
+def test_windows_that_do_not_fit_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        train_self_model(DRIVING, SelfModelOptions(**options), torch.Generator())
+
+
+def test_assumptions_that_a_world_does_not_work_out_are_not_trained_with():
+    with pytest.raises(ValueError, match=r"assumed must be 0, as highway has no supposed\(\)"):
+        options = SelfModelOptions.of("highway", assumed=0.5)
+        train_self_model(get_domain("highway"), options, torch.Generator())
+
+
+def test_a_planner_s_values_are_learned():
     options = SelfModelOptions(
         phases=1, rounds=64, steps=150, batch=16, learning_rate=3e-3, window=3, distil=True
     )
@@ -299,8 +318,6 @@ def test_a_planner_s_values_are_learned_in_every_view():
         found = robot.action_values(robot.believe(evidence[:, :1])[:, 0])
     exact = domain.reference_values(two_cars_near(), 0.9)
     assert (found - exact).abs().max() < 0.5 < (exact[0, 0] - exact[0, 1]).abs()
-    with pytest.raises(ValueError, match="distil needs a window"):
-        SelfModelOptions(distil=True)
 
 
 class ShortDriving(Driving):
@@ -372,9 +389,9 @@ def test_rounds_are_seen_as_the_options_say(monkeypatch):
     assert not plan.remembers.any()
     asked = []
 
-    def noted(domain, batch, steps, generator, kinds):
+    def noted(domain, batch, steps, generator, kinds, assumed):
         asked.append((batch, kinds))
-        return draw_views(domain, batch, steps, generator, kinds)
+        return draw_views(domain, batch, steps, generator, kinds, assumed)
 
     monkeypatch.setattr(self_model_training, "draw_views", noted)
     train(options=replace(TINY, kinds=(0.5, 0.5, 0.0)))

@@ -18,7 +18,7 @@ How CARLA's world becomes a state
     - Lanes have any width there; across the road metres are stretched to 4 m a lane.
     - Vehicles count as 5 m by 2 m. The nearest eight are in the state; missing ones are far away.
     - What others intend is not known: their intended speed is the one they have, and nobody has a
-      scripted manoeuvre. A planner that uses such states foresees less than with highway-env.
+      scripted event. A planner that uses such states foresees less than with highway-env.
     - Acceleration in [-1, 1] is throttle or brake, which is not the same as m/s2.
 """
 

@@ -30,6 +30,8 @@ from mirror_ppl.domains.highway.scenarios import HEADWAY
 from mirror_ppl.domains.highway.speech import AHEAD, BRAKING, DIRECTIONS, SIDES, WORDS
 from mirror_ppl.domains.highway.state import NEVER, HighwayState
 
+LEVEL = 0.1
+"""Metres behind the ego up to which a car counts as ahead, as ends are seen with small errors."""
 SAME = 1e-3
 """m/s by which the motion of one car differs at most between two sectors."""
 SIDEWAYS = 0.7
@@ -66,22 +68,25 @@ class Cars:
 def cars_in(observation: Observation) -> Cars:
     """Return the nearest cars ``[..., 6]`` that the lidar sees; sentences say which of them brake.
 
-    The nearest point of a car is on its near end, or abreast on its side.
+    Points in one lane that move alike and are within a car's length are of one car. One that is
+    wholly ahead or behind shows its near end, one abreast both ends.
     """
     lane, offset, heading, speed = observation["ego"][..., :4].unbind(-1)
     distance, along, across = observation["visual"].unbind(-1)
     turned = _angles(observation["visual"]) + heading[..., None]
     y = (centre_of(lane) + offset)[..., None] + distance * torch.sin(turned)
     x, hit = distance * torch.cos(turned), lane_of(y)
+    centre = _centres(observation["visual"], x, hit)
     sides = torch.tensor(SIDES, device=lane.device)
     ahead = torch.tensor(AHEAD, device=lane.device)
     here = (hit - lane[..., None].long())[..., None, :] == sides[:, None]
-    here = here & ((x >= -LENGTH / 2)[..., None, :] == ahead[:, None])
+    here = here & ((centre >= -LEVEL)[..., None, :] == ahead[:, None])
     here = here & (distance < RANGE)[..., None, :]
-    least, which = torch.where(here, x.abs()[..., None, :], math.inf).min(-1)
-    x, y, hit, along, across = (part.gather(-1, which) for part in (x, y, hit, along, across))
+    least, which = torch.where(here, centre.abs()[..., None, :], math.inf).min(-1)
+    centre, y, hit, along, across = (
+        part.gather(-1, which) for part in (centre, y, hit, along, across)
+    )
 
-    beside = (sides != 0) & (least < LENGTH / 2)
     sin, cos = torch.sin(heading)[..., None], torch.cos(heading)[..., None]
     forward = along + speed[..., None]
     sideways = forward * sin + across * cos
@@ -93,12 +98,31 @@ def cars_in(observation: Observation) -> Cars:
     there = least.isfinite()
     return Cars(
         there=there,
-        x=torch.where(beside, x, x + torch.where(ahead, LENGTH / 2, -LENGTH / 2)),
+        x=centre,
         y=torch.where(sideways.abs() > SIDEWAYS, seen_at, middle),
         speed=forward * cos - across * sin,
         sideways=sideways,
         brakes=there & (said == WORDS.index("braking")),
     )
+
+
+def _centres(visual: Tensor, x: Tensor, lane: Tensor) -> Tensor:
+    """Return how many metres ahead the car is ``[..., 36]`` that each sector sees.
+
+    Args:
+        visual: ``[..., 36, 3]``.
+        x: metres ahead of the nearest points ``[..., 36]``.
+        lane: of these points ``[..., 36]``.
+    """
+    seen, motion = visual[..., 0] < RANGE, visual[..., 1:]
+    one = (motion[..., None, :] - motion[..., None, :, :]).abs().amax(-1) < SAME
+    one = one & ((x[..., None] - x[..., None, :]).abs() <= LENGTH)
+    one = one & (lane[..., None] == lane[..., None, :]) & seen[..., None, :]
+    least = torch.where(one, x[..., None, :], math.inf).amin(-1)
+    most = torch.where(one, x[..., None, :], -math.inf).amax(-1)
+    abreast = (least + most) / 2
+    beyond = torch.where(least >= 0, least + LENGTH / 2, most - LENGTH / 2)
+    return torch.where((least < 0) & (most > 0), abreast, beyond)
 
 
 def _angles(visual: Tensor) -> Tensor:

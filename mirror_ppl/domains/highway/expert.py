@@ -3,7 +3,7 @@
 A short model-predictive controller. Each manoeuvre is kept up in the true, batched physics for a
 few seconds; the one with the largest return is chosen, and everything is planned anew at the next
 decision. The expert knows where all vehicles are and what they intend, and how others respond to
-it; it does not know of scripted manoeuvres that have not begun.
+it; it does not know of scripted events that have not begun.
 """
 
 from __future__ import annotations

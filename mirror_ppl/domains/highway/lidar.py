@@ -23,7 +23,7 @@ AHEAD, BACK = 0, SECTORS // 2
 RANGE = 60.0
 """Metres beyond which the lidar sees nothing; distance of a sector in which there is nothing."""
 RESOLUTION = 1 / 32
-"""Metres, and m/s, to which measurements are rounded; recordings are half as large for it."""
+"""Metres, and m/s, to which measurements are rounded; recordings are smaller for it."""
 FEATURES = ("distance", "velocity_along", "velocity_across")
 UNITS = ("m", "m/s", "m/s")
 

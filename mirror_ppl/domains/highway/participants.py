@@ -69,10 +69,11 @@ def simulated_highway_drivers(
 
 @torch.no_grad()
 def best_messages(driver: HighwayDrivers, state: object, memory: object) -> Tensor:
-    """Return the messages ``[R, N]`` that help a driver most at once, given all that is true.
+    """Return messages ``[R, N]`` that help a driver, given all that is true: a greedy oracle.
 
-    Each flag is added that raises most the expected true value of what the driver does next, less
-    the cost, until none does. Values are the expert's, of keeping up a manoeuvre in the true world.
+    Only the next decision counts, and items are added one by one: the one that raises most the
+    expected true value of what the driver does next, less the cost, until none does. Values are the
+    expert's, of keeping up a manoeuvre in the true world.
 
     Args:
         driver: one person.
@@ -103,7 +104,7 @@ def best_messages(driver: HighwayDrivers, state: object, memory: object) -> Tens
 
     best = worth(chosen[None])[0]
     for _ in range(number):
-        candidates = chosen | torch.eye(number, dtype=torch.bool)[:, None]
+        candidates = chosen | torch.eye(number, dtype=torch.bool, device=chosen.device)[:, None]
         usable = allowed.T & ~chosen.T
         found = torch.where(usable, worth(candidates), -torch.inf)
         most, which = found.max(0)

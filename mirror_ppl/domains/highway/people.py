@@ -22,7 +22,7 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.domains.highway import expert
 from mirror_ppl.domains.highway.estimate import Cars, cars_in, state_with
 from mirror_ppl.domains.highway.lidar import RANGE
-from mirror_ppl.domains.highway.road import DECISION_TICKS, TICK, centre_of, lane_of
+from mirror_ppl.domains.highway.road import DECISION_TICKS, LENGTH, TICK, centre_of, lane_of
 from mirror_ppl.domains.highway.speech import AHEAD, DIRECTIONS, NOTHING, SIDES, WORDS
 from mirror_ppl.domains.highway.world import SIGHT_OF, Highway
 from mirror_ppl.models.implants import ASSUMES, SIGHT
@@ -136,7 +136,7 @@ class HighwayDrivers(SimulatedPeople):
         )
         told = _told(ego, said.round().long())
         after = _either(now, told, _expected(memory, ego, self._limits(ego)))
-        # Who is told that nothing is there forgets a car.
+        # Told that nothing is there, a driver forgets a car.
         empty = heard & (said.round().long() == NOTHING)
         return replace(after, there=after.there & ~(empty & ~now.there))
 
@@ -175,8 +175,8 @@ def _told(ego: Tensor, said: Tensor) -> Memory:
 def _expected(memory: Memory, ego: Tensor, reach: Tensor) -> Memory:
     """Return what is expected of remembered cars, in the directions in which they are now.
 
-    Who looks where a car should be, and does not see it, forgets it, and so does who has not seen
-    it for a while.
+    A driver who looks where a car should be and does not see it forgets it, as does one who has not
+    seen it for a while.
     """
     driven = SECONDS * (memory.own_speed + ego[..., 3]) / 2
     x = memory.x + SECONDS * memory.speed - driven[..., None]
@@ -193,7 +193,7 @@ def _expected(memory: Memory, ego: Tensor, reach: Tensor) -> Memory:
         return part.gather(-1, which)
 
     return Memory(
-        there=least.isfinite() & (least > reach) & (least < RANGE),
+        there=least.isfinite() & (least - LENGTH / 2 > reach) & (least < RANGE),
         x=at(x),
         y=at(memory.y),
         speed=at(memory.speed),

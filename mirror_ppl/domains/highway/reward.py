@@ -4,8 +4,8 @@ Terms are of one decision: of the state before it, the action, and the state tha
 
 ================  =====================================================================
 speed             ``v / v_max`` up to ``v_max`` = 40 km/h; above it ``-(v - v_max)``
-brake             minus the square of the share of full braking
-steer             minus the square of the share of full steering
+brake             minus the square of the share of full braking, at first
+steer             minus the square of the share of full steering, at first
 lane_change       -1 for another lane than before
 lane_centre       minus the distance to the centre of the lane, in half widths of a lane
 front_proximity   -2 if the lidar's sector that faces ahead sees a car within 20 m

@@ -1,4 +1,4 @@
-"""How rounds begin: traffic around the ego, and one named manoeuvre that calls for a response.
+"""How rounds begin: traffic around the ego, and one named event that calls for a response.
 
 Eight cars surround the ego: one in each of six directions, named by where it starts, and two far
 away. All drive by the IDM and change lanes by MOBIL, except for those with a part in a scenario,
@@ -38,8 +38,8 @@ class Car:
         ahead: metres from the ego's centre to the car's, negative behind.
         cruise: m/s that it intends, and at which it starts.
         headway: seconds that it keeps to the car ahead.
-        after: seconds after which its manoeuvre may begin; never by default.
-        gap: metres ahead of the ego that it has to be before its manoeuvre begins.
+        after: seconds after which its event may begin; never by default.
+        gap: metres ahead of the ego that it has to be before its event begins.
         slows: m/s that it then intends.
         lasts: seconds for which it intends this.
         cuts_in: whether it then moves to the ego's first lane.

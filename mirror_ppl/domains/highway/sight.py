@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.projections.polar import PolarAxes
 
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
-from mirror_ppl.domains.highway.messages import group_of
-from mirror_ppl.domains.highway.world import KNOTS, SIGHT_OF, Highway
+from mirror_ppl.domains.highway.world import DIRECTION_OF, KNOTS, Highway
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture, SightPicture, label_of
 from mirror_ppl.plots.reading import BLUE, TRUE, draws, explain, of_person, people, truth
@@ -22,8 +21,6 @@ SITES = tuple(SIGHT + direction for direction in Highway.directions)
 MOST_PEOPLE = 12
 """Maximum number of people on one picture."""
 COLUMNS = 4
-DIRECTION_OF = tuple(SIGHT_OF[group_of(sector)] for sector in range(SECTORS))
-"""Direction of sight of each sector."""
 
 
 def has_sight(data: az.InferenceData) -> bool:

@@ -1,4 +1,4 @@
-"""The state of a batch of rounds: vehicles, what they intend, and their scripted manoeuvres."""
+"""The state of a batch of rounds: vehicles, what they intend, and their scripted events."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway.road import LEFT_EDGE, RIGHT_EDGE, SHOULDER, lane_of
 
 NEVER = 10**6
-"""Tick of a manoeuvre that does not happen."""
+"""Tick of an event that does not happen."""
 
 
 @dataclass(frozen=True)
 class HighwayState:
     """State of a batch of rounds; vehicle 0 of ``N = 1 + OTHERS`` is the ego.
 
-    A manoeuvre of a vehicle begins at the first tick from ``cue_at`` on at which the vehicle is at
+    An event of a vehicle begins at the first tick from ``cue_at`` on at which the vehicle is at
     least ``cue_gap`` metres ahead of the ego. It then heads for lane ``cue_lane``, and intends to
     drive at ``cue_speed`` for ``cue_for`` ticks. What belongs to the ego in fields from
     ``target_lane`` to ``begun`` is not used, but for its ``cruise``: others expect of the ego that
@@ -31,16 +31,16 @@ class HighwayState:
         speed: m/s ``[..., N]`` in the direction of the heading.
         acceleration: m/s2 ``[..., N]`` in the last tick.
         target_lane: lane ``[..., N]`` that the vehicle drives in or moves to.
-        cruise: speed in m/s ``[..., N]`` that it intends when no manoeuvre says otherwise.
+        cruise: speed in m/s ``[..., N]`` that it intends when no event says otherwise.
         headway: seconds ``[..., N]`` that it keeps to the vehicle ahead.
         changes: whether ``[..., N]`` it changes lanes when that is faster (MOBIL).
         timer: ticks ``[..., N]`` since it last considered to change lanes.
-        cue_at: tick ``[..., N]`` from which its manoeuvre may begin; ``NEVER`` without one.
+        cue_at: tick ``[..., N]`` from which its event may begin; ``NEVER`` without one.
         cue_gap: metres ``[..., N]``, see above.
         cue_lane: lane ``[..., N]``, see above.
         cue_speed: m/s ``[..., N]``, see above.
         cue_for: ticks ``[..., N]``, see above.
-        begun: tick ``[..., N]`` at which the manoeuvre began; ``NEVER`` before that.
+        begun: tick ``[..., N]`` at which the event began; ``NEVER`` before that.
         controls: the ego's last action ``[..., 2]``: steering and acceleration in [-1, 1].
         tick: ticks ``[...]`` since the round began.
         crashed: whether ``[...]`` the ego hit another vehicle.

@@ -1,4 +1,4 @@
-"""Physics of traffic, batched and pure: bicycle model, IDM, MOBIL and scripted manoeuvres.
+"""Physics of traffic, batched and pure: bicycle model, IDM, MOBIL and scripted events.
 
 The equations and constants are those of highway-env's ``Vehicle``, ``ControlledVehicle`` and
 ``IDMVehicle`` on a straight road, so that a round here is a round there; tests compare them.
@@ -118,7 +118,7 @@ class Flow:
 
 def tick(state: HighwayState) -> HighwayState:
     """Return the state ``[B]`` one tick later, the ego's controls being ``state.controls``."""
-    state = begin_manoeuvres(state)
+    state = begin_events(state)
     flow = Flow.of(state)
     idle = state.changes & (flow.lane == flow.target_lane)
     considers = idle & (state.timer >= CHANGE_PERIOD)
@@ -211,8 +211,8 @@ def followed(flow: Flow) -> Tensor:
     return wanted.clamp(-MOST_ACCELERATION, MOST_ACCELERATION)
 
 
-def begin_manoeuvres(state: HighwayState) -> HighwayState:
-    """Return the state with manoeuvres begun whose moment has come."""
+def begin_events(state: HighwayState) -> HighwayState:
+    """Return the state with events begun whose moment has come."""
     now = state.tick[..., None]
     due = (state.begun == NEVER) & (now >= state.cue_at)
     begins = due & (state.x - state.x[..., :1] >= state.cue_gap)

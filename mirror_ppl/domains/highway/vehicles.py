@@ -63,7 +63,7 @@ class Ego(Vehicle):
 
 
 class Car(IDMVehicle):
-    """Another vehicle: highway-env's IDM and MOBIL, and one manoeuvre of a scenario."""
+    """Another vehicle: highway-env's IDM and MOBIL, and one event of a scenario."""
 
     def __init__(self, road: Road, position: Sequence[float], heading: float, speed: float) -> None:
         super().__init__(road, position, heading, speed)
@@ -73,7 +73,7 @@ class Car(IDMVehicle):
         self.cruise = speed
 
     def cue(self, now: int, ego: Ego) -> None:
-        """Begin the manoeuvre if it is time, and intend the speed that holds at tick ``now``."""
+        """Begin the event if it is time, and intend the speed that holds at tick ``now``."""
         ahead = self.position[0] - ego.position[0]
         if self.begun == NEVER and now >= self.cue_at and ahead >= self.cue_gap:
             self.begun = now

@@ -84,7 +84,8 @@ KNOTS = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, RANGE)
 """Metres between which networks read distances, and possible thresholds of sight."""
 SIGHT_OF = (0, 1, 2, 3, 2, 1)
 """Direction of sight of each group of sectors."""
-_DIRECTION_OF = tuple(SIGHT_OF[group_of(sector)] for sector in range(SECTORS))
+DIRECTION_OF = tuple(SIGHT_OF[group_of(sector)] for sector in range(SECTORS))
+"""Direction of sight of each sector."""
 STRAIGHT = 0.15
 """Radians, a typical heading."""
 
@@ -130,7 +131,6 @@ class Highway(World):
     }
     assumptions: tuple[str, ...] = ("clear",)
     told_practice = 0.1
-    counterparts: tuple[int | None, ...] = tuple(group_of(sector) for sector in range(SECTORS))
     symbol_sizes: Mapping[str, int] = {
         "ego": LANES + 6,
         "visual": len(KNOTS) + 2,
@@ -251,7 +251,11 @@ class Highway(World):
     def assume(
         self, knowledge: Any, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """Return the assumption ``clear``: where nothing is seen, no car is."""
+        """Return the assumption ``clear``: where nothing is seen, no car is.
+
+        A robot cannot be trained with it: `supposed` is not written, so that the assumed sectors of
+        a training round would be the true ones.
+        """
         del knowledge
         visual = observation["visual"]
         nothing = visual.new_tensor([RANGE, 0.0, 0.0]).expand(visual.shape)
@@ -311,7 +315,11 @@ class Highway(World):
 
 
 class DirectHighway(Highway):
-    """The highway driven by steering and acceleration, which are set five times a second."""
+    """The highway driven by steering and acceleration, which are set five times a second.
+
+    For the Gymnasium environment and CARLA. Its `reference_values` are still those of manoeuvres of
+    half a second.
+    """
 
     ticks = TICKS
     horizon = ROUND_TICKS // TICKS

@@ -8,7 +8,7 @@ from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.highway.estimate import AWAY, HARD, cars_in
 from mirror_ppl.domains.highway.road import LENGTH
-from mirror_ppl.domains.highway.speech import DIRECTIONS
+from mirror_ppl.domains.highway.speech import DIRECTIONS, NOTHING
 
 WORLD = Highway()
 
@@ -43,6 +43,22 @@ def test_a_car_is_where_it_is_in_each_direction(direction, car):
     assert cars.x[place].item() == pytest.approx(x, abs=0.5)
     assert cars.y[place].item() == y and cars.speed[place].item() == pytest.approx(speed)
     assert not cars.brakes.any()
+
+
+@pytest.mark.parametrize("lane", [0.0, 8.0])
+@pytest.mark.parametrize("x", [-6.0, -4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0, 6.0])
+def test_a_car_abreast_is_one_car(lane, x):
+    """In the direction in which the sentences have it; its ends are seen to a sector's width."""
+    now = WORLD.observe(state_of(cars=[(x, lane, 0.0, 9.0)]))
+    cars = cars_in(now)
+    spoken = (now["verbal"][:, 0] < NOTHING).nonzero().flatten().tolist()
+    assert cars.there.nonzero().flatten().tolist() == spoken and len(spoken) == 1
+    assert cars.x[spoken[0]].item() == pytest.approx(x, abs=0.6)
+
+
+def test_cars_of_one_speed_are_two_cars():
+    cars = cars_in(WORLD.observe(state_of(cars=[(9.0, 8.0, 0.0, 9.0), (-9.0, 8.0, 0.0, 9.0)])))
+    assert cars.there.sum() == 2
 
 
 def test_the_nearest_of_a_direction_hides_the_others():

@@ -46,7 +46,7 @@ def test_it_makes_way_for_a_fast_car_from_behind():
     assert abs(steering) > 0.05
 
 
-def test_it_does_not_foresee_manoeuvres():
+def test_it_does_not_foresee_events():
     """A car ahead that will brake in a second counts once it does so."""
     never = state_of((0.0, 4.0, 0.0, 10.0), [(27.0, 4.0, 0.0, 10.0)])
     cue_at, cue_for, begun = (part.clone() for part in (never.cue_at, never.cue_for, never.begun))

@@ -6,10 +6,12 @@ from highway_states import state_of
 
 from mirror_ppl.communication import RoundSoFar, rules
 from mirror_ppl.communication.messages import Channels
+from mirror_ppl.domains import Modality, World
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.highway.lidar import SECTORS
 from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SPOKEN, group_of
 from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.evaluation.played import Tally
 
 CHANNELS = Channels(Highway())
 
@@ -75,8 +77,47 @@ def test_the_nearest_hidden_car_is_shown_with_its_group():
     near, far = (-14.0, 4.0, 0.0, 10.0), (25.0, 4.0, 0.0, 10.0)
     for cars, spoken in (((far, near), "rear"), ((far,), "front")):
         flags = rules.nearest(Highway(), begun(*cars), "fog")
-        assert list(CHANNELS.message(flags)) == [("verbal", spoken)]
+        assert list(CHANNELS.message(flags)) == [("visual", spoken)]
     assert not rules.nearest(Highway(), begun((12.0, 4.0, 0.0, 10.0)), "fog").any()
+
+
+def test_groups_are_described_and_counted_as_one():
+    class TwoByTwo(World):
+        modalities = (
+            Modality("visual", ("a", "b", "c"), ("size",), ("m",), (1.0,), 0.1,
+                     groups=(("both", (0, 1)), ("last", (2,)))),
+        )  # fmt: skip
+        ego_features, actions, horizon = ("here",), ("go", "stop"), 2
+
+        def initial(self, batch, generator, scenario=None):
+            raise NotImplementedError
+
+        transition = rewards = observe = state_behind = initial
+
+    seen = {"visual": torch.tensor([[1.0], [2.0], [3.0]])}
+    world = TwoByTwo()
+    assert world.describe(seen, "visual", "both") == "both (a: size 1 m; b: size 2 m)"
+    assert world.describe(seen, "visual", "c") == "c: size 3 m"
+    tally = Tally(Highway(), CHANNELS, 1)
+    now = {name: part[None, None] for name, part in begun().now.items()}
+    tally.add_messages(now, torch.eye(12, dtype=torch.bool)[:1], torch.tensor([True]))
+    assert {name: count.tolist() for name, count in tally.items.items()} == {
+        "visual": [1], "verbal": [0],
+    }  # fmt: skip
+    assert tally.chances == {"visual": 6, "verbal": 6}
+
+
+@pytest.mark.parametrize(
+    ("groups", "message"),
+    [
+        ((("one", (0, 1)),), "each item belongs in exactly one group"),
+        ((("one", (0, 1)), ("two", (1, 2))), "each item belongs in exactly one group"),
+        ((("one", (0, 1)), ("one", (2,))), "groups need different names"),
+    ],
+)
+def test_impossible_groups_are_refused(groups, message):
+    with pytest.raises(ValueError, match=message):
+        Modality("visual", ("a", "b", "c"), ("size",), ("m",), (1.0,), 0.1, groups=groups)
 
 
 def test_random_messages_are_of_groups():

@@ -164,7 +164,7 @@ def test_neighbours_are_the_next_cars_of_a_lane():
     assert ahead[0, 0] == -1 and ahead[0, 3] >= 5
 
 
-def test_a_manoeuvre_begins_when_its_time_and_place_have_come():
+def test_an_event_begins_when_its_time_and_place_have_come():
     cars = [(2.0, 0.0, 0.0, 12.0)]
     start = state_of((0.0, 4.0, 0.0, 10.0), cars)
 
