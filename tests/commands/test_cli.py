@@ -288,7 +288,7 @@ class Dreamer(HumanModel):
     [
         (
             ("--domain", "flying"),
-            'unknown domain "flying"; known: bomb_defusal, driving, search_rescue',
+            'unknown domain "flying"; known: bomb_defusal, driving, highway, search_rescue',
         ),
         (("--setting", "rain"), 'unknown setting "rain" in driving; known: clear, fog'),
         (("--population", "dense"), 'unknown population "dense" in driving; known: diverse, paper'),

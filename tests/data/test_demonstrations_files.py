@@ -198,7 +198,7 @@ BAD_DATASETS = {
     ),
     "unknown domain": (
         renamed(domain="boats"),
-        'unknown domain "boats"; known: bomb_defusal, driving, search_rescue; '
+        'unknown domain "boats"; known: bomb_defusal, driving, highway, search_rescue; '
         "a world of your own is --domain path/to/file.py:Class",
     ),
     "unknown setting": (
