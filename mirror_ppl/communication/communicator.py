@@ -219,7 +219,7 @@ class Decision:
         if self.over:
             return "the round is over"
         world, now = self.world, self.observation
-        if not offers(world, "reference_values") or getattr(world, "partly_observed", False):
+        if not offers(world, "reference_values") or world.partly_observed:
             return f"none: the best action is not known exactly in {world.name}"
         values = world.reference_values(world.state_behind(now), ADVICE_DISCOUNT)
         notion = next(iter(world.relevance(now).values()))

@@ -299,9 +299,9 @@ class ExpectedValue:
             # Beliefs of each draw after each message, [S, C].
             own = state.belief[index][:, person.percept].T
             beliefs, values = state.mean, human.action_values(state.mean)
-            chances = person.act(beliefs[own], values[own]).exp()
-            utility = (chances * true_values).sum(-1).T
-            predicted = chances.mean(0)[:, None]
+            probabilities = person.act(beliefs[own], values[own]).exp()
+            utility = (probabilities * true_values).sum(-1).T
+            predicted = probabilities.mean(0)[:, None]
             return Valued(utility - channels.cost(message)[:, None], predicted)
 
         return value

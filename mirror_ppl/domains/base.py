@@ -175,7 +175,8 @@ class Domain(Protocol):
     observer may take for granted about unknown items; the world is ``settled`` if all of them
     together determine every item. ``mishap`` is the reward term of a harmful event, and the plural
     of its name. ``counterparts`` has for each visual item the verbal item about the same thing, if
-    that is more informative. ``record`` holds settings of other parts of the package.
+    that is more informative. ``record`` holds settings of other parts of the package. In a world
+    that is ``partly_observed``, observations do not determine states, and `state_behind` estimates.
     """
 
     name: str
@@ -202,6 +203,7 @@ class Domain(Protocol):
     partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...]
     settled: bool
+    partly_observed: bool
 
     @property
     def as_believed(self) -> Domain:

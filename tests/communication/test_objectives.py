@@ -539,15 +539,15 @@ def test_expected_values_are_those_of_the_next_action(generator, time):
     values = self_model().action_values(robot(past).mean)
     assert valued.actions is not None and valued.actions.shape == (len(candidates), 1, ACTIONS)
     for c, candidate in enumerate(candidates):
-        chances = []
+        found = []
         for s in range(4):
             draw = {name: value[s, None] for name, value in someone.draws.items()}
             belief = told_belief({n: v[0] for n, v in draw.items()}, past, candidate[0]).mean
             own = human().action_values(belief)
-            chances.append(Person(human(), draw).act(belief[None, None], own[None, None]).exp())
-            expected = (chances[-1][0, 0] * values).sum() - CHANNELS.cost(candidate[0])
+            found.append(Person(human(), draw).act(belief[None, None], own[None, None]).exp())
+            expected = (found[-1][0, 0] * values).sum() - CHANNELS.cost(candidate[0])
             torch.testing.assert_close(valued.utility[c, s], expected, rtol=1e-4, atol=1e-4)
-        mean = torch.cat(chances).mean(0)
+        mean = torch.cat(found).mean(0)
         torch.testing.assert_close(valued.actions[c], mean, rtol=1e-4, atol=1e-5)
 
 

@@ -41,26 +41,14 @@ CAREFUL = ("front_proximity", "back_proximity", "near", "accident")
 
 
 @dataclass(frozen=True)
-class Memory:
-    """What drivers know of the car in each direction; see `Cars` for shapes.
+class Memory(Cars):
+    """The cars that drivers know of.
 
     Attributes:
-        there: whether they know of one.
-        x: metres ahead.
-        y: metres across the road.
-        speed: m/s along the road.
-        sideways: m/s across it.
-        brakes: whether it brakes.
-        age: decisions since it was seen, shown or spoken of.
-        own_speed: the driver's own speed in m/s ``[...]`` at that decision.
+        age: decisions since each was seen, shown or spoken of ``[..., 6]``.
+        own_speed: the driver's own speed in m/s ``[...]`` at the last decision.
     """
 
-    there: Tensor
-    x: Tensor
-    y: Tensor
-    speed: Tensor
-    sideways: Tensor
-    brakes: Tensor
     age: Tensor
     own_speed: Tensor
 
@@ -94,7 +82,9 @@ class HighwayDrivers(SimulatedPeople):
     def sees(self, observation: Observation) -> Visibility:
         """Return sectors within reach."""
         direction, distance = self.domain.distance(observation)
-        people = torch.arange(len(self.reach)).view(-1, *(1,) * (distance.dim() - 1))
+        people = torch.arange(len(self.reach), device=distance.device).view(
+            -1, *(1,) * (distance.dim() - 1)
+        )
         return by_eye(self.domain, distance <= self.reach[people, direction])
 
     @torch.no_grad()
@@ -107,8 +97,7 @@ class HighwayDrivers(SimulatedPeople):
         if told is not None:
             seen, heard = seen | told["visual"], heard | told["verbal"]
         memory = self.remember(memory, observation, seen, heard)
-        cars = Cars(*(getattr(memory, name) for name in Cars.__dataclass_fields__))
-        state = state_with(observation["ego"], cars)
+        state = state_with(observation["ego"], memory)
         lengths = (1,) * (memory.own_speed.dim() - 1)
         caution = self.caution.view(-1, *lengths).expand(memory.own_speed.shape)
         values = expert.values(state, weights=dict.fromkeys(CAREFUL, caution))
@@ -129,15 +118,12 @@ class HighwayDrivers(SimulatedPeople):
                 "verbal": said[..., None],
             }
         )
-        now = Memory(
-            **{name: getattr(sight, name) for name in Cars.__dataclass_fields__},
-            age=torch.zeros_like(sight.x),
-            own_speed=ego[..., 3],
-        )
-        told = _told(ego, said.round().long())
+        now = Memory(**vars(sight), age=torch.zeros_like(sight.x), own_speed=ego[..., 3])
+        sentence = said.round().long()
+        told = _told(ego, sentence)
         after = _either(now, told, _expected(memory, ego, self._limits(ego)))
         # Told that nothing is there, a driver forgets a car.
-        empty = heard & (said.round().long() == NOTHING)
+        empty = heard & (sentence == NOTHING)
         return replace(after, there=after.there & ~(empty & ~now.there))
 
     def _limits(self, ego: Tensor) -> Tensor:

@@ -222,9 +222,7 @@ class Highway(World):
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
         """Return the direction of sight and the distance in metres of each sector ``[..., 36]``."""
         distance = observation["visual"][..., 0]
-        own = torch.tensor(
-            [SIGHT_OF[group_of(sector)] for sector in range(SECTORS)], device=distance.device
-        )
+        own = torch.tensor(DIRECTION_OF, device=distance.device)
         return own.expand(distance.shape), distance
 
     def nothing_known(self, *batch: int, device: torch.device | None = None) -> Any:
