@@ -31,6 +31,23 @@ LIMITS: Mapping[str, tuple[int, int]] = {
 }
 """Least and greatest value of whole numbers by the option's name, in every command alike."""
 
+PICTURES = (".png", ".pdf", ".svg")
+"""How names of files of pictures may end."""
+
+
+def check_picture(path: Path | None, option: str) -> None:
+    """Refuse a file of a picture of an unknown kind.
+
+    Args:
+        path: of the picture, if one was asked for.
+        option: by which it was.
+
+    Raises:
+        OptionError: the path ends in none of ``PICTURES``.
+    """
+    if path is not None and path.suffix.lower() not in PICTURES:
+        raise OptionError(f"{option} must end in {', '.join(PICTURES)}, not {path.name}")
+
 
 def check_numbers(options: Any, *names: str, **least: int) -> None:
     """Refuse whole numbers outside of their limits.

@@ -11,13 +11,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mirror_ppl.console import console_for_tables
 from mirror_ppl.errors import (
     OptionError,
     PosteriorError,
     UnknownNameError,
 )
-from mirror_ppl.limits import check_numbers
+from mirror_ppl.limits import check_numbers, check_picture
 from mirror_ppl.progress import Progress
 
 if TYPE_CHECKING:
@@ -25,20 +24,21 @@ if TYPE_CHECKING:
     from mirror_ppl.evaluation.played import Played
     from mirror_ppl.inference.results.posterior_file import PosteriorFile
 
-FAR_BELOW = -10
-"""Shares of the way from silence to the oracle below which no number is printed."""
 KL, LEARNED = "mirror-kl", "mirror-self-model"
 PROGRAM = "python -m mirror_ppl.assist"
 DESCRIPTION = """Let communicators send messages to the simulated people of a posterior in their
 rounds, and print for each the people's returns, the cost of messages and what they were about. All
-play the same rounds with the same random numbers. With --json or --log, a run that is stopped goes
-on where it was when the same command is given again."""
+play the same rounds with the same random numbers. With --json, --log or --film, a run that is
+stopped goes on where it was when the same command is given again."""
 EXAMPLES = {
     "how much the people of make demo gain by messages": (
         "--posterior runs/demo/posterior.nc --communicator mirror none --rounds 20"
     ),
     "all communicators, with every decision in a file": (
         "--json runs/assist.json --log runs/assist.jsonl"
+    ),
+    "the round that messages changed most, as a filmstrip": (
+        "--communicator mirror none --film runs/film.png"
     ),
 }
 """Arguments, by what they are for."""
@@ -90,6 +90,9 @@ class Options:
     """Write the results as data; the folder is made if it is not there."""
     log: Path | None = None
     """Write every decision with its audit, one JSON object a line, over what is there."""
+    film: Path | None = None
+    """Draw a filmstrip (png, pdf or svg) of the round in which messages gained most: without
+    messages, if none is among the communicators, and with the first other one."""
     human_model: str | None = None
     """The human model that the posterior is of, if it is another: one-radius and so on, or one of
     your own, path/to/file.py:Class, whose code is run."""
@@ -121,6 +124,7 @@ class Options:
             raise OptionError(f"--hears must be above 0 and at most 1, not {self.hears}")
         if not 0 < self.kl_weight < math.inf:
             raise OptionError(f"--kl-weight must be a positive number, not {self.kl_weight}")
+        check_picture(self.film, "--film")
         if self.kl_measure not in ("kl", "squared"):
             raise OptionError(f'--kl-measure must be kl or squared, not "{self.kl_measure}"')
 
@@ -133,6 +137,7 @@ def main(options: Options) -> None:
     """
     from mirror_ppl.evaluation.assistance import COMMUNICATORS
     from mirror_ppl.evaluation.assistance_cells import play_all, turns
+    from mirror_ppl.evaluation.assistance_report import print_assistance
     from mirror_ppl.evaluation.assistance_summary import summarize_assistance
     from mirror_ppl.files import lock_of, output_folder, write_together
     from mirror_ppl.jobs import Runner
@@ -142,8 +147,12 @@ def main(options: Options) -> None:
         if name not in COMMUNICATORS:
             raise UnknownNameError.of("communicator", name, COMMUNICATORS)
     chosen = tuple(name for name in COMMUNICATORS if name in chosen)
+    if options.film is not None:
+        from mirror_ppl.evaluation.film import compared
+
+        compared(chosen)
     outputs = _outputs(options)
-    kept = options.json or options.log
+    kept = options.json or options.log or options.film
     posterior, source = _people(options)
     number = len(posterior.people) if options.people is None else options.people
     if number > len(posterior.people):
@@ -165,10 +174,14 @@ def main(options: Options) -> None:
         everything = play_all(pairing, cells, runner)
         played = {name: everything[name] for name in chosen}
         summary = summarize_assistance(played, options.seed)
-        write_together(_contents(options, posterior, played, summary))
+        write_together(_contents(options, posterior, pairing, played, summary))
         runner.clean()
-    _show(summary, posterior.attributes, number, options.rounds)
-    for path, what in ((options.json, "the numbers above"), (options.log, "every decision")):
+    print_assistance(summary, posterior.attributes, number, options.rounds)
+    for path, what in (
+        (options.json, "the numbers above"),
+        (options.log, "every decision"),
+        (options.film, "a filmstrip"),
+    ):
         if path is not None:
             print(f"{path}: {what}")
 
@@ -201,7 +214,7 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
         rounds=options.rounds,
         planner=planner,
         seed=options.seed,
-        keep_log=options.log is not None,
+        keep_log=options.log is not None or options.film is not None,
     )
 
 
@@ -232,21 +245,22 @@ def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tu
 def _contents(
     options: Options,
     posterior: PosteriorFile,
+    pairing: Pairing,
     played: Mapping[str, Sequence[Played]],
     summary: dict[str, dict[str, Any]],
-) -> dict[Path, str]:
-    """What is written: a summary as data, and every decision."""
+) -> dict[Path, str | bytes]:
+    """What is written: a summary as data, every decision, and a filmstrip."""
     from mirror_ppl.evaluation.assistance_summary import compare
     from mirror_ppl.files import json_text, plain
 
-    contents = {}
+    contents: dict[Path, str | bytes] = {}
     if options.json is not None:
         results: dict[str, Any] = {
             "command": PROGRAM,
             "options": {
                 name: value
                 for name, value in asdict(options).items()
-                if name not in ("json", "log", "jobs", "scheduler")
+                if name not in ("json", "log", "film", "jobs", "scheduler")
             },
             "posterior": dict(posterior.attributes),
             "communicators": summary,
@@ -267,6 +281,13 @@ def _contents(
             for entry in one.log
         ]
         contents[options.log] = "".join(lines)
+    if options.film is not None:
+        from mirror_ppl.evaluation.film import film
+        from mirror_ppl.plots.film import plot_film
+
+        shown = film(pairing, played)
+        kind = options.film.suffix[1:].lower()
+        contents[options.film] = plot_film(shown, posterior.people).content(kind)
     return contents
 
 
@@ -280,7 +301,9 @@ def _outputs(options: Options) -> list[Path]:
         "--self-model": [options.self_model],
         "--human-model": [None if source is None else Path(source.rpartition(":")[0])],
     }
-    return require_files_of_their_own({"--json": options.json, "--log": options.log}, inputs)
+    return require_files_of_their_own(
+        {"--json": options.json, "--log": options.log, "--film": options.film}, inputs
+    )
 
 
 def _people(options: Options):
@@ -331,83 +354,3 @@ def _people(options: Options):
         )
     require_known(source["population"], "population", populations_of(domain))
     return posterior, source
-
-
-def _show(summary: dict[str, dict[str, Any]], attributes: Any, people: int, rounds: int) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from mirror_ppl.domains import get_domain
-
-    def table(title: str, caption: str, columns: list[str]) -> Table:
-        made = Table(
-            title=title,
-            caption=caption,
-            title_justify="left",
-            caption_justify="left",
-            box=SIMPLE_HEAD,
-            padding=(0, 1, 0, 0),
-        )
-        made.add_column("communicator")
-        for column in columns:
-            made.add_column(column, justify="right", no_wrap=True)
-        return made
-
-    first = next(iter(summary.values()))
-    domain = get_domain(attributes["domain"])
-    notions = [name.split("_")[-1] for name in first["relevant"]]
-    about = [f"about {name.replace('_', ' ')}" for name in first["relevant"]]
-    worth = table(
-        f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
-        "rewards a round; ±: standard error; [90% interval], paired; -: needs none, and an oracle "
-        "ahead of it",
-        ["task", "cost", "net", "above none", "way to oracle"],
-    )
-    said = table(
-        "What is communicated",
-        f"{domain.mishap[1]} a round; {', '.join(first['items'])}: items a step; "
-        f"{', '.join(notions)}: share of items {', '.join(about)}; ms a decision",
-        [domain.mishap[1], *first["items"], *notions, "ms"],
-    )
-    for name, entry in summary.items():
-        error = "" if entry["net_se"] is None else f" ±{entry['net_se']:.2f}"
-        worth.add_row(
-            name,
-            f"{entry['task']:.2f}",
-            f"{entry['cost']:.2f}",
-            f"{entry['net']:.2f}{error}",
-            _interval(entry.get("over_none"), 1, "+.2f"),
-            _way(entry.get("way_to_oracle")),
-        )
-        said.add_row(
-            name,
-            f"{entry['mishaps']:.2f}",
-            *(f"{value:.2f}" for value in entry["items"].values()),
-            *(
-                "-" if share["all"] is None else f"{100 * share['all']:.0f}%"
-                for share in entry["relevant"].values()
-            ),
-            f"{entry['milliseconds']:.1f}",
-        )
-    console = console_for_tables(100)
-    console.print(worth)
-    console.print(said)
-    if rounds == 1:
-        print("Of one round of each person there are no errors and intervals; --rounds gives more")
-
-
-def _way(value: dict[str, float | None] | None) -> str:
-    """How far the way to the oracle; a number that is far below says nothing more."""
-    if value is not None and (value["mean"] or 0) < FAR_BELOW:
-        return f"below {FAR_BELOW:.0%}"
-    return _interval(value, 100, ".0f", "%")
-
-
-def _interval(
-    value: dict[str, float | None] | None, scale: float, form: str, unit: str = ""
-) -> str:
-    if value is None:
-        return "-"
-    known = (value[name] for name in ("mean", "low", "high"))
-    mean, *ends = (format(scale * number, form) for number in known if number is not None)
-    return f"{mean}{unit} [{', '.join(ends)}]" if ends else f"{mean}{unit}"

@@ -12,11 +12,11 @@ from tyro.conf import Positional
 
 from mirror_ppl.console import console_for_tables
 from mirror_ppl.errors import OptionError
+from mirror_ppl.limits import check_picture
 
 if TYPE_CHECKING:
     from mirror_ppl.evaluation.comparison import Comparison
 
-PICTURES = (".png", ".pdf", ".svg")
 WIDTH = 80
 PROGRAM = "python -m mirror_ppl.compare"
 DESCRIPTION = """Compare human models that were fitted to the same recordings by how well they
@@ -60,8 +60,7 @@ class Options:
                 )
             if len({label.strip() for label in self.labels} - {""}) < number:
                 raise OptionError("--labels must be different from each other and not empty")
-        if self.figure is not None and self.figure.suffix.lower() not in PICTURES:
-            raise OptionError(f"--figure must end in {', '.join(PICTURES)}, not {self.figure.name}")
+        check_picture(self.figure, "--figure")
 
 
 def main(options: Options) -> None:

@@ -45,7 +45,7 @@ def results_of(path):
 def done(posterior, tmp_path_factory):
     """A folder with the results and the log of every communicator."""
     folder = tmp_path_factory.mktemp("done")
-    outputs = ("--json", folder / "a.json", "--log", folder / "a.jsonl")
+    outputs = ("--json", folder / "a.json", "--log", folder / "a.jsonl", "--film", folder / "a.png")
     assert command(assist, "--posterior", posterior, *SMALL, *outputs) == 0
     return folder
 
@@ -54,7 +54,7 @@ def done(posterior, tmp_path_factory):
 
 
 def test_results_hold_every_communicator(done):
-    assert content(done) == ["a.json", "a.jsonl"]
+    assert content(done) == ["a.json", "a.jsonl", "a.png"]
     results = results_of(done / "a.json")
     assert tuple(results["communicators"]) == COMMUNICATORS
     assert results["options"]["rounds"] == 2
@@ -267,6 +267,11 @@ def test_posteriors_of_something_else_are_refused(posterior, tmp_path, capsys, a
         (("--people-seed", "-1"), "--people-seed must be at least 0, not -1"),
         (("--people-seed", "5"), "is of people with seed 0, not 5 (--people-seed)"),
         (("--population", "diverse"), "is of people with population paper, not diverse"),
+        (("--film", "film.mp4"), "--film must end in .png, .pdf, .svg, not film.mp4"),
+        (
+            ("--film", "film.png", "--communicator", "none"),
+            "--film compares two communicators, not none alone",
+        ),
         (("--kl-measure", "cosine"), '--kl-measure must be kl or squared, not "cosine"'),
         (("--self-model", "nowhere.safetensors"), "nowhere.safetensors"),
         (("--human-model", "nowhere.py:Class"), "nowhere.py"),

@@ -1,0 +1,81 @@
+"""The round that messages changed most, played back with and without them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from mirror_ppl.domains.base import Domain, map_state
+from mirror_ppl.errors import OptionError
+from mirror_ppl.evaluation.assistance_cells import Pairing
+from mirror_ppl.evaluation.played import Played
+from mirror_ppl.plots.communication import WORDS
+from mirror_ppl.plots.film import Film, Strip
+
+SILENT = "none"
+
+
+def compared(communicators: Sequence[str]) -> tuple[str, str]:
+    """Choose two communicators for a film: none, if it is there, and the first other.
+
+    Raises:
+        OptionError: there is only one.
+    """
+    others = [name for name in communicators if name != SILENT]
+    chosen = ([SILENT] if SILENT in communicators else []) + others
+    if len(chosen) == 1:
+        raise OptionError(f"--film compares two communicators, not {chosen[0]} alone")
+    return chosen[0], chosen[1]
+
+
+def film(pairing: Pairing, played: Mapping[str, Sequence[Played]]) -> Film:
+    """Play back the round in which the second communicator gained most over the first.
+
+    Args:
+        pairing: that was played, with ``keep_log``.
+        played: results of the P people by communicator, at least two; see :func:`compared`.
+    """
+    pair = compared(list(played))
+    first, second = ([one.net for one in played[name]] for name in pair)
+    gain = np.stack(second) - np.stack(first)
+    person, number = (int(index) for index in np.unravel_index(gain.argmax(), gain.shape))
+    begin = pairing.listener(person, inferred=False).start.round(number).state
+    a, b = (strip(pairing.domain, begin, name, played[name][person], number) for name in pair)
+    return Film(pairing.domain, person, number, (a, b))
+
+
+def strip(domain: Domain, state: Any, name: str, played: Played, number: int) -> Strip:
+    """Play back one round by its logged actions.
+
+    Args:
+        domain: the world, whose transitions are deterministic.
+        state: initial state of the round, ``[1, 1]``.
+        name: of the communicator.
+        played: a person's rounds, with their log.
+        number: of the round.
+    """
+    log = [entry for entry in played.log if entry["round"] == number]
+    states = [state]
+    for entry in log:
+        action = torch.tensor([[domain.actions.index(entry["action"])]])
+        states.append(domain.transition(states[-1], action))
+    return Strip(
+        name,
+        [map_state(lambda part: part[0, 0], one) for one in states],
+        [_words(entry["message"]) for entry in log],
+        [entry["action"] for entry in log],
+        float(played.net[number]),
+        played.mishaps[number],
+    )
+
+
+def _words(message: Mapping[str, Sequence[str]]) -> list[str]:
+    """Describe items by modality, as in "shown: front-left"."""
+    return [
+        f"{WORDS.get(modality, modality)}: {item}"
+        for modality, items in message.items()
+        for item in items
+    ]

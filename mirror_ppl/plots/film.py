@@ -1,0 +1,145 @@
+"""A filmstrip: the same round with and without messages, frame by frame."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from mirror_ppl.domains.base import Domain
+from mirror_ppl.plots.picture import Picture, label_of
+from mirror_ppl.plots.reading import BLUE, GREY
+
+FRAMES = 6
+"""Default number of frames."""
+WIDE = 3.0
+"""Ratio of width to height from which communicators stand side by side."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One round of one person with one communicator.
+
+    Attributes:
+        communicator: its name.
+        states: one before each decision and one after the last, without batch, T + 1.
+        messages: what was communicated at each decision, in words, T.
+        actions: of the person, by name, T.
+        net: rewards less costs of the round.
+        mishaps: number of steps with the world's mishap.
+    """
+
+    communicator: str
+    states: list[Any]
+    messages: list[list[str]]
+    actions: list[str]
+    net: float
+    mishaps: int
+
+
+@dataclass(frozen=True)
+class Film:
+    """The same round with two communicators.
+
+    Attributes:
+        domain: the world.
+        person: number of the person, from 0.
+        round: number of the round, from 0.
+        strips: one for each of the two.
+    """
+
+    domain: Domain
+    person: int
+    round: int
+    strips: tuple[Strip, Strip]
+
+
+def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Picture:
+    """Draw the same round with two communicators, step by step.
+
+    Communicators stand below each other, or side by side where pictures of the world are wide.
+    Steps at which messages or actions differ come first, then others. Below each frame stand what
+    was communicated (blue) and what the person did then.
+
+    Args:
+        film: from :func:`mirror_ppl.evaluation.film.film`.
+        people: ids of all people.
+        frames: most frames of each communicator, at least 2.
+
+    Raises:
+        ValueError: there are fewer than 2 frames.
+    """
+    if frames < 2:  # noqa: PLR2004 - one where rounds differ, and the last
+        raise ValueError(f"a film has at least 2 frames, not {frames}")
+    steps = _steps(film, frames)
+    height, width = np.asarray(film.domain.render(film.strips[0].states[0])).shape[:2]
+    side_by_side = width > WIDE * height
+    each = 5.0 if side_by_side else 2.6
+    tall = each * height / width + (0.62 if side_by_side else 1.1)
+    shape = (len(steps), 2) if side_by_side else (2, len(steps))
+    figure = Picture(figsize=(each * shape[1] + 0.3, tall * shape[0] + 0.9), layout="constrained")
+    title = f"Round {film.round + 1} of {label_of(people[film.person])}"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+    parts = figure.subfigures(*((1, 2) if side_by_side else (2, 1)), squeeze=False).flat
+    for part, strip in zip(parts, film.strips, strict=True):
+        part.suptitle(_result(strip, film), x=0.01, ha="left", fontsize=11)
+        one = (len(steps), 1) if side_by_side else (1, len(steps))
+        for ax, step in zip(part.subplots(*one, squeeze=False).flat, steps, strict=True):
+            _frame(ax, film, strip, step, 60 if side_by_side else 34)
+    return figure
+
+
+def _steps(film: Film, frames: int) -> list[int]:
+    """Choose steps: the last, the first ones that differ, and others at equal distances."""
+    one, other = film.strips
+    last = max(len(one.actions), len(other.actions))
+    differ = [
+        step
+        for step in range(last)
+        if one.messages[step : step + 1] != other.messages[step : step + 1]
+        or one.actions[step : step + 1] != other.actions[step : step + 1]
+    ]
+    chosen = {last, *differ[: frames - 1]}
+    for step in np.linspace(max(min(differ, default=0) - 1, 0), last, frames):
+        if len(chosen) < frames:
+            chosen.add(round(step))
+    return sorted(chosen)
+
+
+def _result(strip: Strip, film: Film) -> str:
+    what = film.domain.mishap[1]
+    return f"{strip.communicator}: net return {strip.net:.2f}, {what}: {strip.mishaps}"
+
+
+def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> None:
+    """Draw the state before a step, or the last one where the round is over by then."""
+    ax.set_axis_off()
+    end = len(strip.actions)
+    ax.imshow(film.domain.render(strip.states[min(step, end)]), interpolation="nearest")
+    if step >= end:
+        ax.set_title("the end" if step == end else f"over since step {end + 1}", fontsize=9)
+        return
+    ax.set_title(f"step {step + 1}", fontsize=9)
+    lines = [(f"then: {strip.actions[step]}", GREY)]
+    if strip.messages[step]:
+        lines.insert(0, (", ".join(strip.messages[step]), BLUE))
+    below = 3
+    for text, colour in lines:
+        wrapped = textwrap.wrap(text.replace("_", " "), characters)
+        ax.annotate(
+            "\n".join(wrapped),
+            (0.5, 0),
+            (0, -below),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=8,
+            color=colour,
+            annotation_clip=False,
+        )
+        below += 10 * len(wrapped)

@@ -1,0 +1,139 @@
+"""Filmstrips: rounds played back from logs, the choice of a round, of steps, and the picture."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mirror_ppl.domains.base import total_reward
+from mirror_ppl.domains.driving import Driving
+from mirror_ppl.domains.driving.people import TaskDrivers
+from mirror_ppl.errors import OptionError
+from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, listeners, play, speaker
+from mirror_ppl.evaluation.film import compared, film, strip
+from mirror_ppl.people import draw_starts, simulated_people
+from mirror_ppl.plots.film import plot_film
+
+DOMAIN = Driving()
+
+
+@pytest.fixture(scope="module")
+def listener():
+    person = TaskDrivers(torch.tensor([[2.0, 2.0, 0.0, 0.0]]), torch.tensor([4.0]))
+    return Listener(DOMAIN, "fog", person, draw_starts(1, 3, 0, "film"))
+
+
+@pytest.fixture(scope="module")
+def played(listener):
+    options = PlannerOptions.of("driving")
+    return {
+        name: [play(listener, speaker(name, listener, options, 0, None), keep_log=True)]
+        for name in ("none", "all")
+    }
+
+
+def pairing(listener):
+    return SimpleNamespace(domain=listener.domain, listener=lambda *_, **__: listener)
+
+
+def stacked(states, name):
+    return torch.stack([getattr(state, name) for state in states])
+
+
+def rewards_along(domain, one):
+    """Rewards of a strip's actions in its states ``[T]``."""
+    gained = []
+    for state, action, after in zip(one.states, one.actions, one.states[1:], strict=False):
+        index = torch.tensor(domain.actions.index(action))
+        gained.append(float(total_reward(domain.rewards(state, index, after))))
+    return gained
+
+
+@pytest.mark.parametrize("name", ["none", "all"])
+def test_a_round_played_back_has_the_rewards_that_it_had(listener, played, name):
+    own = played[name][0]
+    for number in range(3):
+        one = strip(DOMAIN, listener.start.round(number).state, name, own, number)
+        assert len(one.states) == len(one.actions) + 1 == len(one.messages) + 1
+        assert sum(rewards_along(DOMAIN, one)) == pytest.approx(own.task[number])
+        assert one.net == pytest.approx(own.task[number] - own.cost[number])
+        assert any(one.messages) == (name == "all")
+
+
+def test_the_film_is_of_the_round_with_the_largest_gain(listener, played):
+    gains = played["all"][0].net - played["none"][0].net
+    shown = film(pairing(listener), played)
+    assert (shown.person, shown.round) == (0, gains.argmax())
+    assert [one.communicator for one in shown.strips] == ["none", "all"]
+    assert shown.strips[1].net - shown.strips[0].net == pytest.approx(gains.max())
+
+
+def test_silence_comes_first_and_one_communicator_is_too_few():
+    assert compared(("mirror", "none", "oracle")) == ("none", "mirror")
+    assert compared(("mirror", "oracle")) == ("mirror", "oracle")
+    with pytest.raises(OptionError, match="--film compares two communicators, not mirror alone"):
+        compared(("mirror",))
+
+
+def texts(figure):
+    return [text.get_text() for ax in figure.findobj() for text in getattr(ax, "texts", [])]
+
+
+def titles(figure):
+    return [ax.get_title() for part in figure.subfigs for ax in part.axes]
+
+
+def test_steps_that_differ_are_drawn_first(listener, played):
+    shown = film(pairing(listener), played)
+    silent, spoken = shown.strips
+    spoken = replace(
+        silent, messages=[["said: rear-left"] if step in (7, 9) else [] for step in range(20)]
+    )
+    figure = plot_film(replace(shown, strips=(silent, spoken)), ["ann"], frames=4)
+    assert titles(figure) == 2 * ["step 7", "step 8", "step 10", "the end"]
+    assert "said: rear-left" in texts(figure)
+    figure = plot_film(replace(shown, strips=(silent, spoken)), ["ann"], frames=2)
+    assert titles(figure) == 2 * ["step 8", "the end"]
+
+
+def test_a_round_that_ended_early_stands_still(listener, played):
+    shown = film(pairing(listener), played)
+    silent, spoken = shown.strips
+    short = replace(
+        silent,
+        states=silent.states[:6],
+        actions=silent.actions[:5],
+        messages=silent.messages[:5],
+    )
+    figure = plot_film(replace(shown, strips=(short, silent)), ["ann"], frames=3)
+    assert titles(figure) == [
+        "the end",
+        "over since step 6",
+        "over since step 6",
+        "step 6",
+        "step 7",
+        "the end",
+    ]
+
+
+def test_equal_rounds_are_drawn_too(listener, played):
+    shown = film(pairing(listener), {"none": played["none"], "nearest": played["none"]})
+    figure = plot_film(shown, ["ann"], frames=3)
+    assert titles(figure) == 2 * ["step 1", "step 9", "the end"]
+
+
+def test_pictures_that_are_not_wide_stand_below_each_other():
+    people = simulated_people("search_rescue", "smoke", "paper", 1, 0)
+    (listener,) = listeners(people, 1, "smoke", 1, 0)
+    options = PlannerOptions.of("search_rescue")
+    own = [play(listener, speaker("none", listener, options, 0, None), keep_log=True)]
+    figure = plot_film(film(pairing(listener), {"none": own, "all": own}), ["ann"], frames=2)
+    upper, lower = figure.subfigs
+    assert upper.bbox.y0 >= lower.bbox.y1 - 1
+    assert len(figure.content("png")) > 10_000
+
+
+def test_one_frame_is_refused(listener, played):
+    with pytest.raises(ValueError, match="a film has at least 2 frames, not 1"):
+        plot_film(film(pairing(listener), played), ["ann"], frames=1)
