@@ -17,70 +17,59 @@ class Toy(ToyHuman):
 RESULTS = {"calibration.nc", "ranks.png", "ecdf.png", "coverage.png"}
 
 
-@pytest.fixture
-def small(tmp_path):
-    """Arguments that make it quick."""
-    path = tmp_path / "toy.py"
+def quick(folder, name="out", people=20):
+    """Arguments of a quick calibration of a model of one's own."""
+    path = folder / "toy.py"
     path.write_text(TOY)
-    out = tmp_path / "out"
-    return (
-        "--human-model",
-        f"{path}:Toy",
-        "--people",
-        60,
-        "--rounds",
-        1,
-        "--out",
-        out,
-        "--draws",
-        19,
-    )
+    model = ("--human-model", f"{path}:Toy", "--rounds", 1, "--draws", 19, "--jobs", 1)
+    return (*model, "--people", people, "--out", folder / name)
 
 
 def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
-def test_it_prints_and_writes_what_it_found(small, tmp_path, capsys):
-    assert command(calibrate, *small, "--jobs", 1) == 0
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A calibration of 20 people, in one go."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert command(calibrate, *quick(folder)) == 0
+    return Calibration.load(folder / "out" / "calibration.nc").data
+
+
+def test_it_prints_and_writes_what_it_found(tmp_path, capsys):
+    assert command(calibrate, *quick(tmp_path, people=10)) == 0
     out, err = capsys.readouterr()
-    assert "60 people drawn from the prior" in out
+    assert "10 people drawn from the prior" in out
     words = "reach", "in sight", "otherwise", "not rejected for any of 3", "calibration.nc"
-    for word in (*words, "Of 60 people, only gross faults would show"):
+    for word in (*words, "Of 10 people, only gross faults would show"):
         assert word in out
-    assert "12/12 people " in err
+    assert "2/2 people " in err
     assert names(tmp_path / "out") == RESULTS
     calibration = Calibration.load(tmp_path / "out" / "calibration.nc")
-    assert calibration.people == 60 and calibration.draws == 19
+    assert calibration.people == 10 and calibration.draws == 19
     assert calibration.data.attrs["human_model"] == "Toy"
     with Image.open(tmp_path / "out" / "ranks.png") as image:
         assert len(image.convert("L").getcolors()) > 10
 
 
-def test_processes_share_the_people(small, tmp_path):
-    assert command(calibrate, *small, "--jobs", 1) == 0
-    alone = Calibration.load(tmp_path / "out" / "calibration.nc")
-    other = [tmp_path / "shared" if part == tmp_path / "out" else part for part in small]
-    assert command(calibrate, *other, "--jobs", 2) == 0
-    shared = Calibration.load(tmp_path / "shared" / "calibration.nc")
-    assert shared.data.equals(alone.data)
+def test_processes_share_the_people(whole, tmp_path):
+    assert command(calibrate, *quick(tmp_path), "--jobs", 2) == 0
+    assert Calibration.load(tmp_path / "out" / "calibration.nc").data.equals(whole)
 
 
 @pytest.mark.slow
-def test_a_cluster_finds_the_same(small, tmp_path):
+def test_a_cluster_finds_the_same(whole, tmp_path):
     """Its workers get the human model of a user's file, which they cannot import."""
-    assert command(calibrate, *small, "--people", 10) == 0
-    here = Calibration.load(tmp_path / "out" / "calibration.nc")
-    other = [tmp_path / "there" if part == tmp_path / "out" else part for part in small]
-    done = command_on_cluster(tmp_path, calibrate, *other, "--people", 10)
+    done = command_on_cluster(tmp_path, calibrate, *quick(tmp_path))
     assert done.returncode == 0, done.stderr
-    assert Calibration.load(tmp_path / "there" / "calibration.nc").data.equals(here.data)
-    assert names(tmp_path / "there") == RESULTS
+    assert Calibration.load(tmp_path / "out" / "calibration.nc").data.equals(whole)
+    assert names(tmp_path / "out") == RESULTS
 
 
-def test_wrong_posteriors_end_with_status_1(small, monkeypatch, capsys):
+def test_wrong_posteriors_end_with_status_1(tmp_path, monkeypatch, capsys):
     def narrow(human, options, network, recordings, seed):
-        found = infer(human, recordings, options, seed)
+        found = infer(human, recordings, options, seed, checked=True)
         draws = {
             name: value if name == "reach" else value.mean(0) + 0.2 * (value - value.mean(0))
             for name, value in found.draws.items()
@@ -88,30 +77,27 @@ def test_wrong_posteriors_end_with_status_1(small, monkeypatch, capsys):
         return Inferred(draws)
 
     monkeypatch.setattr(calibrate, "_infer", narrow)
-    assert command(calibrate, *small, "--jobs", 1, "--seed", 3) == 1
+    assert command(calibrate, *quick(tmp_path, people=60), "--seed", 3) == 1
     assert "rejected for 2 of 3" in capsys.readouterr().out
 
 
-def test_a_stopped_run_goes_on_where_it_was(small, tmp_path, monkeypatch):
+def test_a_stopped_run_goes_on_where_it_was(whole, tmp_path, monkeypatch):
     done = []
 
     def counted(human, options, network, recordings, seed):
         done.append(recordings.num_people)
-        if len(done) == 4:
+        if len(done) == 3:
             raise KeyboardInterrupt
-        return infer(human, recordings, options, seed)
+        return infer(human, recordings, options, seed, checked=True)
 
     monkeypatch.setattr(calibrate, "_infer", counted)
-    assert command(calibrate, *small, "--jobs", 1) == 130
+    assert command(calibrate, *quick(tmp_path)) == 130
     assert names(tmp_path / "out") == {"parts"}
-    assert len(list((tmp_path / "out" / "parts").iterdir())) == 3
-    assert command(calibrate, *small, "--jobs", 1) == 0
-    assert len(done) == 4 + 12 - 3
+    assert len(list((tmp_path / "out" / "parts").iterdir())) == 2
+    assert command(calibrate, *quick(tmp_path)) == 0
+    assert len(done) == 3 + 4 - 2
     assert names(tmp_path / "out") == RESULTS
-    resumed = Calibration.load(tmp_path / "out" / "calibration.nc")
-    other = [tmp_path / "whole" if part == tmp_path / "out" else part for part in small]
-    assert command(calibrate, *other, "--jobs", 1) == 0
-    assert resumed.data.equals(Calibration.load(tmp_path / "whole" / "calibration.nc").data)
+    assert Calibration.load(tmp_path / "out" / "calibration.nc").data.equals(whole)
 
 
 @pytest.mark.parametrize(

@@ -99,14 +99,14 @@ def test_of_two_rounds_each_is_valued_by_itself():
 
 
 def test_the_value_is_what_played_rounds_are_worth_on_average(seed):
-    """A simulated person: the mean of 500 rounds within 4 of its standard errors."""
+    """A simulated person: the mean of 150 rounds within 4 of its standard errors."""
     person = simulated_people("search_rescue", "smoke", "paper", 2, 0).select([1])
-    start = draw_starts(1, 500, seed, "oracle", domain=WORLD, mind_noises=person.mind_noises)
+    start = draw_starts(1, 150, seed, "oracle", domain=WORLD, mind_noises=person.mind_noises)
     oracle = ReachableOracle(person, map_state(lambda part: part[0], start.state))
     someone = Listener(WORLD, "smoke", person, start)
     own = play(someone, speaker("oracle", someone, PlannerOptions(), 0))
     difference = torch.as_tensor(own.net) - oracle.value
-    assert difference.mean().abs() < 4 * difference.std() / 500**0.5
+    assert difference.mean().abs() < 4 * difference.std() / 150**0.5
     # Nobody does better, and silence is far worse.
     for name, least in (("none", 0.2), ("nearest", 0.02), ("all", 10.0)):
         other = play(someone, speaker(name, someone, PlannerOptions(), 0))

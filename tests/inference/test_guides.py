@@ -150,7 +150,7 @@ def test_the_exact_posterior_by_hand(toy, recordings):
 
 @pytest.mark.parametrize("guide", ["importance", "amortized"])
 def test_importance_is_calibrated(toy, network, guide):
-    options = CalibrationOptions(people=120, rounds=(1, 3), batch=60)
+    options = CalibrationOptions(people=60, rounds=(1, 3), batch=60)
     result = calibrate(toy, Infer(toy, guide, network), options, "fog", seed=5)
     assert result.table()["p_value"].min() > 1e-5
 
@@ -177,7 +177,7 @@ def test_calibration_notices_wrong_posteriors(toy, network, kind):
             return value.mean(0) + 0.5 * (value - value.mean(0))
         return value + 0.5 * value.std(0)
 
-    options = CalibrationOptions(people=120, rounds=(3,), batch=120)
+    options = CalibrationOptions(people=60, rounds=(3,), batch=60)
     result = calibrate(toy, Infer(toy, "amortized", network, wrong), options, "fog", seed=5)
     assert {site for site, _ in result.rejected} == set(RATES)
 
