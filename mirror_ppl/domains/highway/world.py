@@ -49,9 +49,7 @@ Version history
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -60,6 +58,7 @@ from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
 from mirror_ppl.domains.highway import estimate, expert, reward, scenarios, traffic
+from mirror_ppl.domains.highway.knowledge import Memory, imagined, nothing, out_of_sight, remember
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS, scan
 from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, controls
 from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SPOKEN, group_of
@@ -88,17 +87,6 @@ DIRECTION_OF = tuple(SIGHT_OF[group_of(sector)] for sector in range(SECTORS))
 """Direction of sight of each sector."""
 STRAIGHT = 0.15
 """Radians, a typical heading."""
-
-
-@dataclass(frozen=True)
-class Nothing:
-    """Knowledge of people who see afresh at each decision; beliefs alone remember.
-
-    Attributes:
-        nothing: an empty tensor ``[..., 0]``.
-    """
-
-    nothing: Tensor
 
 
 class Highway(World):
@@ -225,43 +213,43 @@ class Highway(World):
         own = torch.tensor(DIRECTION_OF, device=distance.device)
         return own.expand(distance.shape), distance
 
-    def nothing_known(self, *batch: int, device: torch.device | None = None) -> Any:
-        """Return knowledge ``[*batch]``: none."""
-        return Nothing(torch.zeros(*batch, 0, dtype=torch.bool, device=device))
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> Memory:
+        """Return the memory of drivers ``[*batch]`` before a round."""
+        return nothing(*batch, like=torch.zeros((), device=device))
 
     def learn(
-        self, knowledge: Any, observation: Observation, visible: Visibility, sees: Any
-    ) -> Any:
-        """Return knowledge ``[...]`` after a step: none, as everything moves."""
-        del observation, visible, sees
-        return knowledge
+        self,
+        knowledge: Memory,
+        observation: Observation,
+        visible: Visibility,
+        sees: Callable[[Observation], Visibility],
+    ) -> Memory:
+        """Return the cars ``[...]`` that a driver knows of; :meth:`assume` alone reads them."""
+        seen, heard = visible["visual"], visible["verbal"]
+        return remember(knowledge, observation, seen, heard, out_of_sight(sees, observation))
 
-    def known(self, knowledge: Any) -> Visibility:
-        """Return known items ``[..., K]``: none."""
-        shape = knowledge.nothing.shape[:-1]
+    def known(self, knowledge: Memory) -> Visibility:
+        """Return known items ``[..., K]``: none, as everything moves."""
+        there = knowledge.there[..., :1]
         return {
-            m.name: torch.zeros(
-                *shape, len(m.items), dtype=torch.bool, device=knowledge.nothing.device
-            )
+            m.name: torch.zeros_like(there).expand(*there.shape[:-1], len(m.items))
             for m in self.modalities
         }
 
     def assume(
-        self, knowledge: Any, observation: Observation
+        self, knowledge: Memory, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """Return the assumption ``clear``: where nothing is seen, no car is.
+        """Return the assumption ``clear``: where nothing is seen, only remembered cars are.
 
         A robot cannot be trained with it: `supposed` is not written, so that the assumed sectors of
         a training round would be the true ones.
         """
-        del knowledge
-        visual = observation["visual"]
-        nothing = visual.new_tensor([RANGE, 0.0, 0.0]).expand(visual.shape)
+        supposed = imagined(knowledge, observation)
         about = {
-            "visual": torch.ones_like(visual[..., 0], dtype=torch.bool),
+            "visual": torch.ones_like(supposed["visual"][..., 0], dtype=torch.bool),
             "verbal": torch.zeros_like(observation["verbal"][..., 0], dtype=torch.bool),
         }
-        return {"clear": about}, {**observation, "visual": nothing}
+        return {"clear": about}, supposed
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Encode observations for networks; distances by their place between ``KNOTS``."""

@@ -7,10 +7,11 @@ from highway_states import state_of
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import Highway
+from mirror_ppl.domains.highway.knowledge import HEARD_AT, REMEMBERED
 from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES
 from mirror_ppl.domains.highway.messages import GROUPS
 from mirror_ppl.domains.highway.participants import best_messages, simulated_highway_drivers
-from mirror_ppl.domains.highway.people import HEARD_AT, REMEMBERED, HighwayDrivers
+from mirror_ppl.domains.highway.people import HighwayDrivers
 from mirror_ppl.domains.highway.speech import DIRECTIONS
 from mirror_ppl.errors import UnknownNameError
 
