@@ -34,7 +34,8 @@ class Course:
         states: ``[B, T + 1]``.
         observation: full observations ``[B, T + 1, ...]``.
         rewards: of the actions ``[B, T]``.
-        values: the planner's action values ``[B, T, A]``, if they are learned.
+        values: the planner's action values ``[B, T, A]``, if they are learned; nan where they are
+            unknown, so that nothing is learned there.
     """
 
     states: Any
@@ -171,6 +172,10 @@ def experience(
     informed = torch.stack(
         [(visible[name] | ~needed).all(-1) for name, needed in domain.decisive(observation).items()]
     ).all(0)
+    over, exact = domain.over(some), _exact(domain, some, discount)
+    if values is not None:
+        exact = values[:, steps]
+        over = over | exact.isnan().any(-1)
     return Experience(
         rounds=Rounds(
             observation=observation,
@@ -179,8 +184,8 @@ def experience(
             rewards=rewards,
         ),
         outcomes=outcomes,
-        over=domain.over(some),
-        exact=_exact(domain, some, discount) if values is None else values[:, steps],
+        over=over,
+        exact=exact,
         informed=informed[:, steps],
         first=first,
         stride=stride,

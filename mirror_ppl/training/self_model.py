@@ -69,9 +69,14 @@ class SelfModelOptions:
         length: steps of a training round; the domain's horizon if 0.
         window: steps of these rounds in a gradient step, from a random one on; all of them if 0.
             What happened is then kept, which takes memory, and not computed again.
-        stride: values are learned at one of every ``stride`` steps; the offset is random.
+        stride: values are learned at one of every ``stride`` steps; the offset is random, and with
+            ``distil`` the same for all rounds of a phase.
         difference_weight: weight of errors in the differences between actions, added to the errors
             themselves. Choices of people depend on these differences alone.
+        choice_weight: weight of the cross entropy, in nats, of choices in proportion to the
+            exponential of learned values, if they were made so by the planner's. Of observers who
+            know all decisive items, and only with ``distil``: others would take what is likely for
+            certain. Errors of values where one action is far better than another hardly count.
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
         assumed: share of sight views in which each assumption is made. At 0 the robot does not
             learn what follows from assumptions; imagined items are then like seen ones to it.
@@ -102,6 +107,7 @@ class SelfModelOptions:
     window: int = 0
     stride: int = 1
     difference_weight: float = 0.0
+    choice_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     assumed: float = ASSUMPTION_PROBABILITY
     at_means: bool = False
@@ -131,6 +137,8 @@ class SelfModelOptions:
             raise ValueError("window and length must not be negative")
         if self.distil and self.exact:
             raise ValueError("distil and exact are two ways to learn a planner's values")
+        if self.choice_weight and not self.distil:
+            raise ValueError("choice_weight needs distil: choices are those at a planner's values")
         if self.distil and not self.window:
             raise ValueError("distil needs a window: values are kept with the states of rounds")
         if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:
@@ -191,11 +199,21 @@ def self_model_loss(
     )
     assert goal is not None
     # Once a round is over (possibly in every round) actions do not matter.
-    error = (self_model.action_values(belief) - goal)[~lived.over]
+    values = self_model.action_values(belief)
+    error = (values - goal)[~lived.over]
     unlike = error - error.mean(-1, keepdim=True)
     bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
     total = options.world_weight * negative_elbo + bellman + options.difference_weight * apart
+    if options.choice_weight:
+        sure = lived.informed & ~lived.over
+        total = total + options.choice_weight * _cross_entropy(goal[sure], values[sure])
     return Loss(total, negative_elbo.detach(), bellman.detach())
+
+
+def _cross_entropy(goal: Tensor, values: Tensor) -> Tensor:
+    """Return the mean cross entropy of softmax choices at values ``[n, A]``; 0 if n is 0."""
+    each = -(torch.softmax(goal, -1) * torch.log_softmax(values, -1)).sum(-1)
+    return each.mean() if len(each) else each.sum()
 
 
 def _bootstrapped(
@@ -429,8 +447,8 @@ class _Trainer:
                 map_state(lambda part: part[chosen], starts),  # noqa: B023 - used at once
                 acted,
                 plan,
-                self._drawn(options.stride),
-                options.stride,
+                0 if options.distil else self._drawn(options.stride),
+                1 if options.distil else options.stride,
                 options.discount if exact else None,
                 lived_through,
             )
@@ -452,24 +470,35 @@ class _Trainer:
         for start, actions in rounds[len(self.courses) :]:
             course = Course.of(self.domain, start, actions)
             if self.options.distil:
-                course = replace(course, values=self._values(course.states))
+                first = len(self.courses) % self.options.stride
+                course = replace(course, values=self._values(course.states, first))
             self.courses.append(course)
         return Course.join(self.courses)
 
-    def _values(self, states: Any) -> Tensor:
-        """Return the planner's values ``[B, T, A]`` of states ``[B, T + 1]``."""
-        before = map_state(lambda part: part[:, :-1], states)
-        batch, steps = self.domain.over(before).shape
-        rows = torch.arange(batch * steps, device=self.generator.device).split(VALUED)
-        flat = map_state(lambda part: part.flatten(0, 1), before)
+    def _values(self, states: Any, first: int) -> Tensor:
+        """Return the planner's values ``[B, T, A]`` of states ``[B, T + 1]``; nan between strides.
+
+        Args:
+            states: of a course.
+            first: step from which on every ``stride``-th is valued.
+        """
+        steps = slice(first, -1, self.options.stride)
+        some = map_state(lambda part: part[:, steps], states)
+        batch, number = self.domain.over(some).shape
+        flat = map_state(lambda part: part.flatten(0, 1), some)
+        rows = torch.arange(batch * number, device=self.generator.device).split(VALUED)
         parts = [
             self.domain.reference_values(
-                map_state(lambda part: part[some], flat),  # noqa: B023 - used at once
+                map_state(lambda part: part[own], flat),  # noqa: B023 - used at once
                 self.options.discount,
             )
-            for some in rows
+            for own in rows
         ]
-        return torch.cat(parts).view(batch, steps, -1)
+        found = torch.cat(parts).view(batch, number, -1)
+        length = self.domain.over(states).shape[1] - 1
+        values = found.new_full((batch, length, found.shape[-1]), torch.nan)
+        values[:, first :: self.options.stride] = found
+        return values
 
     def _drawn(self, number: int) -> int:
         """Return a random whole number from 0 to below another."""

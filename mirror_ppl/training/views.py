@@ -114,12 +114,14 @@ class ViewPlan:
 
     def taken(self, domain: Domain, knowledge: Any, observation: Observation) -> Visibility:
         """Items ``[B, T', K]`` that the assumptions cover, given knowledge ``[B, T']``."""
-        items, _ = domain.assume(knowledge, observation)
         taken = {
             name: torch.zeros_like(value[..., 0], dtype=torch.bool)
             for name, value in observation.items()
             if name != "ego"
         }
+        if not any(makes.any() for makes in self.assumes.values()):
+            return taken
+        items, _ = domain.assume(knowledge, observation)
         for assumption, about in items.items():
             for name, mask in about.items():
                 taken[name] = taken[name] | (mask & self.assumes[assumption][:, None, None])
