@@ -1,36 +1,25 @@
-"""The self-model: its bound, its experience, its training, and the weights that ship."""
+"""The self-model: its bound, and its experience worked out by hand."""
 
-import json
-import math
-import re
 from dataclasses import replace
 
 import pytest
 import torch
+from example_experience import STAY4, two_cars_near
 from pyro import poutine
 from pyro.infer import Trace_ELBO
-from safetensors.torch import save_file
 from torch.distributions import Normal
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.driving import ROAD_END, Driving, DrivingState
-from mirror_ppl.errors import AssetError, CheckpointError
+from mirror_ppl.domains.driving import ROAD_END
 from mirror_ppl.evaluation.self_model import (
     fixed_views,
-    planner_actions,
-    returns,
-    self_model_quality,
 )
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.sizes import Sizes
-from mirror_ppl.models.weights import load_self_model, save_self_model, shipped_weights
-from mirror_ppl.training import self_model as self_model_training
+from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.training.experience import Course, drive, experience
 from mirror_ppl.training.self_model import (
     SelfModelOptions,
     self_model_loss,
-    train_self_model,
 )
 from mirror_ppl.training.views import draw_views
 
@@ -113,18 +102,6 @@ def test_every_parameter_learns_from_the_loss(lived, on_means):
 
 
 # --- experience, by hand ----------------------------------------------------------------------
-
-
-def two_cars_near():
-    """The ego in the left lane; a slow car 3 cells ahead of it, and one 2 cells behind at right."""
-    return DrivingState(
-        lane=torch.tensor([0]),
-        position=torch.tensor([[3, 11, -11, -2]]),
-        speed=torch.tensor([[-1, 1, -1, -1]]),
-    )
-
-
-STAY4 = torch.zeros(1, 4, dtype=torch.long)
 
 
 def test_outcomes_of_both_actions_in_full_view():
@@ -276,293 +253,3 @@ def test_what_is_kept_of_rounds_is_what_is_computed():
     assert torch.equal(part.states.position[1], course.states.position[0, 1:4])
     assert torch.equal(part.observation["visual"][0], course.observation["visual"][0, 1:4])
     assert torch.equal(part.rewards[0], course.rewards[0, 1:3])
-
-
-# --- training ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"window": -1}, "must not be negative"),
-        ({"distil": True}, "distil needs a window"),
-        ({"distil": True, "window": 3, "exact": True}, "distil and exact are two ways"),
-        ({"distil": True, "window": 5, "length": 4}, "window is 5, longer than rounds of 4 steps"),
-    ],
-)
-def test_windows_that_do_not_fit_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        train_self_model(DRIVING, SelfModelOptions(**options), torch.Generator())
-
-
-def test_assumptions_that_a_world_does_not_work_out_are_not_trained_with():
-    with pytest.raises(ValueError, match=r"assumed must be 0, as highway has no supposed\(\)"):
-        options = SelfModelOptions.of("highway", assumed=0.5)
-        train_self_model(get_domain("highway"), options, torch.Generator())
-
-
-def test_a_planner_s_values_are_learned():
-    options = SelfModelOptions(
-        phases=1, rounds=64, steps=150, batch=16, learning_rate=3e-3, window=3, distil=True
-    )
-    domain = ShortDriving()
-    robot = train_self_model(domain, options, torch.Generator().manual_seed(0))
-    rounds = experience(
-        domain,
-        two_cars_near(),
-        STAY4[:, :3],
-        fixed_views(domain, 1, torch.Generator(), speech=True),
-    ).rounds
-    with torch.no_grad():
-        evidence = robot.evidence(rounds.observation, rounds.visible, rounds.actions)
-        found = robot.action_values(robot.believe(evidence[:, :1])[:, 0])
-    exact = domain.reference_values(two_cars_near(), 0.9)
-    assert (found - exact).abs().max() < 0.5 < (exact[0, 0] - exact[0, 1]).abs()
-
-
-class ShortDriving(Driving):
-    """Rounds of three steps that all begin alike."""
-
-    horizon = 3
-
-    def initial(self, batch, generator, scenario=None):
-        return map_state(lambda part: part.expand(batch, *part.shape[1:]), two_cars_near())
-
-
-def optimal_values(state, steps, discount=0.9):
-    """Values of both actions with that many steps to go, by trying everything."""
-    if steps == 0:
-        return [0.0]
-    values = []
-    for action in (torch.tensor([0]), torch.tensor([1])):
-        following = DRIVING.transition(state, action)
-        reward = sum(DRIVING.rewards(state, action, following).values()).item()
-        values.append(reward + discount * max(optimal_values(following, steps - 1)))
-    return values
-
-
-def test_values_move_to_the_optimum():
-    domain = ShortDriving()
-    best = torch.tensor([optimal_values(two_cars_near(), 3)])
-    # Stay: -2 and switch next, -1, then the other lane for nothing. Switch: -1 and stay there.
-    assert best.tolist() == [pytest.approx([-2.0 - 0.9, -1.0])]
-    options = SelfModelOptions(
-        phases=1, rounds=64, steps=150, batch=16, learning_rate=3e-3, target_rate=0.1, beta=0.0
-    )
-
-    def error(model):
-        plan = fixed_views(domain, 1, torch.Generator(), speech=True)
-        rounds = experience(domain, two_cars_near(), STAY4[:, :3], plan).rounds
-        evidence = model.evidence(rounds.observation, rounds.visible, rounds.actions)
-        with torch.no_grad():
-            values = model.action_values(model.believe(evidence[:, :1])[:, 0])
-        return (values - best).abs().max().item()
-
-    before = error(SelfModel(domain))
-    after = error(train_self_model(domain, options, torch.Generator().manual_seed(1)))
-    assert before > 2.0
-    # With errors of less than half of what is at stake, 1.9, the better action is chosen.
-    assert after < 0.95
-
-
-TINY = SelfModelOptions(phases=3, rounds=32, steps=2, batch=8)
-
-
-def train(seed=0, options=TINY, report=lambda done, message: None, checkpoint=None):
-    generator = torch.Generator().manual_seed(seed)
-    return train_self_model(DRIVING, options, generator, report, checkpoint).state_dict()
-
-
-def test_another_class_of_self_model_can_be_trained():
-    class Other(SelfModel):
-        pass
-
-    trained = train_self_model(DRIVING, TINY, torch.Generator().manual_seed(0), kind=Other)
-    assert type(trained) is Other
-    assert_same(trained.state_dict(), train())
-
-
-def test_rounds_are_seen_as_the_options_say(monkeypatch):
-    generator = torch.Generator().manual_seed(0)
-    plan = draw_views(DRIVING, 50, 3, generator, (1.0, 0.0, 0.0))
-    assert all((keep == 1).all() for keep in plan.keep.values())
-    assert not plan.remembers.any()
-    asked = []
-
-    def noted(domain, batch, steps, generator, kinds, assumed):
-        asked.append((batch, kinds))
-        return draw_views(domain, batch, steps, generator, kinds, assumed)
-
-    monkeypatch.setattr(self_model_training, "draw_views", noted)
-    train(options=replace(TINY, kinds=(0.5, 0.5, 0.0)))
-    # Those that are driven and those that are learned from.
-    assert {*asked} == {(TINY.rounds, (0.5, 0.5, 0.0)), (TINY.batch, (0.5, 0.5, 0.0))}
-
-
-def stop_after(phase):
-    def report(done, message):
-        if done == phase:
-            raise KeyboardInterrupt
-
-    return report
-
-
-def assert_same(one, other):
-    assert one.keys() == other.keys()
-    assert all(torch.equal(one[name], other[name]) for name in one)
-
-
-def test_training_depends_on_the_seed_alone():
-    torch.manual_seed(1)
-    one = train()
-    torch.manual_seed(2)
-    before = torch.random.get_rng_state()
-    assert_same(one, train())
-    assert torch.equal(torch.random.get_rng_state(), before)
-    assert not torch.equal(train(seed=1)["reward.head.linear.bias"], one["reward.head.linear.bias"])
-
-
-def test_training_goes_on_from_its_checkpoint_as_if_never_stopped(tmp_path):
-    path, phases = tmp_path / "run.checkpoint", []
-    with pytest.raises(KeyboardInterrupt):
-        train(report=stop_after(2), checkpoint=path)
-    resumed = train(report=lambda done, message: phases.append(done), checkpoint=path)
-    assert phases == [3]
-    assert_same(resumed, train())
-
-
-def test_checkpoint_of_another_run_is_refused(tmp_path):
-    path = tmp_path / "run.checkpoint"
-    with pytest.raises(KeyboardInterrupt):
-        train(report=stop_after(1), checkpoint=path)
-    content = path.read_bytes()
-    with pytest.raises(CheckpointError, match="other options"):
-        train(options=replace(TINY, batch=9), checkpoint=path)
-    with pytest.raises(CheckpointError, match="other options"):
-        train(seed=1, checkpoint=path)
-    assert path.read_bytes() == content
-    for damaged in (content[: len(content) // 2], b"", b"nonsense"):
-        path.write_bytes(damaged)
-        with pytest.raises(CheckpointError, match=re.escape(str(path))):
-            train(checkpoint=path)
-    torch.save([1, 2], path)
-    with pytest.raises(CheckpointError, match=re.escape(str(path))):
-        train(checkpoint=path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("phases", 0, "phases must be at least 1, not 0"),
-        ("batch", -1, "batch must be at least 1, not -1"),
-        ("epsilon", 1.5, r"epsilon must lie in \[0, 1\], not 1.5"),
-        ("discount", -0.1, r"discount must lie in \[0, 1\], not -0.1"),
-        ("kinds", (1.0, -0.1, 0.1), r"kinds must be 3 numbers, .* not \(1.0, -0.1, 0.1\)"),
-        ("kinds", (0.0, 0.0, 0.0), "not negative and not all 0"),
-        ("kinds", (0.2, 0.2, 0.2, 0.4), "kinds must be 3 numbers"),
-    ],
-)
-def test_impossible_options_are_refused(name, value, message):
-    with pytest.raises(ValueError, match=message):
-        SelfModelOptions(**{name: value})
-
-
-# --- weights ----------------------------------------------------------------------------------
-
-
-CARD = {"command": "test", "quality": {"share": 0.98}}
-
-
-def test_weights_survive_a_round_trip(tmp_path):
-    path, model = tmp_path / "a.safetensors", SelfModel(DRIVING)
-    save_self_model(model, path, CARD)
-    state = torch.random.get_rng_state()
-    loaded, card = load_self_model(path, "driving")
-    assert torch.equal(torch.random.get_rng_state(), state)
-    assert_same(loaded.state_dict(), model.state_dict())
-    assert card == CARD
-    assert not loaded.training
-    assert loaded.domain is DRIVING
-    assert [part.name for part in tmp_path.iterdir()] == ["a.safetensors"]
-
-
-def test_damaged_weights_are_refused(tmp_path):
-    path = tmp_path / "a.safetensors"
-    with pytest.raises(AssetError, match=r"a\.safetensors: there is no such file"):
-        load_self_model(path)
-    save_self_model(SelfModel(DRIVING), path, CARD)
-    content = path.read_bytes()
-    for damaged in (content[:-1], content[:100], b"", b"nonsense" * 20):
-        path.write_bytes(damaged)
-        with pytest.raises(AssetError, match=r"a\.safetensors: cannot be read"):
-            load_self_model(path)
-
-
-def test_weights_of_something_else_are_refused(tmp_path, monkeypatch):
-    path = tmp_path / "a.safetensors"
-    save_file({"x": torch.zeros(2)}, path)
-    with pytest.raises(AssetError, match="not a self-model"):
-        load_self_model(path)
-    broken = SelfModel(DRIVING)
-    broken.sizes = Sizes(latent=8)
-    save_self_model(broken, path, CARD)
-    with pytest.raises(AssetError, match="does not fit this program"):
-        load_self_model(path)
-    save_self_model(SelfModel(DRIVING), path, CARD)
-    with pytest.raises(AssetError, match='is for the domain "driving", not "bomb"'):
-        load_self_model(path, "bomb")
-    monkeypatch.setattr(Driving, "version", "2")
-    with pytest.raises(AssetError, match="is for version 1 of driving, this is version 2"):
-        load_self_model(path)
-    monkeypatch.undo()
-    monkeypatch.setattr(Driving, "name", "flying")
-    save_self_model(SelfModel(DRIVING), path, CARD)
-    monkeypatch.undo()
-    with pytest.raises(AssetError, match='unknown domain "flying"'):
-        load_self_model(path)
-
-
-def test_weights_know_their_sizes(tmp_path):
-    path, sizes = tmp_path / "a.safetensors", Sizes(latent=8, encoder=16)
-    save_self_model(SelfModel(DRIVING, sizes), path, CARD)
-    model, _ = load_self_model(path)
-    assert (model.sizes, model.latent, model.encoder.ego.out_features) == (sizes, 8, 16)
-
-
-def test_no_weights_ship_for_an_unknown_domain():
-    with pytest.raises(AssetError, match="there is no self-model of bomb yet"):
-        shipped_weights("bomb")
-
-
-# --- how good the shipped weights are ---------------------------------------------------------
-
-
-def test_shipped_weights_drive_well_in_clear_view(shipped):
-    model, rounds = shipped[0], 4000
-    generator = torch.Generator().manual_seed(77)
-    start = DRIVING.initial(rounds, generator)
-    anything = torch.randint(2, (rounds, STEPS), generator=generator)
-    best = returns(DRIVING, start, planner_actions(DRIVING, start, STEPS, 1.0))
-    own = drive(model, start, fixed_views(DRIVING, rounds, generator), STEPS, generator)
-    reached = returns(DRIVING, start, own)
-    assert (reached <= best + 1e-4).all()  # the yardstick is the optimum of every round
-    gap = (best - returns(DRIVING, start, anything)).mean()
-    regret = (best - reached) / gap
-    share = 1 - regret.mean().item()
-    # One in 20,000 runs of a model of exactly 98% would end below this.
-    assert share >= 0.98 - 4 * regret.std().item() / math.sqrt(rounds)
-
-
-def test_shipped_weights_are_as_good_as_their_card_says(shipped):
-    model, card = shipped
-    number, of_card = 800, 4000
-    assert card["quality"]["share_clear"] >= 0.98
-    assert json.loads(json.dumps(card)) == card
-    measured = self_model_quality(model, number, seed=78)
-    agreements = [name for name in card["quality"] if "agreement" in name]
-    assert len(agreements) == 8
-    for name in agreements:
-        stated = card["quality"][name]
-        # Decisions of one round go together: the error is at most that of whole rounds.
-        error = math.sqrt(stated * (1 - stated) * (1 / number + 1 / of_card))
-        assert measured[name] >= stated - 4 * error, name
