@@ -57,7 +57,7 @@ SITE = {
     ],
     "Worlds": ["docs/driving", "docs/search_rescue", "docs/bomb_defusal", "docs/highway"],
     "Results": ["docs/results", "docs/performance"],
-    "Reference": ["docs/reference/index"],
+    "Reference": ["docs/reference/index", "docs/fit_files"],
     "More": [
         "Gallery <docs/gallery>",
         "Decisions <docs/decisions>",

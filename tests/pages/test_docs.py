@@ -320,6 +320,7 @@ def test_the_commands_of_the_readme_write_what_it_says(results):
         "docs/people.md",
         "docs/self_model.md",
         "docs/human_model.md",
+        "docs/fit_files.md",
         "docs/extending.md",
         "docs/trust.md",
         "docs/search_rescue.md",
@@ -354,7 +355,7 @@ def test_the_example_on_the_page_is_the_file():
 def test_groups_and_variables_of_results_are_on_the_page(results):
     import arviz as az
 
-    text = page("docs/human_model.md")
+    text = page("docs/fit_files.md")
     told = defaultdict(str)
     for row in _filled(table_of(text, "Group")):
         for group in re.findall(r"`(\w+)`", row[0]):
