@@ -25,7 +25,6 @@ from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.domains import DOMAINS as worlds
 from mirror_ppl.domains import World, add_domain, domain_of, get_domain, require_known
-from mirror_ppl.domains.registry import OWN
 from mirror_ppl.errors import InputError, UnreliableWeights
 from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
@@ -315,7 +314,7 @@ def load_recordings(
     setting = require_known(setting or settings[-1], "setting", settings, domain)
     populations = populations_of(domain)
     population = require_known(population or "paper", "population", populations, domain)
-    if domain not in OWN:
+    if domain not in worlds:
         raise InputError(f"no recordings of {domain} ship; name a file of them")
     return load_demonstrations(asset_path(f"{domain}_{setting}_{population}.nc"))
 

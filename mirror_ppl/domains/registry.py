@@ -21,13 +21,9 @@ from mirror_ppl.user_code import class_in_file, describe
 ENTRY_POINTS = "mirror_ppl.domains"
 """Group under which installed packages name their worlds."""
 DOMAINS: dict[str, Domain] = {
-    domain.name: domain for domain in (Driving(), SearchRescue(), BombDefusal())
+    domain.name: domain for domain in (Driving(), SearchRescue(), BombDefusal(), Highway())
 }
-"""The package's own worlds by name, of which a self-model ships."""
-UNTRAINED: dict[str, Domain] = {domain.name: domain for domain in (Highway(),)}
-"""Those of which none ships: `train` makes one."""
-OWN = DOMAINS | UNTRAINED
-"""All worlds of the package, of which recordings ship."""
+"""The package's own worlds by name, of which recordings and a self-model ship."""
 CODE = "_hash_of_file"
 """Attribute of the class of a user's world."""
 _ADDED: dict[str, World] = {}
@@ -42,7 +38,7 @@ def added_worlds() -> tuple[World, ...]:
 
 def known_domains() -> tuple[Domain, ...]:
     """Return the package's own worlds and those that were added."""
-    return (*OWN.values(), *_ADDED.values())
+    return (*DOMAINS.values(), *_ADDED.values())
 
 
 def load_world(specification: str | type[World] | World) -> World:
@@ -66,7 +62,7 @@ def load_world(specification: str | type[World] | World) -> World:
             raise DomainError(f"{world.__name__} cannot be made: {describe(error)}") from error
     if not isinstance(world, World):
         raise DomainError(f"a world is derived from mirror_ppl.World, not {type(world).__name__}")
-    if world.name in OWN:
+    if world.name in DOMAINS:
         raise DomainError(f"{type(world).__name__}: mirror_ppl has a world {world.name} itself")
     return world
 
@@ -89,7 +85,7 @@ def code_of(domain: Domain) -> str:
 
     It is computed once and kept by the class: other processes do not have the file.
     """
-    if domain.name in OWN:
+    if domain.name in DOMAINS:
         return ""
     kind = type(domain)
     if CODE not in vars(kind):
@@ -126,9 +122,9 @@ def get_domain(name: str) -> Domain:
         DomainError: the file or class is missing, does not import, or is no world.
     """
     if not isinstance(name, str):
-        raise UnknownNameError.of("domain", name, OWN)
-    if name in OWN:
-        return OWN[name]
+        raise UnknownNameError.of("domain", name, DOMAINS)
+    if name in DOMAINS:
+        return DOMAINS[name]
     if name in _ADDED:
         return _ADDED[name]
     if ".py:" in name:
@@ -143,7 +139,7 @@ def get_domain(name: str) -> Domain:
             raise DomainError(f"{entry.value}: is called {world.name}, but its entry point {name}")
         return world
     installed = [entry.name for entry in entry_points(group=ENTRY_POINTS)]
-    known = dict.fromkeys([*OWN, *_ADDED, *installed])
+    known = dict.fromkeys([*DOMAINS, *_ADDED, *installed])
     message = f"{UnknownNameError.of('domain', name, known)}"
     raise UnknownNameError(f"{message}; a world of your own is --domain path/to/file.py:Class")
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mirror_ppl.checks import as_path
 from mirror_ppl.data import asset_path
 from mirror_ppl.domains import DOMAINS, get_domain
-from mirror_ppl.domains.registry import UNTRAINED, code_of
+from mirror_ppl.domains.registry import code_of
 from mirror_ppl.errors import AssetError, MirrorError, StaleSelfModel
 from mirror_ppl.files import json_text, read_whole, write_whole
 from mirror_ppl.models.self_model import SelfModel
@@ -40,10 +40,9 @@ def shipped_weights(domain: str) -> Path:
     if domain in DOMAINS:
         return asset_path(name)
     if not (trained := Path("runs") / name).exists():
-        world = domain if domain in UNTRAINED else "path/to/file.py:Class"
         raise AssetError(
             f"{trained}: there is no self-model of {domain} yet; make one with python -m "
-            f"mirror_ppl.train --domain {world}, or name its file with --self-model"
+            "mirror_ppl.train --domain path/to/file.py:Class, or name its file with --self-model"
         )
     return trained
 

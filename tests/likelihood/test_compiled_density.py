@@ -27,12 +27,14 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
-STEPS = {"driving": 3, "search_rescue": 3, "bomb_defusal": 4}
+STEPS = {"driving": 3, "search_rescue": 3, "bomb_defusal": 4, "highway": 3}
 """Of the longest round, by world."""
 HORIZONS = {("search_rescue", "per-item"): 1, ("bomb_defusal", "per-item"): 2}
 """Where that of the longest round would be too much to go through: nine and six items, each of
 which is noticed at one of so many steps or never."""
 DRAWS = 2
+CLOSE = {"rtol": 5e-7, "atol": 1e-4}
+"""Relative: numbers of 32 bits, as densities of a thousand weights add up to a thousand nats."""
 
 
 @cache
@@ -88,8 +90,8 @@ def assert_compiled(human, rounds, log_density):
     found = ViewTables(human, table).log_joint(draws)[:, 0]
     for draw in range(DRAWS):
         expected = log_density(human, rounds, {name: one[draw] for name, one in draws.items()})
-        torch.testing.assert_close(own[draw], expected, rtol=0, atol=1e-4)
-        torch.testing.assert_close(found[draw], expected, rtol=0, atol=1e-4)
+        torch.testing.assert_close(own[draw], expected, **CLOSE)
+        torch.testing.assert_close(found[draw], expected, **CLOSE)
     return joint[0].logsumexp(-1), {name: one[0] for name, one in policy.items()}
 
 
@@ -129,12 +131,15 @@ def log_prior(human, policy):
     return total
 
 
-@pytest.mark.parametrize(("world", "name"), SHIPPED)
+@pytest.mark.parametrize(
+    ("world", "name"),
+    [one for one in SHIPPED if one[0] != "highway" or one[1] in ("mirror", "all")],
+)  # of the highway those that take seconds; what other models change is the same in all worlds
 def test_the_compiled_density_is_that_of_the_program(world, name, monkeypatch):
     human, rounds = shipped(world, name, monkeypatch)
     total, policy = assert_compiled(human, rounds, enumerated)
     # With everything discrete summed out.
-    torch.testing.assert_close(total, enumerated(human, rounds, policy), rtol=0, atol=1e-4)
+    torch.testing.assert_close(total, enumerated(human, rounds, policy), **CLOSE)
 
 
 # --- what Pyro counts in a method --------------------------------------------------------------
@@ -216,4 +221,4 @@ def test_programs_of_users_are_compiled(kind):
     human, rounds = kind(self_model("driving")), short_rounds("driving", 3)
     total, policy = assert_compiled(human, rounds, gone_through)
     if kind in ENUMERATED:
-        torch.testing.assert_close(total, enumerated(human, rounds, policy), rtol=0, atol=1e-4)
+        torch.testing.assert_close(total, enumerated(human, rounds, policy), **CLOSE)

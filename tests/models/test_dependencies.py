@@ -33,7 +33,7 @@ from mirror_ppl.people import simulate
 
 sys.path.insert(0, str(EXAMPLES))
 
-WORLD_NAMES = ("driving", "search_rescue", "bomb_defusal")
+WORLD_NAMES = ("driving", "search_rescue", "bomb_defusal", "highway")
 RESIDUAL = {"residual_in", "residual_out"}
 CHOICE = {"consistency", "lapse"}
 TERMINALS = tuple(f"notices_terminal {number}" for number in range(1, 7))

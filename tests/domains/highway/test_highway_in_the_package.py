@@ -1,7 +1,5 @@
 """The highway among the worlds of the package: recordings ship, a self-model has to be trained."""
 
-import os
-
 import pytest
 import torch
 
@@ -9,8 +7,7 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import DOMAINS, add_domain, get_domain
 from mirror_ppl.domains.checking import faults_of
 from mirror_ppl.domains.highway import Highway
-from mirror_ppl.errors import AssetError, DomainError
-from mirror_ppl.models.weights import shipped_weights
+from mirror_ppl.errors import DomainError
 from mirror_ppl.people import act, draw_starts, populations_of, simulated_people
 
 RECORDINGS = [(s, p) for s in Highway.settings for p in ("diverse", "paper")]
@@ -18,7 +15,7 @@ RECORDINGS = [(s, p) for s in Highway.settings for p in ("diverse", "paper")]
 
 def test_it_is_a_sound_world_of_the_package():
     world = get_domain("highway")
-    assert isinstance(world, Highway) and "highway" not in DOMAINS
+    assert isinstance(world, Highway) and DOMAINS["highway"] is world
     assert faults_of(world) == [] and populations_of("highway") == ("diverse", "paper")
     with pytest.raises(DomainError, match="mirror_ppl has a world highway itself"):
         add_domain(Highway)
@@ -41,10 +38,3 @@ def test_recordings_are_of_the_drivers_that_a_seed_gives(setting, population):
     assert (first == recorded.actions[..., 0]).float().mean() > 0.99
     for name, value in people.truth().items():
         assert torch.equal(recorded.truth[name], value)
-
-
-def test_without_a_self_model_a_fit_says_how_to_train_one(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(AssetError, match="mirror_ppl.train --domain highway"):
-        shipped_weights("highway")
-    assert not os.listdir(tmp_path)
