@@ -1,4 +1,4 @@
-"""The highway among the worlds of the package: recordings ship, a self-model has to be trained."""
+"""The highway among the worlds of the package: recordings and a self-model ship."""
 
 import pytest
 import torch
