@@ -33,8 +33,11 @@ HORIZONS = {("search_rescue", "per-item"): 1, ("bomb_defusal", "per-item"): 2}
 """Where that of the longest round would be too much to go through: nine and six items, each of
 which is noticed at one of so many steps or never."""
 DRAWS = 2
-CLOSE = {"rtol": 5e-7, "atol": 1e-4}
-"""Relative: numbers of 32 bits, as densities of a thousand weights add up to a thousand nats."""
+
+
+def near(human):
+    """Tolerances; relative where a thousand weights of 32 bits add up to a thousand nats."""
+    return {"rtol": 5e-7 if human.domain.name == "highway" else 0, "atol": 1e-4}
 
 
 @cache
@@ -90,8 +93,8 @@ def assert_compiled(human, rounds, log_density):
     found = ViewTables(human, table).log_joint(draws)[:, 0]
     for draw in range(DRAWS):
         expected = log_density(human, rounds, {name: one[draw] for name, one in draws.items()})
-        torch.testing.assert_close(own[draw], expected, **CLOSE)
-        torch.testing.assert_close(found[draw], expected, **CLOSE)
+        torch.testing.assert_close(own[draw], expected, **near(human))
+        torch.testing.assert_close(found[draw], expected, **near(human))
     return joint[0].logsumexp(-1), {name: one[0] for name, one in policy.items()}
 
 
@@ -139,7 +142,7 @@ def test_the_compiled_density_is_that_of_the_program(world, name, monkeypatch):
     human, rounds = shipped(world, name, monkeypatch)
     total, policy = assert_compiled(human, rounds, enumerated)
     # With everything discrete summed out.
-    torch.testing.assert_close(total, enumerated(human, rounds, policy), **CLOSE)
+    torch.testing.assert_close(total, enumerated(human, rounds, policy), **near(human))
 
 
 # --- what Pyro counts in a method --------------------------------------------------------------
@@ -221,4 +224,4 @@ def test_programs_of_users_are_compiled(kind):
     human, rounds = kind(self_model("driving")), short_rounds("driving", 3)
     total, policy = assert_compiled(human, rounds, gone_through)
     if kind in ENUMERATED:
-        torch.testing.assert_close(total, enumerated(human, rounds, policy), **CLOSE)
+        torch.testing.assert_close(total, enumerated(human, rounds, policy), **near(human))

@@ -31,7 +31,7 @@ SECONDS = TICK * DECISION_TICKS
 REMEMBERED = 6
 """Decisions (3 s) for which a car out of sight is expected to drive on."""
 HEARD_AT = (25.0, 20.0)
-"""Metres at which drivers imagine a car ahead, and one behind, of which they are told."""
+"""Metres at which drivers imagine a car ahead, and one behind, that a sentence is about."""
 HEARD_FASTER = (5.0, 1.5, -5.0, -0.5, 2.0)
 """m/s at which its distance shrinks in their minds, by sentence."""
 
