@@ -31,9 +31,6 @@ rounds, and print for each the people's returns, the cost of messages and what t
 play the same rounds with the same random numbers. With --json, --log or --film, a run that is
 stopped goes on where it was when the same command is given again."""
 EXAMPLES = {
-    "how much the people of make demo gain by messages": (
-        "--posterior runs/demo/posterior.nc --communicator mirror none --rounds 20"
-    ),
     "all communicators, with every decision in a file": (
         "--json runs/assist.json --log runs/assist.jsonl"
     ),
