@@ -171,7 +171,8 @@ class Domain(Protocol):
     reaches in each direction by name, with which self-models are evaluated. In training, the
     robot's reach is drawn with weights ``reach_practice`` (uniform if empty), items within reach
     are noticed with a probability per step drawn between those of ``notice_practice``, and items
-    are communicated with a probability of up to ``told_practice``. ``assumptions`` are what an
+    are communicated with a probability of up to ``told_practice``. What was observed before is read
+    only in assumptions, not in `known`, unless the world ``recalls``. ``assumptions`` are what an
     observer may take for granted about unknown items; the world is ``settled`` if all of them
     together determine every item. ``mishap`` is the reward term of a harmful event, and the plural
     of its name. ``counterparts`` has for each visual item the verbal item about the same thing, if
@@ -199,6 +200,7 @@ class Domain(Protocol):
     reach_unit: str
     reach_practice: tuple[float, ...]
     told_practice: float
+    recalls: bool
     notice_practice: tuple[float, float]
     partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...]

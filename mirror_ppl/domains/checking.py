@@ -48,6 +48,7 @@ CAPABILITIES = (
     Capability("deed", "the action's name", "actions in words"),
     Capability("render", "a table of numbers", "pictures of states"),
     Capability("reference_values", "left out", "an expert; exact agreement; advice"),
+    Capability("reflected", "left out", "twice the rounds, where left and right are alike"),
 )
 
 

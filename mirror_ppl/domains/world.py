@@ -83,10 +83,13 @@ class World(ABC):
     reach_unit: str
     reach_practice: tuple[float, ...] = ()
     told_practice: float = 0.3
+    recalls: bool = True
     notice_practice: tuple[float, float] = (1.0, 1.0)
     partial_views: Mapping[str, tuple[float, ...]]
     assumptions: tuple[str, ...] = ()
     settled: bool = False
+    reflected_actions: tuple[int, ...] = ()
+    reflected_items: Mapping[str, tuple[int, ...]] = {}
     counterparts: tuple[int | None, ...]
     symbol_sizes: Mapping[str, int]
     _derived: frozenset[str]
@@ -259,6 +262,17 @@ class World(ABC):
         """Return the state as a person believes it to be: the true state."""
         del knowledge, assumes
         return state
+
+    def reflected(self, state: Any) -> Any:
+        """Return the state with left and right exchanged; only of worlds where both are alike.
+
+        With it, the robot learns from twice as many rounds. Such a world also has
+        ``reflected_actions`` and ``reflected_items``.
+
+        Raises:
+            NotImplementedError: unless a world defines it.
+        """
+        raise NotImplementedError(f"{self.name} has no reflected()")
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Encode observations for networks, ``[..., K, symbol_sizes]``; see ``levels``."""

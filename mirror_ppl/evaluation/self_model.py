@@ -17,7 +17,7 @@ from torch import Tensor
 from mirror_ppl.domains.base import Domain, map_state, roll_out, total_reward
 from mirror_ppl.domains.world import offers
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.training.experience import drive, experience, follow, supposed
+from mirror_ppl.training.experience import Course, drive, experience, follow, supposed
 from mirror_ppl.training.views import ViewPlan
 
 CLEAR_DECISION = 0.2
@@ -167,7 +167,8 @@ def _agreement(
     self_model: SelfModel, exact: Tensor, start: Any, actions: Tensor, plan: ViewPlan
 ) -> tuple[float, float]:
     """Share of decisions that are best by exact values ``[B, T, A]``: of all, and of clear ones."""
-    lived = experience(self_model.domain.as_believed, start, actions, plan).rounds
+    domain = self_model.domain.as_believed
+    lived = experience(domain, Course.of(domain, start, actions), plan).rounds
     belief = self_model.believe(
         self_model.evidence(lived.observation, lived.visible, lived.actions)
     )

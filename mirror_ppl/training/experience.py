@@ -1,14 +1,14 @@
 """Experience of the robot: rounds that it drove, and the outcomes of every action.
 
 Only the initial states and the actions of rounds are stored, unless a `Course` is kept, which
-worlds with slow transitions need. The world is deterministic, so
-observations, views and rewards are recomputed whenever a round is used for training.
+worlds with slow transitions need. The world is deterministic, so observations, views and rewards
+are recomputed whenever a round is used for training.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -22,26 +22,32 @@ from mirror_ppl.domains.base import (
     roll_out,
     total_reward,
 )
+from mirror_ppl.domains.world import World
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.training.views import ViewPlan
 
 
 @dataclass(frozen=True)
 class Course:
-    """What happened in rounds, which takes long to compute in some worlds.
+    """Rounds and what happened in them, which takes long to compute in some worlds.
 
     Attributes:
+        actions: ``[B, T]``.
         states: ``[B, T + 1]``.
         observation: full observations ``[B, T + 1, ...]``.
         rewards: of the actions ``[B, T]``.
         values: the planner's action values ``[B, T, A]``, if they are learned; nan where they are
             unknown, so that nothing is learned there.
+        taken: of rounds as they were believed, the items ``[B, T + 1, K]`` that were seen, heard or
+            taken for granted; none in all other rounds, which may be seen through any view.
     """
 
+    actions: Tensor
     states: Any
     observation: Observation
     rewards: Tensor
     values: Tensor | None = None
+    taken: Visibility | None = None
 
     @classmethod
     def of(cls, domain: Domain, start: Any, actions: Tensor) -> Course:
@@ -52,31 +58,82 @@ class Course:
             for steps in (slice(None, -1), slice(1, None))
         )
         rewards = total_reward(domain.rewards(before, actions, after))
-        return cls(states, domain.observe(states), rewards)
+        return cls(actions, states, domain.observe(states), rewards)
 
     @classmethod
     def join(cls, courses: Sequence[Course]) -> Course:
         """Return the rounds of several courses, all of them with values or all without."""
+        first, *others = courses
+        if not others:
+            return first
+
+        def joined(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+            return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
         values = [one.values for one in courses if one.values is not None]
+        taken = [one.taken for one in courses if one.taken is not None]
         return cls(
+            torch.cat([one.actions for one in courses]),
             map_state(lambda *parts: torch.cat(parts), *(one.states for one in courses)),
-            {
-                name: torch.cat([one.observation[name] for one in courses])
-                for name in courses[0].observation
-            },
+            joined([one.observation for one in courses]),
             torch.cat([one.rewards for one in courses]),
             torch.cat(values) if values else None,
+            joined(taken) if taken else None,
         )
 
     def window(self, rows: Tensor, begin: int, steps: int) -> Course:
         """Return some of these rounds, from a step on."""
         end = begin + steps
+
+        def cut(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: part[rows, begin : end + 1] for name, part in parts.items()}
+
         return Course(
+            self.actions[rows, begin:end],
             map_state(lambda part: part[rows, begin : end + 1], self.states),
-            {name: part[rows, begin : end + 1] for name, part in self.observation.items()},
+            cut(self.observation),
             self.rewards[rows, begin:end],
             None if self.values is None else self.values[rows, begin:end],
+            None if self.taken is None else cut(self.taken),
         )
+
+    def supposed_by(self, domain: Domain, plan: ViewPlan) -> Course:
+        """Return these rounds as observers who make assumptions believed them to be.
+
+        Args:
+            domain: the world.
+            plan: views of these rounds; those in which nothing is assumed stay as they are.
+        """
+        seen, knowledge = follow(domain, plan, self.observation)
+        believed = supposed(domain, plan, self.states, knowledge)
+        observation, now = domain.observe(believed), _but_last(believed)
+        assuming = torch.stack([*plan.assumes.values()]).any(0)
+        taken = plan.taken(domain, knowledge, observation)
+        rewards = domain.rewards(now, self.actions, domain.transition(now, self.actions))
+        return replace(
+            self,
+            states=believed,
+            observation=observation,
+            rewards=torch.where(assuming[:, None], total_reward(rewards), self.rewards),
+            taken={
+                name: (mask | taken[name]) & assuming[:, None, None] for name, mask in seen.items()
+            },
+        )
+
+    def reflected(self, domain: World) -> Course:
+        """Return these rounds with left and right exchanged, in worlds where both are alike."""
+        states = domain.reflected(self.states)
+        image = torch.tensor(domain.reflected_actions, device=self.actions.device)
+        observation = domain.observe(states)
+        values = None if self.values is None else self.values[..., image]
+        taken = self.taken and {
+            name: mask[..., domain.reflected_items[name]] for name, mask in self.taken.items()
+        }
+        return Course(image[self.actions], states, observation, self.rewards, values, taken)
+
+
+def _but_last(states: Any) -> Any:
+    return map_state(lambda part: part[:, :-1], states)
 
 
 @dataclass(frozen=True)
@@ -126,13 +183,11 @@ class Experience:
 
 def experience(
     domain: Domain,
-    start: Any,
-    actions: Tensor,
+    course: Course,
     plan: ViewPlan,
     first: int = 0,
     stride: int = 1,
     discount: float | None = None,
-    course: Course | None = None,
 ) -> Experience:
     """Compute the experience of an observer with a view.
 
@@ -141,22 +196,17 @@ def experience(
 
     Args:
         domain: the world.
-        start: states ``[B]``.
-        actions: ``[B, T]``.
-        plan: views of B rounds.
+        course: rounds; with values, no outcomes are computed.
+        plan: views of these rounds.
         first: first step at which the outcomes of every action are computed.
         stride: distance between these steps.
         discount: discount of exact values, which are computed only if it is given.
-        course: of these rounds, if it is known; else it is computed. With values, no outcomes are
-            computed.
     """
-    course = course or Course.of(domain, start, actions)
     observation, rewards, values = course.observation, course.rewards, course.values
+    actions = course.actions
     seen_along, knowledge = follow(domain, plan, observation)
     believed = supposed(domain, plan, course.states, knowledge)
-    current, so_far = (
-        map_state(lambda part: part[:, :-1], whole) for whole in (believed, knowledge)
-    )
+    current, so_far = _but_last(believed), _but_last(knowledge)
 
     steps = slice(first, actions.shape[1], stride)
     some, known = (map_state(lambda part: part[:, steps], whole) for whole in (current, so_far))
@@ -169,6 +219,12 @@ def experience(
         rewards = total_reward(domain.rewards(current, actions, later))
     taken = plan.taken(domain, knowledge, observation)
     visible = {name: mask | taken[name] for name, mask in seen_along.items()}
+    if course.taken is not None:
+        kept = torch.cat([mask.flatten(1) for mask in course.taken.values()], 1).any(1)
+        visible = {
+            name: torch.where(kept[:, None, None], course.taken[name], mask)
+            for name, mask in visible.items()
+        }
     informed = torch.stack(
         [(visible[name] | ~needed).all(-1) for name, needed in domain.decisive(observation).items()]
     ).all(0)

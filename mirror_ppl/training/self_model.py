@@ -79,14 +79,17 @@ class SelfModelOptions:
             certain. Errors of values where one action is far better than another hardly count.
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
         assumed: share of sight views in which each assumption is made. At 0 the robot does not
-            learn what follows from assumptions; imagined items are then like seen ones to it.
+            learn what follows from assumptions; imagined items are then like seen ones to it. With
+            ``distil``, the share of all rounds that are kept as one observer who makes assumptions
+            believed them to be, with the planner's values there.
         at_means: True to learn values at the encoder's means in every step, False to alternate with
             draws of the guide. Means are exact sooner where decisive items are clearly visible.
         exact: True to learn the exact planner's values, where there is one, for observers who know
             all decisive items, instead of bootstrapped values.
         distil: True to learn the planner's values of the true state in every view: their mean,
             given what is seen. They are computed once for each driven state; only for planners
-            whose values hold without further observations, and with ``window``.
+            whose values hold without further observations, and with ``window``. In worlds where
+            left and right are alike, the same rounds are learned from with both exchanged, too.
     """
 
     phases: int = 40
@@ -337,6 +340,7 @@ class _Trainer:
         self.starts: list[Any] = []
         self.actions: list[Tensor] = []
         self.courses: list[Course] = []
+        self.seed = seed
         self.phase = 0
 
     def run(self, report: Callable[[int, str], None], checkpoint: Path | None) -> None:
@@ -418,9 +422,11 @@ class _Trainer:
     def _learn(self) -> str:
         options = self.options
         exact = options.exact and offers(self.domain, "reference_values")
-        actions = torch.cat(self.actions)
-        starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
         course = self._course() if options.window else None
+        actions = torch.cat(self.actions) if course is None else course.actions
+        starts = None
+        if course is None:
+            starts = map_state(lambda *parts: torch.cat(parts), *self.starts)
         elbo = bellman = 0.0
         for step in range(options.steps):
             chosen = torch.randint(
@@ -429,28 +435,27 @@ class _Trainer:
                 generator=self.generator,
                 device=self.generator.device,
             )
-            acted, lived_through = actions[chosen], None
-            if course is not None:
+            if course is None:
+                some = map_state(lambda part: part[chosen], starts)  # noqa: B023 - used at once
+                rounds = Course.of(self.domain, some, actions[chosen])
+            else:
                 begin = self._drawn(actions.shape[1] - options.window + 1)
-                acted = acted[:, begin : begin + options.window]
-                lived_through = course.window(chosen, begin, options.window)
+                rounds = course.window(chosen, begin, options.window)
             plan = draw_views(
                 self.domain,
                 options.batch,
-                acted.shape[1],
+                rounds.actions.shape[1],
                 self.generator,
                 options.kinds,
-                options.assumed,
+                0.0 if options.distil else options.assumed,
             )
             lived = experience(
                 self.domain,
-                map_state(lambda part: part[chosen], starts),  # noqa: B023 - used at once
-                acted,
+                rounds,
                 plan,
                 0 if options.distil else self._drawn(options.stride),
                 1 if options.distil else options.stride,
                 options.discount if exact else None,
-                lived_through,
             )
             means = options.at_means or step % 2 == 1
             loss = self_model_loss(self.self_model, self.target, lived, options, means)
@@ -469,11 +474,23 @@ class _Trainer:
         rounds = list(zip(self.starts, self.actions, strict=True))
         for start, actions in rounds[len(self.courses) :]:
             course = Course.of(self.domain, start, actions)
-            if self.options.distil:
-                first = len(self.courses) % self.options.stride
-                course = replace(course, values=self._values(course.states, first))
-            self.courses.append(course)
+            self.courses.append(self._valued(course) if self.options.distil else course)
         return Course.join(self.courses)
+
+    def _valued(self, course: Course) -> Course:
+        """Return a phase's rounds, some of them as believed, with the planner's values."""
+        domain, phase = self.domain, len(self.courses)
+        if self.options.assumed and domain.assumptions:
+            # A generator of its own, as a resumed run has to repeat the phases before.
+            own = torch.Generator(self.generator.device).manual_seed(self.seed + phase)
+            number, steps = course.actions.shape
+            share, only_sight = self.options.assumed, (0.0, 0.0, 1.0)
+            plan = draw_views(domain, number, steps, own, only_sight, share)
+            course = course.supposed_by(domain, plan)
+        course = replace(course, values=self._values(course.states, phase % self.options.stride))
+        if isinstance(domain, World) and offers(domain, "reflected"):
+            course = Course.join([course, course.reflected(domain)])
+        return course
 
     def _values(self, states: Any, first: int) -> Tensor:
         """Return the planner's values ``[B, T, A]`` of states ``[B, T + 1]``; nan between strides.

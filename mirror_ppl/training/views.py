@@ -97,9 +97,12 @@ class ViewPlan:
             stride: distance between these steps.
 
         Returns:
-            Masks ``[B, T', K]`` of items seen, heard or remembered, and knowledge ``[B, T']``.
+            Masks ``[B, T', K]`` of items seen, heard or remembered, and knowledge ``[B, T']``;
+            it is not updated where nobody uses it.
         """
         visible = self.visibility(domain, observation, first, stride)
+        if not domain.recalls and not any(makes.any() for makes in self.assumes.values()):
+            return visible, knowledge
         knowledge = domain.learn(
             knowledge,
             observation,

@@ -15,7 +15,7 @@ from mirror_ppl.domains.base import map_state, roll_out
 from mirror_ppl.domains.driving import CAR_LANES, CARS, ROAD_END, DrivingState
 from mirror_ppl.domains.driving.people import Memory, remember
 from mirror_ppl.evaluation.self_model import _exact_values, fixed_views
-from mirror_ppl.training.experience import experience, follow, supposed
+from mirror_ppl.training.experience import Course, experience, follow, supposed
 from mirror_ppl.training.views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES, draw_views
 
 DRIVING = get_domain("driving")
@@ -187,7 +187,7 @@ REACH = (2.0, 2.0, 3.0, 0.0)
 def lived_by(clear, closing):
     """Four steps in the left lane; the car ahead is shown at the first."""
     plan = one_plan(REACH, clear, closing, visual=[(FRONT_LEFT, 0)])
-    return plan, experience(DRIVING, four_cars(), STAY4, plan)
+    return plan, experience(DRIVING, Course.of(DRIVING, four_cars(), STAY4), plan)
 
 
 @pytest.mark.parametrize(("clear", "closing"), BOTH)
@@ -266,7 +266,7 @@ def test_the_believed_world_is_the_one_that_drivers_remember(generator):
         remembers=everybody,
         assumes=dict.fromkeys(DRIVING.assumptions, everybody),
     )
-    rounds = experience(DRIVING, start, actions, plan).rounds
+    rounds = experience(DRIVING, Course.of(DRIVING, start, actions), plan).rounds
     observation = DRIVING.observe(roll_out(DRIVING, start, actions))
     observed = plan.visibility(DRIVING, observation)
     memory, wrong = Memory.empty((number,)), 0

@@ -12,7 +12,7 @@ from mirror_ppl.evaluation.self_model import fixed_views, self_model_quality
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import sizes_of
 from mirror_ppl.models.weights import load_self_model
-from mirror_ppl.training.experience import experience
+from mirror_ppl.training.experience import Course, experience
 from mirror_ppl.training.self_model import (
     SelfModelOptions,
     self_model_loss,
@@ -42,7 +42,7 @@ def lived(generator, **plan):
     start = WORLD.anywhere(30, generator)
     actions = torch.randint(5, (30, 4), generator=generator)
     view = replace(fixed_views(WORLD, 30, generator, speech=True), **plan)
-    return start, actions, experience(WORLD, start, actions, view, discount=0.9)
+    return start, actions, experience(WORLD, Course.of(WORLD, start, actions), view, discount=0.9)
 
 
 def test_who_knows_what_counts_has_exact_values_to_learn_from(generator):

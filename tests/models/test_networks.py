@@ -25,7 +25,7 @@ from mirror_ppl.models.networks import (
 )
 from mirror_ppl.models.self_model import Rounds, SelfModel
 from mirror_ppl.models.sizes import Sizes
-from mirror_ppl.training.experience import experience
+from mirror_ppl.training.experience import Course, experience
 
 DRIVING = get_domain("driving")
 LATENT, ACTIONS, HIDDEN = 48, 2, 64
@@ -304,7 +304,9 @@ def lived(actions):
     """Rounds of the same start, under the same clear view."""
     generator = torch.Generator().manual_seed(3)
     start = DRIVING.initial(len(actions), generator)
-    return experience(DRIVING, start, actions, fixed_views(DRIVING, len(actions), generator))
+    return experience(
+        DRIVING, Course.of(DRIVING, start, actions), fixed_views(DRIVING, len(actions), generator)
+    )
 
 
 def assert_first_difference(one, other, step, time=1):

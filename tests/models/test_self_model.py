@@ -37,7 +37,9 @@ def lived(generator):
     """Experience of 40 rounds, each seen in a way of its own."""
     start = DRIVING.initial(40, generator)
     actions = torch.randint(2, (40, STEPS), generator=generator)
-    return experience(DRIVING, start, actions, draw_views(DRIVING, 40, STEPS, generator))
+    return experience(
+        DRIVING, Course.of(DRIVING, start, actions), draw_views(DRIVING, 40, STEPS, generator)
+    )
 
 
 # --- the bound --------------------------------------------------------------------------------
@@ -106,7 +108,7 @@ def test_every_parameter_learns_from_the_loss(lived, on_means):
 
 def test_outcomes_of_both_actions_in_full_view():
     plan = fixed_views(DRIVING, 1, torch.Generator(), speech=True)
-    lived = experience(DRIVING, two_cars_near(), STAY4, plan)
+    lived = experience(DRIVING, Course.of(DRIVING, two_cars_near(), STAY4), plan)
     rounds, (stay, switch) = lived.rounds, lived.outcomes
     # Car ahead at 2, 1, 0, -1 cells: -2 each time, and -5 in the same cell.
     assert stay.reward.tolist() == [[-2.0, -2.0, -7.0, -2.0]]
@@ -130,7 +132,7 @@ def test_world_of_a_person_who_sees_one_cell_ahead(assuming):
     plan = fixed_views(DRIVING, 1, torch.Generator(), (1.0, 0.0, 0.0, 0.0))
     assert list(plan.assumes) == ["clear", "closing"] and all(plan.assumes.values())
     plan = replace(plan, assumes=dict.fromkeys(plan.assumes, torch.tensor([assuming])))
-    lived = experience(DRIVING, two_cars_near(), STAY4, plan)
+    lived = experience(DRIVING, Course.of(DRIVING, two_cars_near(), STAY4), plan)
     rounds, (stay, switch) = lived.rounds, lived.outcomes
     ahead = rounds.observation["visual"][0, :, 0, 0]
     # Seen at 1 cell and again at 0; from then on the car is known, in sight or not.
@@ -166,7 +168,9 @@ def test_people_know_communicated_items_from_then_on(generator):
     plan.noise["verbal"][..., 1] = 1.0
     plan.noise["verbal"][0, 1, 0, 1] = 0.0  # the car ahead is spoken of at step 1
     told = {"visual": torch.zeros(1), "verbal": torch.full((1,), 0.5)}
-    rounds = experience(DRIVING, two_cars_near(), STAY4, replace(plan, told=told)).rounds
+    rounds = experience(
+        DRIVING, Course.of(DRIVING, two_cars_near(), STAY4), replace(plan, told=told)
+    ).rounds
     assert rounds.observation["visual"][0, :, 0, 0].tolist() == [ROAD_END, 2, 1, 0, -1]
     assert rounds.observation["verbal"][0, :, 0, 2].tolist() == [0, -1, -1, -1, -1]
     # Before, it was taken to be absent, of which there is no word.
@@ -175,7 +179,7 @@ def test_people_know_communicated_items_from_then_on(generator):
     # To a person who does not remember, speech is only of the step at which it is heard.
     open_to_it = dict.fromkeys(plan.assumes, torch.tensor([False]))
     plan = replace(plan, told=told, remembers=torch.tensor([False]), assumes=open_to_it)
-    visible = experience(DRIVING, two_cars_near(), STAY4, plan).rounds.visible
+    visible = experience(DRIVING, Course.of(DRIVING, two_cars_near(), STAY4), plan).rounds.visible
     assert visible["verbal"][0, :, 0].tolist() == [False, True, False, False, False]
     assert visible["visual"][0, :, 0].tolist() == [False, False, False, True, False]
 
@@ -185,7 +189,7 @@ def test_the_robot_drives_by_the_beliefs_that_it_learns_from(shipped, generator)
     start, plan = DRIVING.initial(300, generator), draw_views(DRIVING, 300, STEPS, generator)
     with torch.no_grad():
         actions = drive(model, start, plan, STEPS, generator)
-        rounds = experience(DRIVING, start, actions, plan).rounds
+        rounds = experience(DRIVING, Course.of(DRIVING, start, actions), plan).rounds
         belief = model.believe(model.evidence(rounds.observation, rounds.visible, actions))
         values = model.action_values(belief[:, :-1])
     chosen = values.gather(-1, actions[..., None]).squeeze(-1)
@@ -238,15 +242,15 @@ def test_what_is_kept_of_rounds_is_what_is_computed():
     start, actions = two_cars_near(), STAY4
     plan = fixed_views(DRIVING, 1, torch.Generator(), speech=True)
     course = Course.of(DRIVING, start, actions)
-    found = experience(DRIVING, start, actions, plan, course=course.window(torch.tensor([0]), 0, 4))
-    expected = experience(DRIVING, start, actions, plan)
+    found = experience(DRIVING, course.window(torch.tensor([0]), 0, 4), plan)
+    expected = experience(DRIVING, course, plan)
     for name, value in expected.rounds.observation.items():
         assert torch.equal(found.rounds.observation[name], value)
     assert torch.equal(found.rounds.rewards, expected.rounds.rewards)
     assert torch.equal(found.outcomes[1].reward, expected.outcomes[1].reward)
     joined = Course.join([replace(course, values=torch.full((1, 4, 2), 7.0 + n)) for n in (0, 1)])
     second = joined.window(torch.tensor([1]), 0, 4)
-    valued = experience(DRIVING, start, actions, plan, stride=2, course=second)
+    valued = experience(DRIVING, second, plan, stride=2)
     assert not valued.outcomes and torch.equal(valued.exact, torch.full((1, 2, 2), 8.0))
     part = joined.window(torch.tensor([1, 0]), 1, 2)
     assert torch.equal(part.values[:, 0, 0], torch.tensor([8.0, 7.0]))

@@ -10,15 +10,15 @@ from example_experience import STAY4, two_cars_near
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import Driving
+from mirror_ppl.domains.highway import Highway
+from mirror_ppl.domains.world import World
 from mirror_ppl.errors import CheckpointError
-from mirror_ppl.evaluation.self_model import (
-    fixed_views,
-)
+from mirror_ppl.evaluation.self_model import fixed_views
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
 from mirror_ppl.training import self_model as self_model_training
-from mirror_ppl.training.experience import experience
+from mirror_ppl.training.experience import Course, experience
 from mirror_ppl.training.self_model import (
     SelfModelOptions,
     _Trainer,
@@ -46,7 +46,8 @@ def test_windows_that_do_not_fit_are_refused(options, message):
         train_self_model(DRIVING, SelfModelOptions(**options), torch.Generator())
 
 
-def test_assumptions_that_a_world_does_not_work_out_are_not_trained_with():
+def test_assumptions_that_a_world_does_not_work_out_are_not_trained_with(monkeypatch):
+    monkeypatch.setattr(Highway, "supposed", World.supposed)
     with pytest.raises(ValueError, match=r"assumed must be 0, as highway has no supposed\(\)"):
         options = SelfModelOptions.of("highway", assumed=0.5)
         train_self_model(get_domain("highway"), options, torch.Generator())
@@ -54,14 +55,20 @@ def test_assumptions_that_a_world_does_not_work_out_are_not_trained_with():
 
 def test_a_planner_s_values_are_learned():
     options = SelfModelOptions(
-        phases=1, rounds=64, steps=150, batch=16, learning_rate=3e-3, window=3, distil=True
+        phases=1,
+        rounds=64,
+        steps=150,
+        batch=16,
+        learning_rate=3e-3,
+        window=3,
+        distil=True,
+        assumed=0.0,
     )
     domain = ShortDriving()
     robot = train_self_model(domain, options, torch.Generator().manual_seed(0))
     rounds = experience(
         domain,
-        two_cars_near(),
-        STAY4[:, :3],
+        Course.of(domain, two_cars_near(), STAY4[:, :3]),
         fixed_views(domain, 1, torch.Generator(), speech=True),
     ).rounds
     with torch.no_grad():
@@ -73,7 +80,7 @@ def test_a_planner_s_values_are_learned():
 
 def test_values_between_strides_are_not_computed():
     domain = ShortDriving()
-    options = SelfModelOptions(rounds=2, window=3, distil=True, stride=2, discount=0.9)
+    options = SelfModelOptions(rounds=2, window=3, distil=True, stride=2, discount=0.9, assumed=0.0)
     trainer = _Trainer(
         domain, options, torch.Generator().manual_seed(0), 0, "words", sizes_of(domain), SelfModel
     )
@@ -85,8 +92,7 @@ def test_values_between_strides_are_not_computed():
     exact = domain.reference_values(two_cars_near(), 0.9)
     torch.testing.assert_close(first[:, 0], exact.expand(2, -1))
     plan = fixed_views(domain, 4, torch.Generator(), speech=True)
-    start, actions = (two_cars_near(), STAY4[:, :3])
-    lived = experience(domain, start, actions, plan, course=trainer._course())
+    lived = experience(domain, trainer._course(), plan)
     assert torch.equal(lived.over, lived.exact.isnan().any(-1))
 
 
@@ -96,8 +102,7 @@ def test_choices_are_learned_where_all_that_counts_is_known():
     options = SelfModelOptions(distil=True, window=3, world_weight=0.0)
     lived = experience(
         DRIVING,
-        two_cars_near(),
-        STAY4[:, :3],
+        Course.of(DRIVING, two_cars_near(), STAY4[:, :3]),
         fixed_views(DRIVING, 1, torch.Generator(), speech=True),
         discount=0.9,
     )
@@ -151,7 +156,7 @@ def test_values_move_to_the_optimum():
 
     def error(model):
         plan = fixed_views(domain, 1, torch.Generator(), speech=True)
-        rounds = experience(domain, two_cars_near(), STAY4[:, :3], plan).rounds
+        rounds = experience(domain, Course.of(domain, two_cars_near(), STAY4[:, :3]), plan).rounds
         evidence = model.evidence(rounds.observation, rounds.visible, rounds.actions)
         with torch.no_grad():
             values = model.action_values(model.believe(evidence[:, :1])[:, 0])
@@ -221,13 +226,38 @@ def test_training_depends_on_the_seed_alone():
     assert not torch.equal(train(seed=1)["reward.head.linear.bias"], one["reward.head.linear.bias"])
 
 
-def test_training_goes_on_from_its_checkpoint_as_if_never_stopped(tmp_path):
+KEPT = replace(TINY, window=4, stride=2, distil=True, choice_weight=1.0, assumed=0.5)
+"""What happened is kept, for some rounds as it was believed."""
+
+
+@pytest.mark.parametrize("options", [TINY, KEPT], ids=["computed", "kept"])
+def test_training_goes_on_from_its_checkpoint_as_if_never_stopped(options, tmp_path):
     path, phases = tmp_path / "run.checkpoint", []
     with pytest.raises(KeyboardInterrupt):
-        train(report=stop_after(2), checkpoint=path)
-    resumed = train(report=lambda done, message: phases.append(done), checkpoint=path)
+        train(options=options, report=stop_after(2), checkpoint=path)
+
+    def report(done, message):
+        phases.append(done)
+
+    resumed = train(options=options, report=report, checkpoint=path)
     assert phases == [3]
-    assert_same(resumed, train())
+    assert_same(resumed, train(options=options))
+
+
+def test_some_rounds_are_kept_as_they_were_believed():
+    """With values of the believed world; and twice as many where left and right are alike."""
+    generator = torch.Generator().manual_seed(0)
+    trainer = _Trainer(DRIVING, KEPT, generator, 0, "words", sizes_of(DRIVING), SelfModel)
+    trainer._drive()
+    kept = trainer._course()
+    believed = kept.taken["visual"].flatten(1).any(1)
+    assert 0 < believed.sum() < TINY.rounds
+    true = Course.of(DRIVING, trainer.starts[0], trainer.actions[0])
+    changed = (kept.observation["visual"] != true.observation["visual"]).flatten(1).any(1)
+    assert changed.any() and not (changed & ~believed).any()
+    now = map_state(lambda part: part[:, :-1:2], kept.states)
+    exact = DRIVING.reference_values(now, KEPT.discount)
+    torch.testing.assert_close(kept.values[:, ::2], exact)
 
 
 def test_checkpoint_of_another_run_is_refused(tmp_path):

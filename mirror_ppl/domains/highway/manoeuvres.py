@@ -30,6 +30,12 @@ SPEED_NAMES = ("stop", "slow", "medium", "fast")
 LANE_NAMES = ("left", "middle", "right")
 MANOEUVRES = tuple(f"{lane} lane {speed}" for lane in LANE_NAMES for speed in SPEED_NAMES)
 """Lane and speed of each manoeuvre in words; the lane changes slowest."""
+REFLECTED = tuple(
+    (LANES - 1 - lane) * len(SPEEDS) + speed
+    for lane in range(LANES)
+    for speed in range(len(SPEEDS))
+)
+"""The manoeuvre that each is, with left and right exchanged."""
 
 HEADING_GAIN, LATERAL_GAIN, SPEED_GAIN = 2.0, 0.7, 1.5
 """Gains of the controller, per second; softer than other vehicles', which steer at every tick."""

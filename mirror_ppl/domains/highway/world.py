@@ -50,6 +50,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -58,23 +59,26 @@ from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
 from mirror_ppl.domains.highway import estimate, expert, reward, scenarios, traffic
+from mirror_ppl.domains.highway.estimate import state_with
 from mirror_ppl.domains.highway.knowledge import Memory, imagined, nothing, out_of_sight, remember
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS, scan
-from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, controls
+from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, REFLECTED, controls
 from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SPOKEN, group_of
 from mirror_ppl.domains.highway.record import RECORD
 from mirror_ppl.domains.highway.road import (
     DECISION_TICKS,
     LANE_WIDTH,
     LANES,
+    LEFT_EDGE,
     LIMIT,
+    RIGHT_EDGE,
     ROUND_TICKS,
     TICKS,
     centre_of,
     wrapped,
 )
 from mirror_ppl.domains.highway.speech import DIRECTIONS, NOTHING, SIDES, utterances
-from mirror_ppl.domains.highway.state import HighwayState
+from mirror_ppl.domains.highway.state import HighwayState, where
 from mirror_ppl.domains.world import World
 
 FOG_AHEAD, FOG_BEHIND = 15.0, 5.0
@@ -119,6 +123,12 @@ class Highway(World):
     }
     assumptions: tuple[str, ...] = ("clear",)
     told_practice = 0.1
+    recalls = False  # everything moves
+    reflected_actions: tuple[int, ...] = REFLECTED
+    reflected_items: Mapping[str, tuple[int, ...]] = {
+        SEEN.name: tuple(-k % SECTORS for k in range(SECTORS)),
+        SPOKEN.name: tuple(-k % len(DIRECTIONS) for k in range(len(DIRECTIONS))),
+    }
     symbol_sizes: Mapping[str, int] = {
         "ego": LANES + 6,
         "visual": len(KNOTS) + 2,
@@ -159,17 +169,8 @@ class Highway(World):
 
     def observe(self, state: HighwayState) -> Observation:
         """Return everything: ego ``[..., 7]``, visual ``[..., 36, 3]``, verbal ``[..., 6, 1]``."""
-        lane = state.lane[..., 0]
-        ego = [
-            lane.to(state.x.dtype),
-            state.y[..., 0] - centre_of(lane),
-            wrapped(state.heading[..., 0]),
-            state.speed[..., 0],
-            *state.controls.unbind(-1),
-            state.over.to(state.x.dtype),
-        ]
         return {
-            "ego": torch.stack(ego, -1),
+            "ego": _ego(state),
             "visual": scan(state),
             "verbal": utterances(state)[..., None].to(state.x.dtype),
         }
@@ -239,17 +240,40 @@ class Highway(World):
     def assume(
         self, knowledge: Memory, observation: Observation
     ) -> tuple[dict[str, Visibility], Observation]:
-        """Return the assumption ``clear``: where nothing is seen, only remembered cars are.
-
-        A robot cannot be trained with it: `supposed` is not written, so that the assumed sectors of
-        a training round would be the true ones.
-        """
+        """Return the assumption ``clear``: where nothing is seen, only remembered cars are."""
         supposed = imagined(knowledge, observation)
         about = {
             "visual": torch.ones_like(supposed["visual"][..., 0], dtype=torch.bool),
             "verbal": torch.zeros_like(observation["verbal"][..., 0], dtype=torch.bool),
         }
         return {"clear": about}, supposed
+
+    def supposed(
+        self, state: HighwayState, knowledge: Memory, assumes: Mapping[str, Tensor]
+    ) -> HighwayState:
+        """Return the state ``[...]`` as believed: the cars that are known, and no others."""
+        assuming = assumes["clear"].expand(state.tick.shape)
+        if not assuming.any():
+            return state
+        return where(assuming, state_with(_ego(state), knowledge), state)
+
+    def reflected(self, state: HighwayState) -> HighwayState:
+        """Return the state with left and right exchanged.
+
+        What follows is reflected, too, but for vehicles to which MOBIL recommends both lanes.
+        """
+        return replace(
+            state,
+            y=LEFT_EDGE + RIGHT_EDGE - state.y,
+            heading=-state.heading,
+            target_lane=LANES - 1 - state.target_lane,
+            cue_lane=LANES - 1 - state.cue_lane,
+            controls=state.controls * state.controls.new_tensor([-1.0, 1.0]),
+        )
+
+    def decisive(self, observation: Observation) -> Visibility:
+        """Return all sectors ``[..., 36]``; sentences add little to them."""
+        return self._all(observation, lambda m: m.name == SEEN.name)
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
         """Encode observations for networks; distances by their place between ``KNOTS``."""
@@ -309,6 +333,20 @@ class DirectHighway(Highway):
 
     ticks = TICKS
     horizon = ROUND_TICKS // TICKS
+
+
+def _ego(state: HighwayState) -> Tensor:
+    """Return what a driver knows of the own car, ``[..., 7]``."""
+    lane = state.lane[..., 0]
+    parts = [
+        lane.to(state.x.dtype),
+        state.y[..., 0] - centre_of(lane),
+        wrapped(state.heading[..., 0]),
+        state.speed[..., 0],
+        *state.controls.unbind(-1),
+        state.over.to(state.x.dtype),
+    ]
+    return torch.stack(parts, -1)
 
 
 def sight(setting: str) -> Tensor:
