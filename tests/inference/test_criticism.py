@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from few_reaches import robot_of_few_reaches
 from paths import ROOT
 
 import mirror_ppl
@@ -12,6 +13,7 @@ from mirror_ppl.inference.results import criticism
 from mirror_ppl.inference.results.criticism import base_rate, no_implants, verdict
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.inference.results.summary import predictive
+from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds
@@ -80,7 +82,7 @@ def test_without_rounds_before_the_robot_is_as_its_prior(recordings):
 @pytest.fixture(scope="module")
 def late():
     """Of two people of the prior, seed 100, one always acts on the belief of the step before."""
-    self_model = load_self_model(shipped_weights("driving"))[0]
+    self_model = robot_of_few_reaches()
     human = load_human_model(f"{ROOT}/docs/examples/late_reactions.py:LatePerson", self_model)
     implants = {name: value[0] for name, value in draw_prior(human, 2, 1, 100).items()}
     implants["late"] = torch.tensor([[0.01], [0.99]])
@@ -88,7 +90,8 @@ def late():
 
 
 def test_a_fit_says_who_is_late(late):
-    fit = mirror_ppl.infer(late, engine="importance", seed=1)
+    human = HumanModel(robot_of_few_reaches())
+    fit = mirror_ppl.infer(late, human=human, engine="importance", seed=1)
     check = fit.check
     assert list(check.index) == ["person-01", "person-02"]
     assert check["verdict"].iloc[0] == "ok"

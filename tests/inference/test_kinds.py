@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from few_reaches import robot_of_few_reaches
 
 from mirror_ppl.inference import importance
 from mirror_ppl.inference.engine import Job
@@ -17,7 +18,7 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 @pytest.fixture(scope="module")
 def job():
-    human = AnyKind(load_self_model(shipped_weights("driving"), "driving")[0])
+    human = AnyKind(robot_of_few_reaches())
     rounds = simulate_from_prior(human, 1, 2, "fog", 100)
     return Job(human, rounds, 200, importance.ImportanceOptions(), 1, Screening())
 

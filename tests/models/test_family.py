@@ -4,6 +4,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from few_reaches import robot_of_few_reaches
 
 import mirror_ppl
 from mirror_ppl.communication import (
@@ -54,6 +55,11 @@ def self_model(world):
 @pytest.fixture(scope="module")
 def driving():
     return self_model("driving")
+
+
+@pytest.fixture(scope="module")
+def few_reaches():
+    return robot_of_few_reaches()
 
 
 def beliefs(human, world):
@@ -254,20 +260,20 @@ def of_kind(human, seed, rounds=6, **known):
         ("forgetting", Forgetting, 6, {"consistency": 4.0, FORGETS: 0.7}),
     ],
 )
-def test_kinds_are_distinguished(driving, kind, model, rounds, known):
-    recordings = of_kind(model(driving), 100, rounds, **known).select_people([0])
+def test_kinds_are_distinguished(few_reaches, kind, model, rounds, known):
+    recordings = of_kind(model(few_reaches), 100, rounds, **known).select_people([0])
     options = InferenceOptions("importance", 100, ImportanceOptions(proposals=256, enough=100))
-    found = infer(AnyKind(driving), recordings, options, 1)
+    found = infer(AnyKind(few_reaches), recordings, options, 1)
     own = (found.draws[KIND][:, :, 0] == list(KINDS).index(kind)).float().mean(0)
     assert (own > 0.5).all(), own
     assert (found.pareto_k < 0.7).all()
 
 
-def test_a_fit_reports_the_probability_of_each_model(driving):
-    recordings = of_kind(Late(driving), 100, 8, **{LATE: 0.95, "consistency": 4.0})
+def test_a_fit_reports_the_probability_of_each_model(few_reaches):
+    recordings = of_kind(Late(few_reaches), 100, 8, **{LATE: 0.95, "consistency": 4.0})
     few = {"settings": {"proposals": 256, "enough": 100}, "draws": 100, "explore": 0}
     one = recordings.select_people([0])
-    fit = mirror_ppl.infer(one, human="all", engine="importance", **few, seed=1)
+    fit = mirror_ppl.infer(one, human=AnyKind(few_reaches), engine="importance", **few, seed=1)
     for number, person in enumerate(fit.summary["people"]):
         models = person["check"]["models"]
         assert list(models) == list(KINDS) and sum(models.values()) == pytest.approx(1)
@@ -278,9 +284,9 @@ def test_a_fit_reports_the_probability_of_each_model(driving):
 
 
 @pytest.mark.parametrize("known", [{SHARES_GOAL: -0.8}, {SHARES_GOAL: 1.0}])
-def test_what_few_kinds_of_people_could_have_seen_is_not_given_up(driving, known):
+def test_what_few_kinds_of_people_could_have_seen_is_not_given_up(few_reaches, known):
     """Policies of each kind tell what is given up; of few drawn from all, most are mirror's."""
-    human, everybody = Preferring(driving), AnyKind(driving)
+    human, everybody = Preferring(few_reaches), AnyKind(few_reaches)
     implants = {name: value[0] for name, value in draw_prior(human, 1, 1, 100).items()}
     implants |= {name: torch.full((1, 1), value) for name, value in known.items()}
     rounds = play_rounds(human, implants, 12, "fog", torch.Generator().manual_seed(100))
@@ -306,7 +312,7 @@ def test_what_is_stratified_by_has_to_be_discrete(driving):
 def test_without_rounds_what_is_known_is_the_prior(world, name):
     human = load_human_model(name, self_model(world))
     rounds = simulate_from_prior(human, 1, 2, seed=1)
-    fit = mirror_ppl.infer(rounds, human=human, train_rounds=0)
+    fit = mirror_ppl.infer(rounds, human=human, train_rounds=0, draws=200, explore=0)
     assert fit.summary["people"][0]["rounds"] == 0
     assert abs(fit.summary["people"][0]["log_evidence"]) < 0.05  # an average of weights
     assert fit.summary["people"][0]["check"]["verdict"] == "unchecked"
@@ -315,15 +321,15 @@ def test_without_rounds_what_is_known_is_the_prior(world, name):
         fit.plot.check()
 
 
-def test_evidence_is_of_actions_alone(driving):
+def test_evidence_is_of_actions_alone(few_reaches):
     class Asked(HumanModel):
         def prior(self):
             implants = super().prior()
             pyro.sample("asked", dist.Normal(implants["consistency"], 0.5), obs=torch.tensor(3.0))
             return implants
 
-    rounds = of_kind(HumanModel(driving), 100)
-    fit = mirror_ppl.infer(rounds, human=Asked(driving), engine="importance")
+    rounds = of_kind(HumanModel(few_reaches), 100)
+    fit = mirror_ppl.infer(rounds, human=Asked(few_reaches), engine="importance")
     assert fit.summary["people"][0]["log_evidence"] is None
 
 

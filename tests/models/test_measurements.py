@@ -8,6 +8,7 @@ import pyro.distributions as dist
 import pytest
 import torch
 from example_person import self_model
+from few_reaches import robot_of_few_reaches
 from test_one_program import recordings
 
 import mirror_ppl
@@ -77,7 +78,7 @@ def test_each_person_has_their_own(engine):
     settings = SVIOptions(steps=150) if engine == "svi" else None
     options = InferenceOptions(engine, 100, settings)
     some = measured(rounds, questionnaire=answers)
-    draws = infer(Asked(driving()), some, options, 0).draws
+    draws = infer(Asked(robot_of_few_reaches()), some, options, 0).draws
     medians = draws["consistency"].median(0).values.flatten().tolist()
     # The mean-field guide has not quite arrived after so few steps.
     for answer, median in zip(answers, medians, strict=True):
@@ -86,12 +87,6 @@ def test_each_person_has_their_own(engine):
     assert (draws["questionnaire"][:, 1] == 5.0).all()
     if engine == "importance":  # of two sites that hang together, a mean-field guide is too sure
         assert draws["questionnaire"][:, 2].std() > 0.1
-
-
-def driving():
-    from mirror_ppl.models.weights import load_self_model, shipped_weights
-
-    return load_self_model(shipped_weights("driving"))[0]
 
 
 def test_batches_are_of_people_of_whom_the_same_is_known():
@@ -104,7 +99,8 @@ def test_batches_are_of_people_of_whom_the_same_is_known():
 def test_a_fit_holds_what_was_measured(tmp_path):
     rounds = measured(simulate("driving", "fog", "paper", 2, 3, 100), questionnaire=[2.0, 4.0])
     save_demonstrations(tmp_path / "asked.nc", rounds)
-    fit = mirror_ppl.infer(tmp_path / "asked.nc", human=Asked, draws=20, explore=0)
+    human = Asked(robot_of_few_reaches())
+    fit = mirror_ppl.infer(tmp_path / "asked.nc", human=human, draws=20, explore=0)
     assert fit.person("person-02").implants.loc["questionnaire", "median"] == 4.0
     assert fit.person("person-02").implants.loc["consistency", "median"] == pytest.approx(
         4, abs=0.1
