@@ -108,15 +108,15 @@ def by_combination(human, rounds, draws):
                 chance = chance + time * torch.log1p(-p)
             values = {"guess": guess, **{f"found_{k}": time for k, time in enumerate(found)}}
             attention = {name: torch.tensor([value]) for name, value in values.items()}
-            each = []
-            for draw in range(number):
-                sites = {"reads_type": draws["reads_type"][draw, 0], **attention}
+            each = torch.zeros(number, steps, len(WORLD.actions))
+            for reads in (0, 1):  # all that a belief depends on, besides attention
+                sites = {"reads_type": torch.tensor([reads]), **attention}
                 belief = gone_through(human, sites, seen, heard, actions[:, :steps])
-                own = {name: value[draw : draw + 1] for name, value in draws.items()}
-                with conditioned(own, 1, 1):
+                rows = (draws["reads_type"].flatten() == reads).nonzero().flatten()
+                own = {name: value[rows] for name, value in draws.items()}
+                with conditioned(own, len(rows), 1):
                     found_here = human.act(human.prior(), belief, human.action_values(belief))
-                each.append(found_here[0, 0])
-            each = torch.stack(each)  # [S, t, A]
+                each[rows] = found_here[:, 0]
             done = each.gather(-1, actions[:, :steps, None].expand(number, -1, 1)).squeeze(-1)
             before = done.cumsum(-1) - done
             along.append((chance[:, None] + before)[..., None] + each)
