@@ -110,6 +110,8 @@ def _import_libraries() -> None:
     from xarray.backends import list_engines
 
     list_engines()
+    with suppress(ImportError):  # which xarray imports where it is installed
+        import dask.array  # noqa: F401 # pyright: ignore[reportMissingImports]
 
 
 def _read(

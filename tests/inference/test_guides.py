@@ -59,8 +59,13 @@ def recordings(toy):
 
 
 @pytest.fixture(scope="module")
-def network(toy):
-    return train_guide(toy, TRAINING, seed=0)[0]
+def trained(toy):
+    return train_guide(toy, TRAINING, seed=0)
+
+
+@pytest.fixture(scope="module")
+def network(trained):
+    return trained[0]
 
 
 def options_of(guide):
@@ -311,8 +316,8 @@ def test_evidence_adds_up_by_hand(toy, recordings):
     torch.testing.assert_close(evidence.log_evidence, exact, atol=1e-3, rtol=0)
 
 
-def test_a_guide_learns_and_starts_at_the_prior_s_place(toy):
-    guide, quality = train_guide(toy, TRAINING, seed=1)
+def test_a_guide_learns_and_starts_at_the_prior_s_place(trained):
+    guide, quality = trained
     assert quality["learned"] == pytest.approx(quality["prior_loss"] - quality["loss"])
     assert quality["learned"] > 0.3
     place = guide.density(torch.zeros(64), torch.tensor(0)).sample((2000,))

@@ -76,11 +76,11 @@ def test_rounds_can_be_added(recordings):
 
 @pytest.mark.parametrize("engine", ["svi", "nuts"])
 def test_the_program_of_a_user_is_run(engine, recordings):
-    settings = SVIOptions(steps=250) if engine == "svi" else NUTSOptions(warmup=60)
-    options = InferenceOptions(engine, 150, settings)
+    settings = SVIOptions(steps=250) if engine == "svi" else NUTSOptions(warmup=30)
+    options = InferenceOptions(engine, 60, settings)
     found = infer(Asked(self_model()), recordings, options, 0).draws["in_sight"].flatten()
     # Draws of a chain depend on each other: as many as a third of them count.
-    error = 0.03 if engine == "svi" else 4 * float(found.std()) / math.sqrt(50)
+    error = 0.03 if engine == "svi" else 4 * float(found.std()) / math.sqrt(20)
     assert abs(found.mean() - exact_mean("factor", recordings, self_model())) < error
 
 
@@ -101,7 +101,7 @@ def test_pyro_infers_it_too(recordings):
             human.model,
             guide,
             pyro.optim.Adam({"lr": 0.05}),
-            Trace_ELBO(4, vectorize_particles=False),
+            Trace_ELBO(2, vectorize_particles=False),
         )
         for _ in range(200):
             svi.step(recordings)
@@ -194,7 +194,7 @@ def two_people(recordings):
 
 def test_what_ties_people_together_is_of_nobody_alone(recordings, monkeypatch):
     two = two_people(recordings)
-    found = infer(Tied(self_model()), two, InferenceOptions("nuts", 30, NUTSOptions(30)), 0)
+    found = infer(Tied(self_model()), two, InferenceOptions("nuts", 20, NUTSOptions(15)), 0)
     first, second = found.draws["in_sight"].squeeze(-1).T
     assert (first - second).abs().mean() < 0.1  # .3 without the factor
     compiled = compile(Tied(self_model()), two)
