@@ -201,7 +201,7 @@ plot_ecdf(calibration)
 # Actions may be odd because of sight or because of the policy. The mutual information of the two
 # in the posterior measures how much of the entropy of sight they share. The model also simulates
 # further rounds in each scenario and reports the expected information gain. `python -m
-# mirror_ppl.fit` writes this picture as `open.png`.
+# mirror_ppl.fit` writes this picture as `identifiability.png`.
 
 # %%
 some = recordings.select_people(recordings.people[: 2 if quick else 5])

@@ -25,8 +25,8 @@ COPIES = 4
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
-InferenceData), summary.json, pictures of what they see, check.png and open.png. A fit that is
-stopped goes on from its checkpoint when the same command is given again."""
+InferenceData), summary.json, pictures of what they see, check.png and identifiability.png. A fit
+that is stopped goes on from its checkpoint when the same command is given again."""
 EXAMPLES = {
     "ten simulated people who differ in what they see": (
         "--setting fog --population diverse --out runs/diverse"

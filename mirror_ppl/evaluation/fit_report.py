@@ -68,8 +68,8 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
             "odds with what they did, or far from the prior; their posterior is coarse"
         )
     _show_checks(people, model_name(summary.get("human_model", "")))
-    opened = [person["identifiability"] for person in people if "identifiability" in person]
-    _show_entropy(opened, sites)
+    identified = [person["identifiability"] for person in people if "identifiability" in person]
+    _show_entropy(identified, sites)
     tested = [person["test"] for person in people if person["test"]]
     if not tested:
         print("No rounds were held out, so predictions are not scored (--train-rounds)")
@@ -205,14 +205,14 @@ def _show_entropy(people: list[dict[str, Any]], sites: Iterable[str]) -> None:
         return
     entropy, shared = (
         sum(person[part]["together"] for person in people) / len(people)
-        for part in ("open", "hangs_on_policy")
+        for part in ("entropy", "shared_with_policy")
     )
     expected = {
         name: sum(person["scenarios"][name]["expected"] for person in people) / len(people)
         for name in people[0]["scenarios"]
     }
     best = max(expected, key=lambda name: expected[name], default="")
-    amounts = [person["open"]["together"] for person in people]
+    amounts = [person["entropy"]["together"] for person in people]
     amounts += [one["expected"] for person in people for one in person["scenarios"].values()]
     if max(amounts) < NEGLIGIBLE:
         noticing = any(name.startswith(NOTICES) for name in sites)

@@ -16,8 +16,8 @@ from mirror_ppl.plots.picture import Picture
 if TYPE_CHECKING:
     import arviz as az
 
-OPEN, CHECK = "open.png", "check.png"
-FILES = (*sight.FILES, CHECK, OPEN)
+IDENTIFIABILITY, CHECK = "identifiability.png", "check.png"
+FILES = (*sight.FILES, CHECK, IDENTIFIABILITY)
 """Names of all picture files that a fit may write."""
 
 
@@ -99,14 +99,14 @@ class FitPlots:
             pictures[CHECK] = self.check(), "whether the model explains each person"
         if self._has_identifiability():
             shows = "posterior entropy of what they see, and the most informative scenarios"
-            pictures[OPEN] = plot_identifiability(self.data), shows
+            pictures[IDENTIFIABILITY] = plot_identifiability(self.data), shows
         return pictures
 
     def _has_identifiability(self) -> bool:
         if "identifiability" not in self.data.groups():
             return False
         group = self.data["identifiability"]
-        found = [group[name].values for name in ("open_together", "information")]
+        found = [group[name].values for name in ("entropy_together", "information")]
         return any((values >= NEGLIGIBLE).any() for values in found)
 
     def _of_rounds(self, name: str) -> Callable[..., Picture]:

@@ -48,8 +48,8 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
     rows = np.arange(len(people))
     left = np.zeros(len(people))
     for number, site in enumerate(sites):
-        whole = group["open"].sel(site=site).values
-        hanging = group["hangs_on_policy"].sel(site=site).values
+        whole = group["entropy"].sel(site=site).values
+        hanging = group["shared_with_policy"].sel(site=site).values
         colour = COLOURS[number % len(COLOURS)]
         axes[0].barh(rows, whole, 0.75, left, color=colour, lw=0)
         axes[0].barh(rows, hanging, 0.75, left, color="none", hatch="//////", edgecolor=BLACK, lw=0)

@@ -33,7 +33,14 @@ from mirror_ppl.inference.results.fitting import split_rounds
 from mirror_ppl.inference.results.summary import score, summarize
 from mirror_ppl.models.weights import load_self_model
 
-RESULTS = {"check.png", "open.png", "posterior.nc", "samples.png", "sight.png", "summary.json"}
+RESULTS = {
+    "check.png",
+    "identifiability.png",
+    "posterior.nc",
+    "samples.png",
+    "sight.png",
+    "summary.json",
+}
 
 
 def content(folder):

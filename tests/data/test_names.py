@@ -43,7 +43,11 @@ def test_strange_ids_are_fitted_and_shown(some, tmp_path, capsys):
     shown = capsys.readouterr().out
     for name in STRANGE[:-1]:
         assert f"│ {name} " in shown
-    assert {path.name for path in fits[0].iterdir()} >= {"sight.png", "samples.png", "open.png"}
+    assert {path.name for path in fits[0].iterdir()} >= {
+        "sight.png",
+        "samples.png",
+        "identifiability.png",
+    }
     figure = tmp_path / "x.svg"
     assert command(compare, *fits, "--by", "heldout", "--figure", figure) == 0
     assert figure.read_text().startswith("<?xml")

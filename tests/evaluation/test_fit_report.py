@@ -87,8 +87,8 @@ def test_people_whom_the_model_does_not_explain_are_reported_with_reasons(capsys
 def test_posterior_entropy_and_the_most_informative_scenario_are_printed(capsys):
     def opened(entropy, expected):
         return {
-            "open": {"together": entropy},
-            "hangs_on_policy": {"together": 0.5},
+            "entropy": {"together": entropy},
+            "shared_with_policy": {"together": 0.5},
             "scenarios": {"one car": {"expected": 0.1}, "two cars": {"expected": expected}},
         }
 
@@ -113,7 +113,7 @@ def test_people_who_notice_things_have_no_reach(capsys):
     some = person(1)
     some["implants"] = {"notices_terminal 1": some["implants"]["consistency"]}
     nothing = {"together": 0.0}
-    some["identifiability"] = {"open": nothing, "hangs_on_policy": nothing, "scenarios": {}}
+    some["identifiability"] = {"entropy": nothing, "shared_with_policy": nothing, "scenarios": {}}
     out = shown(capsys, people=[some])
     assert "perceptual implants: none, not counting how soon they notice things" in out
     assert "What each person notices (probability at a step) and" in shown(capsys, people=[some])

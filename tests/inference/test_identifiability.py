@@ -211,7 +211,9 @@ def test_twenty_rounds_leave_less_entropy_than_one(toy):
     assert (found[0].all_shared <= found[0].all_entropy).all()
     told = found[1].of(0, human.domain.scenarios)
     assert list(told["scenarios"]) == list(human.domain.scenarios)
-    assert told["open"].keys() == told["hangs_on_policy"].keys() == {*found[1].sites, "together"}
+    assert (
+        told["entropy"].keys() == told["shared_with_policy"].keys() == {*found[1].sites, "together"}
+    )
 
 
 @pytest.mark.parametrize("explored", [0, 2])
@@ -226,9 +228,9 @@ def test_the_picture(toy, rounds, draws, explored, tmp_path):
         coords={"person": list(rounds.people)},
     )
     add_identifiability(data, found, {"domain": "driving"})
-    assert data["identifiability"]["open"].dims == ("person", "site")
+    assert data["identifiability"]["entropy"].dims == ("person", "site")
     figure = plot_identifiability(data)
     assert len(figure.axes) == 1 + bool(explored)
     bars = [patch.get_width() for patch in figure.axes[0].patches]
     assert bars[:3] == pytest.approx(found.entropy[:, 0].tolist())
-    figure.save(tmp_path / "open.png")
+    figure.save(tmp_path / "identifiability.png")

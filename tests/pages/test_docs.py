@@ -307,7 +307,7 @@ def results(tmp_path_factory):
 def test_the_commands_of_the_readme_write_what_it_says(results):
     demo = results / "runs" / "demo"
     names = {path.name for path in demo.iterdir()}
-    pictures = {"sight.png", "samples.png", "check.png", "open.png"}
+    pictures = {"sight.png", "samples.png", "check.png", "identifiability.png"}
     assert names == pictures | {"posterior.nc", "summary.json"}
     assert all(f"`{name}`" in page("README.md").replace("runs/demo/", "") for name in names)
 

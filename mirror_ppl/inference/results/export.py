@@ -110,10 +110,10 @@ def add_identifiability(
     scenarios = list(domain.scenarios)[: found.information.shape[1]]
     by_site, by_scenario = ("person", "site"), ("person", "scenario")
     variables = {
-        "open": (by_site, found.entropy),
-        "hangs_on_policy": (by_site, found.shared),
-        "open_together": (("person",), found.all_entropy),
-        "hangs_on_policy_together": (("person",), found.all_shared),
+        "entropy": (by_site, found.entropy),
+        "shared_with_policy": (by_site, found.shared),
+        "entropy_together": (("person",), found.all_entropy),
+        "shared_with_policy_together": (("person",), found.all_shared),
         "information": (by_scenario, found.information),
         "information_error": (by_scenario, found.information_error),
     }

@@ -101,9 +101,9 @@ class Identifiability:
             part[person].tolist() for part in (self.information, self.information_error)
         )
         return {
-            "open": dict(zip(self.sites, entropy, strict=True))
+            "entropy": dict(zip(self.sites, entropy, strict=True))
             | {"together": float(self.all_entropy[person])},
-            "hangs_on_policy": dict(zip(self.sites, shared, strict=True))
+            "shared_with_policy": dict(zip(self.sites, shared, strict=True))
             | {"together": float(self.all_shared[person])},
             "scenarios": {
                 name: {"expected": expected, "error": None if math.isnan(error) else error}
@@ -190,7 +190,7 @@ def identify(
                 rounds,
                 generator,
             )
-        found.append((*_open(weights, grid), *told))
+        found.append((*_entropies(weights, grid), *told))
     report("identify", people, people, "people")
     return Identifiability(tuple(sizes), *(torch.stack(part) for part in zip(*found, strict=True)))
 
@@ -213,16 +213,18 @@ def _instead_of_prior(
     return total
 
 
-def _open(weights: Tensor, grid: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _entropies(
+    weights: Tensor, grid: Mapping[str, Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Entropies and their parts shared with policy, of each site ``[D]`` and of all jointly."""
-    open_, shared = [], []
+    entropy, shared = [], []
     for value in grid.values():
         values = value.unique()
         member = (value[:, None] == values).to(weights)
         pair = _entropy_and_shared(weights.exp() @ member)
-        open_.append(pair[0])
+        entropy.append(pair[0])
         shared.append(pair[1])
-    return torch.stack(open_), torch.stack(shared), *_entropy_and_shared(weights.exp())
+    return torch.stack(entropy), torch.stack(shared), *_entropy_and_shared(weights.exp())
 
 
 def _entropy_and_shared(probability: Tensor) -> tuple[Tensor, Tensor]:
