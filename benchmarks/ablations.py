@@ -48,7 +48,8 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, save_self_model
 from mirror_ppl.progress import Progress
-from mirror_ppl.training.self_model import SelfModelOptions, train_self_model
+from mirror_ppl.training.self_model import train_self_model
+from mirror_ppl.training.self_model_options import SelfModelOptions
 
 DOMAIN, SETTING = "driving", "fog"
 DRAWS = 200

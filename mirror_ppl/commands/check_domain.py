@@ -54,7 +54,7 @@ def _of_record(world: World) -> list[str]:
     from mirror_ppl.domains.registry import know
     from mirror_ppl.errors import MirrorError
     from mirror_ppl.models.sizes import sizes_of
-    from mirror_ppl.training.self_model import SelfModelOptions
+    from mirror_ppl.training.self_model_options import SelfModelOptions
 
     know(world)
     found = []

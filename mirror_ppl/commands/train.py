@@ -132,7 +132,8 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
     from mirror_ppl.models.sizes import sizes_of
     from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
-    from mirror_ppl.training.self_model import SelfModelOptions, train_self_model
+    from mirror_ppl.training.self_model import train_self_model
+    from mirror_ppl.training.self_model_options import SelfModelOptions
 
     default, *_ = EMBEDDINGS
     if require_known(options.speech, "speech", tuple(EMBEDDINGS)) != default and not any(

@@ -32,7 +32,7 @@ class Record:
     Attributes:
         networks: :class:`~mirror_ppl.models.sizes.Sizes` of the robot that differ in this world.
         paper_networks: sizes that further differ in the supplement, where they cost too much.
-        training: settings of :class:`~mirror_ppl.training.self_model.SelfModelOptions`, by name.
+        training: of :class:`~mirror_ppl.training.self_model_options.SelfModelOptions`, by name.
         planning: settings of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
         baselines: settings of baselines, by the baseline's name: ``bc`` and ``sqil``.
         measured: rounds on which a self-model's returns and agreement are measured.

@@ -18,231 +18,27 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
-from mirror_ppl.domains.record import settings_of
-from mirror_ppl.domains.registry import code_of, get_domain
+from mirror_ppl.domains.registry import code_of
 from mirror_ppl.domains.world import World, offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
-from mirror_ppl.training.experience import Course, Experience, drive, experience
-from mirror_ppl.training.views import (
-    ASSUMPTION_PROBABILITY,
-    KIND_PROBABILITIES,
-    KINDS,
-    draw_views,
-)
+from mirror_ppl.training.experience import Course, drive, experience
+from mirror_ppl.training.self_model_loss import self_model_loss
+from mirror_ppl.training.self_model_options import SelfModelOptions, require_fitting
+from mirror_ppl.training.views import draw_views
 
 VALUED = 1024
 """States of which values are computed at once; bounds memory."""
-
-
-@dataclass(frozen=True)
-class SelfModelOptions:
-    """Settings of self-model training.
-
-    Attributes:
-        phases: number of phases of driving and learning.
-        rounds: rounds driven in a phase.
-        steps: gradient steps of a phase.
-        batch: rounds in a gradient step.
-        learning_rate: initial rate of Adam, annealed to a hundredth on a cosine. The supplement
-            has 3e-4; ``docs/decisions.md`` compares both.
-        beta: probability that the expert drives a round, in the first phase (supplement: 0.5).
-        beta_decay: factor on beta after each phase (supplement: 0.8).
-        epsilon: probability of a random action, in the first phase (supplement: 0.5).
-        epsilon_decay: factor on epsilon after each phase (supplement: 0.75).
-        epsilon_floor: least epsilon; people err more often than a trained policy, and the
-            robot has to know the states that errors lead to.
-        discount: discount of rewards per step.
-        target_rate: rate at which the target network follows the Q-network, per step.
-        world_weight: weight of the negative ELBO per observation.
-        speech_weight: weight of messages in the ELBO; pictures have many more numbers.
-        length: steps of a training round; the domain's horizon if 0.
-        window: steps of these rounds in a gradient step, from a random one on; all of them if 0.
-            What happened is then kept, which takes memory, and not computed again.
-        stride: values are learned at one of every ``stride`` steps; the offset is random, and with
-            ``distil`` the same for all rounds of a phase.
-        difference_weight: weight of errors in the differences between actions, added to the errors
-            themselves. Choices of people depend on these differences alone.
-        choice_weight: weight of the cross entropy, in nats, of choices in proportion to the
-            exponential of learned values, if they were made so by the planner's. Of observers who
-            know all decisive items, and only with ``distil``: others would take what is likely for
-            certain. Errors of values where one action is far better than another hardly count.
-        kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
-        assumed: share of sight views in which each assumption is made. At 0 the robot does not
-            learn what follows from assumptions; imagined items are then like seen ones to it. With
-            ``distil``, the share of all rounds that are kept as one observer who makes assumptions
-            believed them to be, with the planner's values there.
-        at_means: True to learn values at the encoder's means in every step, False to alternate with
-            draws of the guide. Means are exact sooner where decisive items are clearly visible.
-        exact: True to learn the exact planner's values, where there is one, for observers who know
-            all decisive items, instead of bootstrapped values.
-        distil: True to learn the planner's values of the true state in every view: their mean,
-            given what is seen. They are computed once for each driven state; only for planners
-            whose values hold without further observations, and with ``window``. In worlds where
-            left and right are alike, the same rounds are learned from with both exchanged, too.
-    """
-
-    phases: int = 40
-    rounds: int = 2048
-    steps: int = 300
-    batch: int = 64
-    learning_rate: float = 1e-3
-    beta: float = 0.5
-    beta_decay: float = 0.8
-    epsilon: float = 0.5
-    epsilon_decay: float = 0.75
-    epsilon_floor: float = 0.15
-    discount: float = 0.9
-    target_rate: float = 0.01
-    world_weight: float = 0.01
-    speech_weight: float = 1.0
-    length: int = 0
-    window: int = 0
-    stride: int = 1
-    difference_weight: float = 0.0
-    choice_weight: float = 0.0
-    kinds: tuple[float, float, float] = KIND_PROBABILITIES
-    assumed: float = ASSUMPTION_PROBABILITY
-    at_means: bool = False
-    exact: bool = False
-    distil: bool = False
-
-    @classmethod
-    def of(cls, domain: str, **changes: Any) -> Self:
-        """Settings of a domain, with changes.
-
-        Args:
-            domain: name of the domain.
-            changes: settings by name; None keeps the domain's own.
-        """
-        given = {name: value for name, value in changes.items() if value is not None}
-        return cls(**{**settings_of(get_domain(domain).record, "training", cls), **given})
-
-    def __post_init__(self) -> None:
-        for name in ("phases", "rounds", "steps", "batch", "stride"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not 0 < self.learning_rate <= 1:
-            raise ValueError(
-                f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
-            )
-        if self.window < 0 or self.length < 0:
-            raise ValueError("window and length must not be negative")
-        if self.distil and self.exact:
-            raise ValueError("distil and exact are two ways to learn a planner's values")
-        if self.choice_weight and not self.distil:
-            raise ValueError("choice_weight needs distil: choices are those at a planner's values")
-        if self.distil and not self.window:
-            raise ValueError("distil needs a window: values are kept with the states of rounds")
-        if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:
-            raise ValueError(
-                f"kinds must be {len(KINDS)} numbers, not negative and not all 0, not {self.kinds}"
-            )
-        for name in (
-            "beta",
-            "beta_decay",
-            "epsilon",
-            "epsilon_decay",
-            "epsilon_floor",
-            "discount",
-            "assumed",
-        ):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class Loss:
-    """Parts of the loss of one gradient step."""
-
-    total: Tensor
-    negative_elbo: Tensor
-    bellman: Tensor
-
-
-def self_model_loss(
-    self_model: SelfModel,
-    target: torch.nn.Module,
-    lived: Experience,
-    options: SelfModelOptions,
-    on_means: bool,
-) -> Loss:
-    """Loss of a batch of rounds.
-
-    Args:
-        self_model: the model to train.
-        target: target network, the slow copy of its Q-network.
-        lived: rounds and outcomes.
-        options: settings.
-        on_means: True to learn values at the encoder's means, which all other code uses as beliefs;
-            False for draws of the guide, which keep it precise about what values depend on.
-            Training alternates.
-    """
-    rounds = lived.rounds
-    bound, z = self_model.elbo(rounds)
-    batch, steps = rounds.actions.shape
-    negative_elbo = -bound / (batch * (steps + 1))
-    belief = z[:, :-1]
-    if on_means:
-        evidence = self_model.evidence(rounds.observation, rounds.visible, rounds.actions)
-        belief = self_model.believe(evidence[:, :-1])
-    belief = belief[:, lived.steps]
-    goal = (
-        lived.exact if options.distil else _bootstrapped(self_model, target, lived, options, belief)
-    )
-    assert goal is not None
-    # Once a round is over (possibly in every round) actions do not matter.
-    values = self_model.action_values(belief)
-    error = (values - goal)[~lived.over]
-    unlike = error - error.mean(-1, keepdim=True)
-    bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
-    total = options.world_weight * negative_elbo + bellman + options.difference_weight * apart
-    if options.choice_weight:
-        sure = lived.informed & ~lived.over
-        total = total + options.choice_weight * _cross_entropy(goal[sure], values[sure])
-    return Loss(total, negative_elbo.detach(), bellman.detach())
-
-
-def _cross_entropy(goal: Tensor, values: Tensor) -> Tensor:
-    """Return the mean cross entropy of softmax choices at values ``[n, A]``; 0 if n is 0."""
-    each = -(torch.softmax(goal, -1) * torch.log_softmax(values, -1)).sum(-1)
-    return each.mean() if len(each) else each.sum()
-
-
-def _bootstrapped(
-    self_model: SelfModel,
-    target: torch.nn.Module,
-    lived: Experience,
-    options: SelfModelOptions,
-    belief: Tensor,
-) -> Tensor:
-    """Return the goals ``[B, T', A]`` of action values at beliefs ``[B, T', Z]``."""
-    steps = lived.rounds.actions.shape[1]
-    goals = []
-    with torch.no_grad():
-        for action, outcome in enumerate(lived.outcomes):
-            embedded = self_model.encoder.embed(self_model.domain.symbols(outcome.observation))
-            evidence = self_model.encoder.combine(embedded, outcome.visible)
-            evidence = evidence + self_model.encoder.action.weight[action]
-            value = target(self_model.encoder(belief, evidence).mean).amax(-1)
-            over = outcome.over
-            if self_model.domain.over_at_horizon and steps == self_model.domain.horizon:
-                over = over | (torch.arange(steps, device=over.device) == steps - 1)[lived.steps]
-            goals.append(outcome.reward + options.discount * value.masked_fill(over, 0.0))
-    goal = torch.stack(goals, -1)
-    if lived.exact is not None:
-        goal = torch.where(lived.informed[..., None], lived.exact, goal)
-    return goal
 
 
 def train_self_model(
@@ -283,23 +79,6 @@ def train_self_model(
     return trainer.self_model.eval()
 
 
-def _require_fitting(domain: Domain, options: SelfModelOptions) -> None:
-    """Refuse options that do not fit a world.
-
-    Raises:
-        ValueError: a window is longer than rounds, or ends where nothing is known to follow; or
-            assumptions are to be learned that the world does not work out.
-    """
-    rounds = options.length or domain.horizon
-    if options.window > rounds:
-        raise ValueError(f"window is {options.window}, longer than rounds of {rounds} steps")
-    if options.window and domain.over_at_horizon and not options.distil:
-        raise ValueError(f"with a window, values of {domain.name} can only be distilled")
-    works_out = not isinstance(domain, World) or offers(domain, "supposed")
-    if options.assumed and domain.assumptions and not works_out:
-        raise ValueError(f"assumed must be 0, as {domain.name} has no supposed()")
-
-
 class _Trainer:
     """State of a training run, as checkpoints hold it."""
 
@@ -313,7 +92,7 @@ class _Trainer:
         sizes: Sizes,
         kind: type[SelfModel],
     ) -> None:
-        _require_fitting(domain, options)
+        require_fitting(domain, options)
         self.domain = domain
         self.options = options
         self.run_id = {

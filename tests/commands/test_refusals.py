@@ -8,7 +8,7 @@ from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.errors import HumanModelError, OptionError, OutputError
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-from mirror_ppl.training.self_model import SelfModelOptions
+from mirror_ppl.training.self_model_options import SelfModelOptions
 
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf"), 0.0, -1.0, 1e30])

@@ -13,11 +13,9 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import sizes_of
 from mirror_ppl.models.weights import load_self_model
 from mirror_ppl.training.experience import Course, experience
-from mirror_ppl.training.self_model import (
-    SelfModelOptions,
-    self_model_loss,
-    train_self_model,
-)
+from mirror_ppl.training.self_model import train_self_model
+from mirror_ppl.training.self_model_loss import self_model_loss
+from mirror_ppl.training.self_model_options import SelfModelOptions
 from mirror_ppl.training.views import draw_views
 
 WORLD = BombDefusal()

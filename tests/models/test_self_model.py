@@ -17,10 +17,8 @@ from mirror_ppl.evaluation.self_model import (
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.training.experience import Course, drive, experience
-from mirror_ppl.training.self_model import (
-    SelfModelOptions,
-    self_model_loss,
-)
+from mirror_ppl.training.self_model_loss import self_model_loss
+from mirror_ppl.training.self_model_options import SelfModelOptions
 from mirror_ppl.training.views import draw_views
 
 DRIVING = get_domain("driving")

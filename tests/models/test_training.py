@@ -19,12 +19,9 @@ from mirror_ppl.models.sizes import sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
 from mirror_ppl.training import self_model as self_model_training
 from mirror_ppl.training.experience import Course, experience
-from mirror_ppl.training.self_model import (
-    SelfModelOptions,
-    _Trainer,
-    self_model_loss,
-    train_self_model,
-)
+from mirror_ppl.training.self_model import _Trainer, train_self_model
+from mirror_ppl.training.self_model_loss import self_model_loss
+from mirror_ppl.training.self_model_options import SelfModelOptions
 from mirror_ppl.training.views import draw_views
 
 DRIVING = get_domain("driving")

@@ -39,7 +39,7 @@ from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import populations_of
 from mirror_ppl.training import views as training_views
-from mirror_ppl.training.self_model import SelfModelOptions
+from mirror_ppl.training.self_model_options import SelfModelOptions
 
 TOP = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")
 PAGES = [*(ROOT / name for name in TOP), *sorted((ROOT / "docs").glob("*.md"))]

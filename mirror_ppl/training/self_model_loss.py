@@ -1,0 +1,96 @@
+"""The loss of self-model training, of rounds under views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.training.experience import Experience
+from mirror_ppl.training.self_model_options import SelfModelOptions
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Parts of the loss of one gradient step."""
+
+    total: Tensor
+    negative_elbo: Tensor
+    bellman: Tensor
+
+
+def self_model_loss(
+    self_model: SelfModel,
+    target: torch.nn.Module,
+    lived: Experience,
+    options: SelfModelOptions,
+    on_means: bool,
+) -> Loss:
+    """Loss of a batch of rounds.
+
+    Args:
+        self_model: the model to train.
+        target: target network, the slow copy of its Q-network.
+        lived: rounds and outcomes.
+        options: settings.
+        on_means: True to learn values at the encoder's means, which all other code uses as beliefs;
+            False for draws of the guide, which keep it precise about what values depend on.
+            Training alternates.
+    """
+    rounds = lived.rounds
+    bound, z = self_model.elbo(rounds)
+    batch, steps = rounds.actions.shape
+    negative_elbo = -bound / (batch * (steps + 1))
+    belief = z[:, :-1]
+    if on_means:
+        evidence = self_model.evidence(rounds.observation, rounds.visible, rounds.actions)
+        belief = self_model.believe(evidence[:, :-1])
+    belief = belief[:, lived.steps]
+    goal = (
+        lived.exact if options.distil else _bootstrapped(self_model, target, lived, options, belief)
+    )
+    assert goal is not None
+    # Once a round is over (possibly in every round) actions do not matter.
+    values = self_model.action_values(belief)
+    error = (values - goal)[~lived.over]
+    unlike = error - error.mean(-1, keepdim=True)
+    bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
+    total = options.world_weight * negative_elbo + bellman + options.difference_weight * apart
+    if options.choice_weight:
+        sure = lived.informed & ~lived.over
+        total = total + options.choice_weight * _cross_entropy(goal[sure], values[sure])
+    return Loss(total, negative_elbo.detach(), bellman.detach())
+
+
+def _cross_entropy(goal: Tensor, values: Tensor) -> Tensor:
+    """Return the mean cross entropy of softmax choices at values ``[n, A]``; 0 if n is 0."""
+    each = -(torch.softmax(goal, -1) * torch.log_softmax(values, -1)).sum(-1)
+    return each.mean() if len(each) else each.sum()
+
+
+def _bootstrapped(
+    self_model: SelfModel,
+    target: torch.nn.Module,
+    lived: Experience,
+    options: SelfModelOptions,
+    belief: Tensor,
+) -> Tensor:
+    """Return the goals ``[B, T', A]`` of action values at beliefs ``[B, T', Z]``."""
+    steps = lived.rounds.actions.shape[1]
+    goals = []
+    with torch.no_grad():
+        for action, outcome in enumerate(lived.outcomes):
+            embedded = self_model.encoder.embed(self_model.domain.symbols(outcome.observation))
+            evidence = self_model.encoder.combine(embedded, outcome.visible)
+            evidence = evidence + self_model.encoder.action.weight[action]
+            value = target(self_model.encoder(belief, evidence).mean).amax(-1)
+            over = outcome.over
+            if self_model.domain.over_at_horizon and steps == self_model.domain.horizon:
+                over = over | (torch.arange(steps, device=over.device) == steps - 1)[lived.steps]
+            goals.append(outcome.reward + options.discount * value.masked_fill(over, 0.0))
+    goal = torch.stack(goals, -1)
+    if lived.exact is not None:
+        goal = torch.where(lived.informed[..., None], lived.exact, goal)
+    return goal
