@@ -21,6 +21,7 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.communication.tracking import Tracks
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import AttentionValues, Proposal
@@ -72,6 +73,7 @@ class Person:
         self.device = next(iter(self.draws.values())).device
         self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
         self.percept_count = int(self.percept.max()) + 1
+        self._tracks = Tracks()
 
     def _distinct_percepts(
         self, values: Mapping[str, Tensor], number: int
@@ -153,9 +155,7 @@ class Person:
         percept = self.percept[:, None] * number + torch.arange(
             number, device=self.device
         )  # [S, G]
-        before = BeliefState.initial(self.human, everybody.percept_count)
-        steps = transitions(everybody, past)
-        for time, state in enumerate(before.through(steps) if steps else ()):
+        for time, state in enumerate(everybody.states(past)):
             mean = state.mean[None]
             acted = past.actions[time].expand(1, mean.shape[1])
             with self._conditioned():
@@ -190,6 +190,16 @@ class Person:
         """Return the action before a step of a round; the number of actions before the first."""
         return int(past.actions[time - 1]) if time else len(self.human.domain.actions)
 
+    def states(self, past: RoundSoFar) -> list[BeliefState]:
+        """Return beliefs of every percept after each step of a round, before its present step.
+
+        If an earlier part of the round was asked for before, they go on from there.
+        """
+        initial = BeliefState.initial(self.human, self.percept_count)
+        return self._tracks.through(
+            self.percepts, past, initial, lambda first: transitions(self, past, first)
+        )
+
     def act(self, belief: Tensor, values: Tensor) -> Tensor:
         """Return log-probabilities ``[S, M, A]`` of actions at M beliefs of each draw.
 
@@ -202,8 +212,8 @@ class Person:
         return result.expand(self.number, *result.shape[1:])[:, 0]
 
 
-def transitions(person: Person, past: RoundSoFar) -> list[Transition]:
-    """Return the transitions of every percept through a round, before its present step."""
+def transitions(person: Person, past: RoundSoFar, first: int = 0) -> list[Transition]:
+    """Return the transitions of every percept through a round from a step on, up to its present."""
     every = torch.arange(person.percept_count, device=person.device)
     return [
         person.transition(
@@ -212,7 +222,7 @@ def transitions(person: Person, past: RoundSoFar) -> list[Transition]:
             {name: value[time, None] for name, value in past.observation.items()},
             {name: mask[time, None] for name, mask in past.told.items()},
         )
-        for time in range(past.time)
+        for time in range(first, past.time)
     ]
 
 
@@ -236,9 +246,8 @@ class PlanningContext:
     def of(cls, person: Person, past: RoundSoFar) -> PlanningContext:
         """Return the context of a person at this point of a round."""
         person = person.in_round(past)
-        state = BeliefState.initial(person.human, person.percept_count)
-        if past.time:
-            state = state.through(transitions(person, past))[-1]
+        states = person.states(past)
+        state = states[-1] if states else BeliefState.initial(person.human, person.percept_count)
         return cls(person, past, *state.distinct())
 
     @property
