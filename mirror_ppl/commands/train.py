@@ -50,7 +50,7 @@ class Options:
     one, of driving 40, of search_rescue 400, of bomb_defusal 200 and of highway 12."""
     steps: int | None = None
     """Of a self-model: gradient steps of a phase. Default: of driving 300,
-    of search_rescue 40, of bomb_defusal 30, of highway 650."""
+    of search_rescue 40, of bomb_defusal 30, of highway 1000."""
     learning_rate: float | None = None
     """Of a self-model: learning rate at the start; it falls to a hundredth. Default: of driving
     and highway 0.001, of the others 0.002."""

@@ -190,10 +190,12 @@ class Person:
         """Return the action before a step of a round; the number of actions before the first."""
         return int(past.actions[time - 1]) if time else len(self.human.domain.actions)
 
+    @torch.no_grad()
     def states(self, past: RoundSoFar) -> list[BeliefState]:
         """Return beliefs of every percept after each step of a round, before its present step.
 
-        If an earlier part of the round was asked for before, they go on from there.
+        Beliefs of the steps before are kept from one call to the next; the parameters of the human
+        model must not change in between.
         """
         initial = BeliefState.initial(self.human, self.percept_count)
         return self._tracks.through(

@@ -1,10 +1,10 @@
-"""Beliefs of a person along a round: at its next step they go on from where they were."""
+"""Tracks beliefs along a round that grows, one step at a time."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,8 +13,8 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.row_hashing import distinct_rows
 
-ROUNDS = 4
-"""Rounds, or sets of percepts in a round, that are kept."""
+TRACKS = 4
+"""Number of tracks that are kept: of different rounds, or sets of percepts."""
 PERCEPTS = 4096
 """Maximum number of percepts that are kept; bounds memory."""
 
@@ -35,24 +35,41 @@ class Track:
     past: RoundSoFar
     states: Sequence[BeliefState]
 
-    def of(self, sites: Sequence[str], percepts: Tensor, past: RoundSoFar) -> list[BeliefState]:
-        """Return the states of percepts ``[u, sites]`` along a round, as far as they are known."""
+    def leads_to(self, past: RoundSoFar) -> bool:
+        """True if beliefs after these steps are those after the first steps of another round."""
         steps = len(self.states)
-        if sites != self.sites or steps > past.time or not _begins(past, self.past, steps):
-            return []
+        if steps > past.time:
+            return False
+        pairs = [(self.past.actions[: steps - 1], past.actions[: steps - 1])]
+        for mine, its in ((self.past.observation, past.observation), (self.past.told, past.told)):
+            pairs += [(part[:steps], its[name][:steps]) for name, part in mine.items()]
+        return all(torch.equal(one, other) for one, other in pairs)
+
+    def of(self, percepts: Tensor) -> list[BeliefState] | None:
+        """Return the states of percepts ``[u, sites]``; None if some of them were not tracked."""
+        if torch.equal(percepts, self.percepts):
+            return list(self.states)
         _, numbers = distinct_rows(torch.cat([self.percepts, percepts]))
         known, wanted = numbers[: len(self.percepts)], numbers[len(self.percepts) :]
         place = torch.full_like(numbers, -1)
         place[known] = torch.arange(len(known), device=known.device)
         own = place[wanted]
-        return [] if (own < 0).any() else [state.at(own) for state in self.states]
+        return None if (own < 0).any() else [state.at(own) for state in self.states]
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """A cache of tracks; what it returns depends on it by rounding alone."""
+    """A cache of tracks.
 
-    kept: deque[Track] = field(default_factory=lambda: deque(maxlen=ROUNDS))
+    Cached and recomputed beliefs agree up to floating-point rounding. Copies in other processes
+    begin empty.
+    """
+
+    kept: list[Track] = field(default_factory=list)
+
+    def __reduce__(self) -> tuple[type[Tracks], tuple[()]]:
+        """Leave out what is kept, which can be computed again."""
+        return Tracks, ()
 
     def through(
         self,
@@ -72,20 +89,31 @@ class Tracks:
         sites = sorted(percepts)
         none = initial.belief.new_zeros(len(initial.belief))
         rows = torch.stack([percepts[name].long() for name in sites] or [none], -1)
-        # The latest first, as it knows most of a round.
-        known = (track.of(sites, rows, past) for track in reversed(self.kept))
-        states = max(known, key=len, default=[])
+        track, states = self._longest(sites, rows, past)
         further = transitions(len(states))
         if further:
             states = [*states, *(states[-1] if states else initial).through(further)]
+            if track is not None and len(track.percepts) == len(rows):
+                self.kept[:] = [one for one in self.kept if one is not track]
             if len(rows) <= PERCEPTS:
-                self.kept.append(Track(sites, rows, past, states))
+                own = RoundSoFar(*(_copied(part) for part in vars(past).values()))
+                self.kept[:] = [*self.kept, Track(sites, rows, own, states)][-TRACKS:]
         return states
 
+    def _longest(
+        self, sites: Sequence[str], percepts: Tensor, past: RoundSoFar
+    ) -> tuple[Track | None, list[BeliefState]]:
+        """Return the track that knows most of a round, and the states of percepts there."""
+        for track in sorted(self.kept, key=lambda one: -len(one.states)):
+            if track.sites == sites and track.leads_to(past):
+                states = track.of(percepts)
+                if states is not None:
+                    return track, states
+        return None, []
 
-def _begins(past: RoundSoFar, other: RoundSoFar, steps: int) -> bool:
-    """True if the first steps of two rounds are equal in all that beliefs after them depend on."""
-    pairs = [(past.actions[: steps - 1], other.actions[: steps - 1])]
-    for mine, its in ((past.observation, other.observation), (past.told, other.told)):
-        pairs += [(part[:steps], its[name][:steps]) for name, part in mine.items()]
-    return all(torch.equal(one, two) for one, two in pairs)
+
+def _copied(part: Any) -> Any:
+    """Return a copy, so that buffers that a caller uses again do not change what is kept."""
+    if isinstance(part, Tensor):
+        return part.clone()
+    return {name: value.clone() for name, value in part.items()}

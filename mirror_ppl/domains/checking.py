@@ -48,7 +48,7 @@ CAPABILITIES = (
     Capability("deed", "the action's name", "actions in words"),
     Capability("render", "a table of numbers", "pictures of states"),
     Capability("reference_values", "left out", "an expert; exact agreement; advice"),
-    Capability("reflected", "left out", "twice the rounds, where left and right are alike"),
+    Capability("reflected", "left out", "with `distil`, twice the rounds: mirror images"),
 )
 
 
@@ -259,7 +259,30 @@ def _looks(world: World) -> list[str]:
         values = _call(world, "reference_values", along, 0.9)
         wanted = (*shape, len(world.actions))
         found.append(_fault("reference_values", "", values, wanted, float))
+    if offers(world, "reflected"):
+        found += _faults_of_reflection(world, along, observation)
     return [fault for fault in found if fault] or _of_one(world, along, observation)
+
+
+def _faults_of_reflection(
+    world: World, states: Any, observation: Mapping[str, Tensor]
+) -> list[str]:
+    """Return faults of `World.reflected`: the image of an image has to be what there was."""
+    found = []
+    numbers = {f"reflected_items: {m.name}": len(m.items) for m in world.modalities}
+    images = {f"reflected_items: {name}": image for name, image in world.reflected_items.items()}
+    numbers["reflected_actions"] = len(world.actions)
+    images["reflected_actions"] = world.reflected_actions
+    for name, number in numbers.items():
+        image = images.get(name, ())
+        twice = [image[place] for place in image] if sorted(image) == [*range(number)] else []
+        if twice != [*range(number)]:
+            found.append(f"{name}: expected the mirror image of each of {number}, found {image}")
+    twice = _call(world, "reflected", _call(world, "reflected", states))
+    for name, value in _call(world, "observe", twice).items():
+        if bool(((value - observation[name]).abs() > TOLERANCE).any()):
+            found.append(f"reflected: {name} of the mirror image of a mirror image differs")
+    return found
 
 
 def _of_one(world: World, states: Any, observations: Mapping[str, Tensor]) -> list[str]:

@@ -264,10 +264,11 @@ class World(ABC):
         return state
 
     def reflected(self, state: Any) -> Any:
-        """Return the state with left and right exchanged; only of worlds where both are alike.
+        """Return the mirror image of a state, in a world that equals its mirror image.
 
-        With it, the robot learns from twice as many rounds. Such a world also has
-        ``reflected_actions`` and ``reflected_items``.
+        A robot that learns values of a planner (``distil``) then learns from twice as many rounds.
+        Such a world also has ``reflected_actions``, the index of each action's mirror image, and
+        ``reflected_items``, those of the items of each modality.
 
         Raises:
             NotImplementedError: unless a world defines it.

@@ -49,10 +49,10 @@ def plot_identifiability(data: az.InferenceData) -> Picture:
     left = np.zeros(len(people))
     for number, site in enumerate(sites):
         whole = group["entropy"].sel(site=site).values
-        hanging = group["shared_with_policy"].sel(site=site).values
+        shared = group["shared_with_policy"].sel(site=site).values
         colour = COLOURS[number % len(COLOURS)]
         axes[0].barh(rows, whole, 0.75, left, color=colour, lw=0)
-        axes[0].barh(rows, hanging, 0.75, left, color="none", hatch="//////", edgecolor=BLACK, lw=0)
+        axes[0].barh(rows, shared, 0.75, left, color="none", hatch="//////", edgecolor=BLACK, lw=0)
         left = left + whole
     axes[0].set_yticks(rows, labels)
     axes[0].set_ylim(len(people) - 0.5, -0.5)

@@ -38,8 +38,9 @@ class Course:
         rewards: of the actions ``[B, T]``.
         values: the planner's action values ``[B, T, A]``, if they are learned; nan where they are
             unknown, so that nothing is learned there.
-        taken: of rounds as they were believed, the items ``[B, T + 1, K]`` that were seen, heard or
-            taken for granted; none in all other rounds, which may be seen through any view.
+        believed: rounds ``[B]`` that are as they were believed; none of them unless given.
+        taken: in these, the items ``[B, T + 1, K]`` that were seen, heard or taken for granted;
+            the other rounds may be seen through any view.
     """
 
     actions: Tensor
@@ -47,6 +48,7 @@ class Course:
     observation: Observation
     rewards: Tensor
     values: Tensor | None = None
+    believed: Tensor | None = None
     taken: Visibility | None = None
 
     @classmethod
@@ -71,6 +73,7 @@ class Course:
             return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
         values = [one.values for one in courses if one.values is not None]
+        believed = [one.believed for one in courses if one.believed is not None]
         taken = [one.taken for one in courses if one.taken is not None]
         return cls(
             torch.cat([one.actions for one in courses]),
@@ -78,6 +81,7 @@ class Course:
             joined([one.observation for one in courses]),
             torch.cat([one.rewards for one in courses]),
             torch.cat(values) if values else None,
+            torch.cat(believed) if believed else None,
             joined(taken) if taken else None,
         )
 
@@ -94,6 +98,7 @@ class Course:
             cut(self.observation),
             self.rewards[rows, begin:end],
             None if self.values is None else self.values[rows, begin:end],
+            None if self.believed is None else self.believed[rows],
             None if self.taken is None else cut(self.taken),
         )
 
@@ -115,9 +120,8 @@ class Course:
             states=believed,
             observation=observation,
             rewards=torch.where(assuming[:, None], total_reward(rewards), self.rewards),
-            taken={
-                name: (mask | taken[name]) & assuming[:, None, None] for name, mask in seen.items()
-            },
+            believed=assuming,
+            taken={name: mask | taken[name] for name, mask in seen.items()},
         )
 
     def reflected(self, domain: World) -> Course:
@@ -129,7 +133,9 @@ class Course:
         taken = self.taken and {
             name: mask[..., domain.reflected_items[name]] for name, mask in self.taken.items()
         }
-        return Course(image[self.actions], states, observation, self.rewards, values, taken)
+        return Course(
+            image[self.actions], states, observation, self.rewards, values, self.believed, taken
+        )
 
 
 def _but_last(states: Any) -> Any:
@@ -219,11 +225,10 @@ def experience(
         rewards = total_reward(domain.rewards(current, actions, later))
     taken = plan.taken(domain, knowledge, observation)
     visible = {name: mask | taken[name] for name, mask in seen_along.items()}
-    if course.taken is not None:
-        kept = torch.cat([mask.flatten(1) for mask in course.taken.values()], 1).any(1)
+    if course.believed is not None and course.taken is not None:
+        believes = course.believed[:, None, None]
         visible = {
-            name: torch.where(kept[:, None, None], course.taken[name], mask)
-            for name, mask in visible.items()
+            name: torch.where(believes, course.taken[name], mask) for name, mask in visible.items()
         }
     informed = torch.stack(
         [(visible[name] | ~needed).all(-1) for name, needed in domain.decisive(observation).items()]

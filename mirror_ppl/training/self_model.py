@@ -6,8 +6,9 @@ samples rounds from all experience so far, each under a newly drawn view, and mi
 
     - ELBO / (B (T + 1)) * world_weight  +  mean squared Bellman error of both actions.
 
-With ``distil``, the planner's values in the true state take the place of outcomes, in every view;
-the error that is reported is then that of the regression.
+With ``distil``, the planner's values take the place of outcomes, in every view: values of the true
+state, or in some rounds of the state that an observer who makes assumptions believes in. The error
+that is reported is then that of the regression.
 
 The Bellman error uses the outcomes of *every* action, from the robot's simulator, not only of the
 action taken. Where the observer knows everything, the targets can also be the values of the exact

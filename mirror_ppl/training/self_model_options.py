@@ -47,16 +47,17 @@ class SelfModelOptions:
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
         assumed: share of sight views in which each assumption is made. At 0 the robot does not
             learn what follows from assumptions; imagined items are then like seen ones to it. With
-            ``distil``, the share of all rounds that are kept as one observer who makes assumptions
-            believed them to be, with the planner's values there.
+            ``distil``, also the probability of each assumption in every stored round: rounds with
+            an assumption have the believed states, and the planner's values there.
         at_means: True to learn values at the encoder's means in every step, False to alternate with
             draws of the guide. Means are exact sooner where decisive items are clearly visible.
         exact: True to learn the exact planner's values, where there is one, for observers who know
             all decisive items, instead of bootstrapped values.
-        distil: True to learn the planner's values of the true state in every view: their mean,
-            given what is seen. They are computed once for each driven state; only for planners
-            whose values hold without further observations, and with ``window``. In worlds where
-            left and right are alike, the same rounds are learned from with both exchanged, too.
+        distil: True to learn the planner's values of the true state (with ``assumed``, in some
+            rounds the believed one) in every view: their mean, given what is seen. They are
+            computed once for each driven state; only for planners whose values hold without
+            further observations, and with ``window``. In worlds with `World.reflected`, mirror
+            images of the same rounds are learned from, too.
     """
 
     phases: int = 40

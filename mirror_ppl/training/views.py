@@ -97,8 +97,8 @@ class ViewPlan:
             stride: distance between these steps.
 
         Returns:
-            Masks ``[B, T', K]`` of items seen, heard or remembered, and knowledge ``[B, T']``;
-            it is not updated where nobody uses it.
+            Masks ``[B, T', K]`` of items seen, heard or remembered, and knowledge ``[B, T']``. The
+            latter is updated only if something depends on it.
         """
         visible = self.visibility(domain, observation, first, stride)
         if not domain.recalls and not any(makes.any() for makes in self.assumes.values()):

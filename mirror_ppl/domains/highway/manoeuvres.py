@@ -35,7 +35,7 @@ REFLECTED = tuple(
     for lane in range(LANES)
     for speed in range(len(SPEEDS))
 )
-"""The manoeuvre that each is, with left and right exchanged."""
+"""Index of the mirror image of each manoeuvre."""
 
 HEADING_GAIN, LATERAL_GAIN, SPEED_GAIN = 2.0, 0.7, 1.5
 """Gains of the controller, per second; softer than other vehicles', which steer at every tick."""

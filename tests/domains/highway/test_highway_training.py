@@ -7,10 +7,15 @@ import torch
 from highway_states import state_of
 
 from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.checking import _faults_of_reflection
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.highway.knowledge import nothing, remember
 from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, REFLECTED
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import sizes_of
 from mirror_ppl.training.experience import Course, experience
+from mirror_ppl.training.self_model import _Trainer
+from mirror_ppl.training.self_model_options import SelfModelOptions
 from mirror_ppl.training.views import draw_views
 
 WORLD = Highway()
@@ -30,6 +35,25 @@ def test_left_and_right_are_exchanged_in_manoeuvres():
     for place, image in enumerate(REFLECTED):
         other = MANOEUVRES[place].replace("left", "LEFT").replace("right", "left")
         assert MANOEUVRES[image] == other.replace("LEFT", "right")
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "fault"),
+    [
+        (
+            "reflected_actions",
+            (),
+            "reflected_actions: expected the mirror image of each of 12, fou",
+        ),
+        ("reflected_items", {}, "reflected_items: visual: expected the mirror image of each of 36"),
+        ("reflected", lambda self, state: replace(state, y=state.y - 1), "reflected: ego of the m"),
+    ],
+)
+def test_faults_of_reflection_are_found(course, monkeypatch, name, wrong, fault):
+    assert not _faults_of_reflection(WORLD, course.states, course.observation)
+    monkeypatch.setattr(Highway, name, wrong)
+    found = _faults_of_reflection(WORLD, course.states, course.observation)
+    assert any(one.startswith(fault) for one in found)
 
 
 def test_the_reflected_world_is_the_same_world(course):
@@ -67,7 +91,7 @@ def test_rounds_are_kept_as_they_are_believed(course, generator):
     for name, value in believed.observation.items():
         assert torch.equal(value[~assuming], course.observation[name][~assuming])
     assert torch.equal(believed.rewards[~assuming], course.rewards[~assuming])
-    assert not any(mask[~assuming].any() for mask in believed.taken.values())
+    assert torch.equal(believed.believed, assuming)
     assert believed.taken["visual"][assuming].all()
     assert torch.equal(
         believed.taken["verbal"][assuming],
@@ -104,8 +128,21 @@ def test_what_was_believed_is_seen_whatever_the_view(course, generator):
     assert torch.equal(first[:, WORLD.reflected_items["verbal"]], second)
 
 
-def test_nobody_follows_what_nobody_reads(course, generator, monkeypatch):
-    """Where all moves, knowledge counts in assumptions alone, and costs time."""
+def test_the_robot_learns_from_mirror_images_too():
+    options = SelfModelOptions.of("highway", rounds=4, beta=0.0, length=STEPS, window=4, stride=4)
+    generator = torch.Generator().manual_seed(0)
+    robot = sizes_of(WORLD)
+    trainer = _Trainer(WORLD, options, generator, 0, "words", robot, SelfModel)
+    trainer._drive()
+    course = trainer._course()
+    image = list(REFLECTED)
+    assert len(course.actions) == len(course.believed) == 8
+    assert torch.equal(course.values[4:, ::4], course.values[:4, ::4][..., image])
+    torch.testing.assert_close(course.states.heading[4:], -course.states.heading[:4])
+
+
+def test_knowledge_is_followed_only_where_something_depends_on_it(course, generator, monkeypatch):
+    """Where everything moves, only assumptions depend on knowledge."""
 
     def fails(*args):
         raise AssertionError
@@ -117,8 +154,8 @@ def test_nobody_follows_what_nobody_reads(course, generator, monkeypatch):
         experience(WORLD, course, draw_views(WORLD, 12, STEPS, generator, SIGHT, 1.0))
 
 
-def test_cars_told_of_are_remembered_when_told_again():
-    """A reflected memory of what is told is what is told of the reflected world."""
+def test_messages_of_the_mirror_image_are_about_the_mirror_image():
+    """A car ahead on the right is one ahead on the left there."""
     state = state_of((0.0, 4.0, 0.0, 10.0), [(20.0, 8.0, 0.0, 8.0)], torch.float32)
     for now in (state, WORLD.reflected(state)):
         observation = WORLD.observe(now)
