@@ -1,5 +1,7 @@
 """Beliefs along a round go on from where they were, and are those of the whole round."""
 
+import pickle
+
 import pytest
 import torch
 
@@ -16,7 +18,7 @@ from mirror_ppl.people import simulate
 STEPS = 8
 
 
-def somebody(world, hears=None):
+def person_of(world, hears=None):
     human = load_human_model(None, load_self_model(shipped_weights(world), world)[0])
     draws = draw_prior(human, 1, 12, 1)
     return Person(human, draws) if hears is None else HearingPerson(human, draws, hears)
@@ -49,11 +51,11 @@ def part(rounds, number, step):
 def test_a_round_step_by_step_is_the_whole_round(world, hears):
     """Also where attention or channels that reach the person are drawn anew at each step."""
     recorded = simulate(world, None, "paper", 1, 1, 100, told=0.2)
-    person = somebody(world, hears)
+    person = person_of(world, hears)
     for step in range(STEPS):
         past = part(recorded, 0, step)
         found, expected = (
-            PlanningContext.of(one, past) for one in (person, somebody(world, hears))
+            PlanningContext.of(one, past) for one in (person, person_of(world, hears))
         )
         alike = [one.own[:, None] == one.own for one in (found, expected)]
         assert torch.equal(*alike)
@@ -63,10 +65,10 @@ def test_a_round_step_by_step_is_the_whole_round(world, hears):
 
 
 def test_only_what_is_new_is_tracked(rounds, steps):
-    person = somebody("driving")
+    person = person_of("driving")
     for step in range(STEPS):
         PlanningContext.of(person, part(rounds, 0, step))
-    assert steps == [1] * (STEPS - 1)
+    assert steps == [1] * (STEPS - 1) and len(person._tracks.kept) == 1
     PlanningContext.of(person, part(rounds, 0, STEPS - 1))
     PlanningContext.of(person, part(rounds, 0, 3))
     assert steps[STEPS - 1 :] == [3], "the present step again costs nothing, an earlier one is new"
@@ -74,7 +76,7 @@ def test_only_what_is_new_is_tracked(rounds, steps):
 
 @pytest.mark.parametrize("change", ["round", "message", "action", "observation"])
 def test_another_course_is_tracked_anew(rounds, steps, change):
-    person, past = somebody("driving"), part(rounds, 0, STEPS)
+    person, past = person_of("driving"), part(rounds, 0, STEPS)
     PlanningContext.of(person, past)
     observation = {name: value.clone() for name, value in past.observation.items()}
     actions, told = past.actions.clone(), {n: mask.clone() for n, mask in past.told.items()}
@@ -91,9 +93,26 @@ def test_another_course_is_tracked_anew(rounds, steps, change):
     assert steps == [STEPS, STEPS]
 
 
+def test_buffers_that_are_used_again_do_not_change_what_is_kept(rounds, steps):
+    person, past = person_of("driving"), part(rounds, 0, STEPS)
+    past = RoundSoFar(
+        {name: value.clone() for name, value in past.observation.items()}, past.actions, past.told
+    )
+    person.states(past)
+    past.observation["visual"][2, 0, 0] += 1
+    person.states(past)
+    assert steps == [STEPS, STEPS]
+
+
+def test_copies_in_other_processes_begin_empty(rounds):
+    person = person_of("driving")
+    person.states(part(rounds, 0, 2))
+    assert person._tracks.kept and not pickle.loads(pickle.dumps(person._tracks)).kept
+
+
 def test_what_is_not_yet_believed_may_differ(rounds, steps):
     """The present observation, and the action and messages after it."""
-    person, past = somebody("driving"), part(rounds, 0, STEPS)
+    person, past = person_of("driving"), part(rounds, 0, STEPS)
     PlanningContext.of(person, past)
     observation = {name: value.clone() for name, value in past.observation.items()}
     observation["visual"][-1, 0, 0] += 1
@@ -105,7 +124,7 @@ def test_what_is_not_yet_believed_may_differ(rounds, steps):
 
 
 def test_some_of_the_percepts_are_found_among_all(rounds, steps):
-    person, past = somebody("driving"), part(rounds, 0, STEPS)
+    person, past = person_of("driving"), part(rounds, 0, STEPS)
     whole = person.states(past)
     some = torch.tensor([3, 0, 3])
     less = Person(person.human, {name: value[:4] for name, value in person.draws.items()})
@@ -122,7 +141,7 @@ def test_some_of_the_percepts_are_found_among_all(rounds, steps):
 
 
 def test_many_percepts_are_not_kept(rounds):
-    tracks, person, past = Tracks(), somebody("driving"), part(rounds, 0, 1)
+    tracks, person, past = Tracks(), person_of("driving"), part(rounds, 0, 1)
     initial = BeliefState.initial(person.human, PERCEPTS + 1)
     percepts = {"sight": torch.arange(PERCEPTS + 1)}
 
