@@ -82,7 +82,7 @@ def test_the_reflected_world_is_the_same_world(course):
 
 
 def test_rounds_are_kept_as_they_are_believed(course, generator):
-    """Of drivers who take the road for clear, with the cars that they know; others see all."""
+    """Who takes the road for clear believes in the known cars alone; other rounds stay true."""
     plan = draw_views(WORLD, 12, STEPS, generator, SIGHT, 0.5)
     plan = replace(plan, told={name: torch.ones(12) for name in plan.told})
     assuming = plan.assumes["clear"]
