@@ -109,23 +109,10 @@ class Course:
             domain: the world.
             plan: views of these rounds; those in which nothing is assumed stay as they are.
         """
-        seen, knowledge = follow(domain, plan, self.observation)
-        believed = supposed(domain, plan, self.states, knowledge)
-        observation, now = domain.observe(believed), _but_last(believed)
-        assuming = torch.stack([*plan.assumes.values()]).any(0)
-        taken = plan.taken(domain, knowledge, observation)
-        rewards = domain.rewards(now, self.actions, domain.transition(now, self.actions))
-        return replace(
-            self,
-            states=believed,
-            observation=observation,
-            rewards=torch.where(assuming[:, None], total_reward(rewards), self.rewards),
-            believed=assuming,
-            taken={name: mask | taken[name] for name, mask in seen.items()},
-        )
+        return _seen_by(domain, plan, self)[0]
 
     def reflected(self, domain: World) -> Course:
-        """Return these rounds with left and right exchanged, in worlds where both are alike."""
+        """Return the mirror images of these rounds, in a world that equals its mirror image."""
         states = domain.reflected(self.states)
         image = torch.tensor(domain.reflected_actions, device=self.actions.device)
         observation = domain.observe(states)
@@ -208,23 +195,17 @@ def experience(
         stride: distance between these steps.
         discount: discount of exact values, which are computed only if it is given.
     """
-    observation, rewards, values = course.observation, course.rewards, course.values
-    actions = course.actions
-    seen_along, knowledge = follow(domain, plan, observation)
-    believed = supposed(domain, plan, course.states, knowledge)
-    current, so_far = _but_last(believed), _but_last(knowledge)
-
+    values, actions = course.values, course.actions
+    lived, knowledge = _seen_by(domain, plan, course)
+    observation, visible = lived.observation, lived.taken or {}
     steps = slice(first, actions.shape[1], stride)
-    some, known = (map_state(lambda part: part[:, steps], whole) for whole in (current, so_far))
-
+    some, known = (
+        map_state(lambda part: part[:, steps], _but_last(whole))
+        for whole in (lived.states, knowledge)
+    )
     outcomes = ()
     if values is None:
         outcomes = _outcomes(domain, plan, some, known, 1 + first, stride)
-    if any(makes.any() for makes in plan.assumes.values()):  # the world is not as believed
-        later, observation = domain.transition(current, actions), domain.observe(believed)
-        rewards = total_reward(domain.rewards(current, actions, later))
-    taken = plan.taken(domain, knowledge, observation)
-    visible = {name: mask | taken[name] for name, mask in seen_along.items()}
     if course.believed is not None and course.taken is not None:
         believes = course.believed[:, None, None]
         visible = {
@@ -242,7 +223,7 @@ def experience(
             observation=observation,
             visible=visible,
             actions=actions,
-            rewards=rewards,
+            rewards=lived.rewards,
         ),
         outcomes=outcomes,
         over=over,
@@ -251,6 +232,24 @@ def experience(
         first=first,
         stride=stride,
     )
+
+
+def _seen_by(domain: Domain, plan: ViewPlan, course: Course) -> tuple[Course, Any]:
+    """Return rounds as their observers see or believe them, and what these know ``[B, T + 1]``."""
+    visible, knowledge = follow(domain, plan, course.observation)
+    assuming = torch.zeros_like(plan.remembers)
+    for makes in plan.assumes.values():
+        assuming = assuming | makes
+    if assuming.any():  # the world is not as believed
+        states = supposed(domain, plan, course.states, knowledge)
+        observation, now = domain.observe(states), _but_last(states)
+        taken = plan.taken(domain, knowledge, observation)
+        visible = {name: mask | taken[name] for name, mask in visible.items()}
+        later = domain.transition(now, course.actions)
+        earned = total_reward(domain.rewards(now, course.actions, later))
+        rewards = torch.where(assuming[:, None], earned, course.rewards)
+        course = replace(course, states=states, observation=observation, rewards=rewards)
+    return replace(course, believed=assuming, taken=visible), knowledge
 
 
 def _exact(domain: Domain, states: Any, discount: float | None) -> Tensor | None:
