@@ -21,7 +21,7 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains.base import Domain, Observation, map_state
+from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.evaluation.played import Played, Tally
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
@@ -201,69 +201,109 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
     return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
 
 
-@torch.no_grad()
 def play(listener: Listener, say: Say, keep_log: bool = False) -> Played:
-    """Play one person's rounds with a communicator.
+    """Play one person's rounds with a communicator; see `play_together`."""
+    return play_together([listener], [say], keep_log)[0]
 
-    A planner learns from each round before the next one; others play all rounds at once.
+
+@torch.no_grad()
+def play_together(
+    listeners: Sequence[Listener], says: Sequence[Say], keep_log: bool = False
+) -> list[Played]:
+    """Play the rounds of several people, each with a communicator of their own.
+
+    A planner learns from each round before the next one; others play all rounds at once. People do
+    not meet, but take their steps together: a step of many takes hardly longer than one of few.
 
     Args:
-        listener: the person, and their rounds.
-        say: the communicator.
+        listeners: people of one population, with equally many rounds.
+        says: the communicator of each; all or none of them planners.
         keep_log: True to keep every decision.
     """
-    if not isinstance(say, Planning):
-        return _play(listener, say, keep_log)[0]
-    parts = []
-    for number in range(listener.start.action_noise.shape[1]):
-        played, (past,) = _play(listener.round(number), say, keep_log)
-        say.learn(past)
-        parts.append(played)
-    return replace(Played.joined(parts), hears=say.hears)
+    if not any(isinstance(say, Planning) for say in says):
+        return [played for played, _ in _play(listeners, says, keep_log)]
+    parts: list[list[Played]] = [[] for _ in says]
+    for number in range(listeners[0].start.action_noise.shape[1]):
+        found = _play([one.round(number) for one in listeners], says, keep_log)
+        for own, say, (played, (past,)) in zip(parts, says, found, strict=True):
+            assert isinstance(say, Planning)
+            say.learn(past)
+            own.append(played)
+    return [
+        replace(Played.joined(own), hears=say.hears)
+        for own, say in zip(parts, says, strict=True)
+        if isinstance(say, Planning)
+    ]
 
 
-def _play(listener: Listener, say: Say, keep_log: bool) -> tuple[Played, list[RoundSoFar]]:
-    """Play all rounds at once; also returns the observed rounds."""
-    domain, driver, start = listener.domain, listener.driver, listener.start
-    channels, number = Channels(domain), start.action_noise.shape[1]
-    tally, seconds, log = Tally(domain, channels, number), 0.0, []
+def _play(
+    listeners: Sequence[Listener], says: Sequence[Say], keep_log: bool
+) -> list[tuple[Played, list[RoundSoFar]]]:
+    """Play all rounds at once; also returns the observed rounds of each person."""
+    domain = listeners[0].domain
+    driver = SimulatedPeople.join([one.driver for one in listeners])
+    start = Start.join([one.start for one in listeners])
+    channels, (people, number, _) = Channels(domain), start.action_noise.shape
+    tallies = [Tally(domain, channels, number) for _ in says]
+    seconds, logs = [0.0] * people, [[] for _ in says]
     state, memory = start.state, driver.start(number, mind_noise=start.mind_noise)
-    now = _now(domain, state, number)
-    rounds = [RoundSoFar.begin(domain, one) for one in now]
-    for step in range(domain.horizon):
-        observation = domain.observe(state)
-        began = perf_counter()
-        flags, decisions = say(rounds, Truth(step, state, memory))
-        seconds += perf_counter() - began
-        under_way = ~domain.over(state)[0]
-        if not under_way.any():
-            break
-        flags = flags & under_way[:, None]
-        messages = channels.split(flags)
-        probability, memory = driver.step(memory, observation, channels.split(flags[None]))
-        action = act(probability, start.action_noise[..., step])[0]
-        memory = driver.acted(memory, action[None])
-        following = domain.transition(state, action[None])
-        tally.add_messages(observation, flags, under_way)
-        tally.add_rewards(domain.rewards(state, action[None], following))
-        if keep_log:
-            log += [
-                {"round": r, "step": step}
-                | _entry(domain, channels, flags[r], int(action[r]), probability[0, r])
-                | ({} if decisions is None else audit(decisions[r]))
-                for r in range(number)
-                if under_way[r]
-            ]
-        state = following
-        now = _now(domain, state, number)
-        rounds = [past.then(_row(messages, r), action[r], now[r]) for r, past in enumerate(rounds)]
-    return tally.played(seconds, log), rounds
-
-
-def _now(domain: Domain, state: Any, number: int) -> list[Observation]:
-    """Current observation in each of R rounds."""
     observation = domain.observe(state)
-    return [{name: value[0, r] for name, value in observation.items()} for r in range(number)]
+    rounds = [
+        [RoundSoFar.begin(domain, _at(observation, person, r)) for r in range(number)]
+        for person in range(people)
+    ]
+    for step in range(domain.horizon):
+        under_way = ~domain.over(state)
+        playing = under_way.any(-1).nonzero().flatten().tolist()
+        if not playing:
+            break
+        decisions: dict[int, list[Decision] | None] = {}
+        flags = torch.zeros(people, number, len(channels), dtype=torch.bool)
+        for person in playing:
+            truth = Truth(step, _of(state, person), _of(memory, person))
+            began = perf_counter()
+            flags[person], decisions[person] = says[person](rounds[person], truth)
+            seconds[person] += perf_counter() - began
+        flags = flags & under_way[..., None]
+        messages = channels.split(flags)
+        probability, memory = driver.step(memory, observation, messages)
+        action = act(probability, start.action_noise[..., step])
+        memory = driver.acted(memory, action)
+        following = domain.transition(state, action)
+        rewards, after = domain.rewards(state, action, following), domain.observe(following)
+        for person in playing:
+            seen = {name: value[person] for name, value in observation.items()}
+            own, going = flags[person], under_way[person]
+            tallies[person].add_messages(seen, own, going)
+            tallies[person].add_rewards({name: term[person] for name, term in rewards.items()})
+            if keep_log:
+                decided = decisions[person]
+                logs[person] += [
+                    {"round": r, "step": step}
+                    | _entry(domain, channels, own[r], int(action[person, r]), chances)
+                    | ({} if decided is None else audit(decided[r]))
+                    for r, chances in enumerate(probability[person])
+                    if going[r]
+                ]
+            rounds[person] = [
+                past.then(_at(messages, person, r), action[person, r], _at(after, person, r))
+                for r, past in enumerate(rounds[person])
+            ]
+        state, observation = following, after
+    return [
+        (tally.played(took, log), own)
+        for tally, took, log, own in zip(tallies, seconds, logs, rounds, strict=True)
+    ]
+
+
+def _of(parts: Any, person: int) -> Any:
+    """What one person has of states or memories ``[P, R]``, ``[1, R]``."""
+    return map_state(lambda part: part[person : person + 1], parts)
+
+
+def _at(parts: Mapping[str, Tensor], person: int, number: int) -> dict[str, Tensor]:
+    """What one person has of ``[P, R, ...]`` in one round."""
+    return {name: part[person, number] for name, part in parts.items()}
 
 
 def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
@@ -300,7 +340,3 @@ def _entry(
         "action": domain.actions[action],
         "true_probability": dict(zip(domain.actions, probability.tolist(), strict=True)),
     }
-
-
-def _row(masks: dict[str, Tensor], row: int) -> dict[str, Tensor]:
-    return {name: mask[row] for name, mask in masks.items()}

@@ -94,7 +94,7 @@ class Tally:
         """Count messages ``[R, N]`` and communicable items of a step."""
         self.steps += int(under_way.sum())
         self.cost += self.channels.cost(flags)
-        may = self._by_modality(self.channels.join(self.domain.communicable(observation))[0])
+        may = self._by_modality(self.channels.join(self.domain.communicable(observation)))
         messages = self._by_modality(flags)
         for name, mask in messages.items():
             self.items[name] += mask.sum(-1)
@@ -103,7 +103,7 @@ class Tally:
             counts = self.relevant.setdefault(
                 notion, {name: torch.zeros_like(count) for name, count in self.items.items()}
             )
-            relevant = self._by_modality(self.channels.join(masks)[0])
+            relevant = self._by_modality(self.channels.join(masks))
             for name, mask in messages.items():
                 counts[name] += (mask & relevant[name]).sum(-1)
 
@@ -112,9 +112,9 @@ class Tally:
         return dict(zip(self.items, flags.split(self.channels.sizes, -1), strict=True))
 
     def add_rewards(self, terms: Mapping[str, Tensor]) -> None:
-        """Add rewards ``[1, R]`` of a step, by term."""
-        self.task += total_reward(terms)[0]
-        self.mishaps += (terms[self.domain.mishap[0]][0] < 0).long()
+        """Add rewards ``[R]`` of a step, by term."""
+        self.task += total_reward(terms)
+        self.mishaps += (terms[self.domain.mishap[0]] < 0).long()
 
     def played(self, seconds: float, log: list[dict[str, Any]]) -> Played:
         """Return the results of the rounds, whose decisions took ``seconds`` in all."""

@@ -16,7 +16,7 @@ import torch
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.registry import code_of
 from mirror_ppl.errors import AssetError, UnknownNameError
-from mirror_ppl.evaluation.assistance import REFERENCES, PlannerOptions, play, speaker
+from mirror_ppl.evaluation.assistance import REFERENCES, PlannerOptions, play_together, speaker
 from mirror_ppl.evaluation.learned import Plannable, Trained
 from mirror_ppl.evaluation.learners import (
     ALSO_PLANNABLE,
@@ -132,12 +132,19 @@ def assist(cell: Assistance) -> Rows:
     # Networks learn from recordings if people react to messages, so this is not inferred.
     taken_for_granted = 1.0 if isinstance(learned, Trained) else None
     options, rows = PlannerOptions.of(group.domain, hears=taken_for_granted), []
-    for number, listener in enumerate(group.listeners(cell.played)):
-        if learned is not None:
-            listener = replace(listener, person=learned.person(number, cell.draws))
-        for objective in _objectives(cell.model):
-            who = cell.model if objective == UTILITY else objective
-            played = play(listener, speaker(objective, listener, options, group.seed + number))
+    people = group.listeners(cell.played)
+    if learned is not None:
+        people = [
+            replace(one, person=learned.person(number, cell.draws))
+            for number, one in enumerate(people)
+        ]
+    for objective in _objectives(cell.model):
+        who = cell.model if objective == UTILITY else objective
+        says = [
+            speaker(objective, one, options, group.seed + number)
+            for number, one in enumerate(people)
+        ]
+        for number, played in enumerate(play_together(people, says)):
             rows.append(
                 _row(group, who, cell.rounds, f"person-{number + 1:02d}")
                 | {

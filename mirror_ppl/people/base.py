@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -159,6 +159,21 @@ class SimulatedPeople(ABC):
             **{
                 name: part[index] if isinstance(part, Tensor) else part
                 for name, part in parts.items()
+            }
+        )
+
+    @classmethod
+    def join(cls, people: Sequence[Self]) -> Self:
+        """Return people of one population together; undoes `select`."""
+        first, *others = people
+        if not others:
+            return first
+        return type(first)(
+            **{
+                field.name: torch.cat([getattr(one, field.name) for one in people])
+                if isinstance(part := getattr(first, field.name), Tensor)
+                else part
+                for field in fields(first)
             }
         )
 

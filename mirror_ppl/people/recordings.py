@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,6 +44,22 @@ class Start:
             self.action_noise[people],
             None if self.mind_noise is None else self.mind_noise[people],
             None if self.message_noise is None else self.message_noise[people],
+        )
+
+    @classmethod
+    def join(cls, starts: Sequence[Start]) -> Start:
+        """Return the rounds of several people, equally many of each; undoes `select`."""
+
+        def joined(name: str) -> Any:
+            parts = [getattr(one, name) for one in starts]
+            return None if parts[0] is None else torch.cat(parts)
+
+        return cls(
+            map_state(lambda *parts: torch.cat(parts), *(one.state for one in starts)),
+            joined("scenario"),
+            joined("action_noise"),
+            joined("mind_noise"),
+            joined("message_noise"),
         )
 
     def round(self, number: int) -> Start:

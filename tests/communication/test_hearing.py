@@ -13,7 +13,7 @@ from mirror_ppl.communication.hearing import HearingPerson, hearing
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import InputError
-from mirror_ppl.evaluation.assistance import Listener, listeners, play, speaker
+from mirror_ppl.evaluation.assistance import Listener, listeners, play, play_together, speaker
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import HardOfHearing
 from mirror_ppl.models.implants import sight_sites
@@ -151,6 +151,21 @@ def test_who_does_not_react_is_soon_left_in_peace(driving):
     silent = play(alone, speaker("none", alone, PlannerOptions(), 1))
     assert heard.net.sum() - silent.net.sum() > 10
     assert heard.hears["verbal"] > 0.9
+
+
+def test_planners_of_several_people_keep_apart_what_each_hears(driving):
+    everybody = simulated_people("driving", "fog", "diverse", 2, 100)
+    people = [
+        replace(one, person=Person(driving, known(driving, one.driver)))
+        for one in listeners(everybody, 2, "fog", 2, 100)
+    ]
+    options = PlannerOptions.of("driving", hears=0.7, horizon=4)
+    together = play_together(people, [speaker("mirror", one, options, 1) for one in people])
+    for found, one in zip(together, people, strict=True):
+        alone = play(one, speaker("mirror", one, options, 1))
+        assert (found.task, found.cost, found.items) == (alone.task, alone.cost, alone.items)
+        assert found.hears == pytest.approx(alone.hears, abs=1e-6)
+    assert together[0].hears != together[1].hears
 
 
 def known(human, people) -> dict[str, Tensor]:

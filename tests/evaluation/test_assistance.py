@@ -20,7 +20,9 @@ from mirror_ppl.evaluation.assistance import (
     Listener,
     PlannerOptions,
     audit,
+    listeners,
     play,
+    play_together,
     speaker,
 )
 from mirror_ppl.people import draw_starts
@@ -197,6 +199,20 @@ def test_all_play_the_same_rounds_with_the_same_action_noise():
         assert run(name, rounds=5).chances == run("none", rounds=5).chances
     other = play(listener(seed=1), lambda rounds, truth: (flags, None))
     assert without_time(other) != without_time(silence)
+
+
+@pytest.mark.parametrize("name", ["none", "all", "nearest", "oracle"])
+def test_people_who_play_together_play_as_each_alone(name):
+    reach = torch.tensor([FOG, (5.0, 5.0, 3.0, 3.0), (0.0, 1.0, 0.0, 9.0)])
+    everybody = TaskDrivers(reach, torch.tensor([1.0, 0.5, 4.0]))
+    people = listeners(everybody, 3, "fog", 4, 7)
+    says = [speaker(name, one, PlannerOptions(), 0) for one in people]
+    together = play_together(people, says, keep_log=True)
+    for found, one in zip(together, people, strict=True):
+        alone = play(one, speaker(name, one, PlannerOptions(), 0), keep_log=True)
+        assert without_time(found) == without_time(alone)
+        assert found.log == alone.log
+    assert len({tuple(found.task) for found in together}) == 3
 
 
 def test_all_say_everything_and_none_nothing():
