@@ -75,7 +75,7 @@ def main(options: Options) -> None:
 
 def lost(pairing: Pairing, number: int) -> Tensor:
     """Units of reward that one person loses in a round: by silence, by messages ``[2]``."""
-    listener = pairing.listener(number)
+    (listener,) = pairing.listeners([number])
     say = speaker("mirror", listener, pairing.planner, pairing.seed + number)
     flags, actions = [], None
 

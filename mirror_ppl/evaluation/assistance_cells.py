@@ -18,7 +18,7 @@ from mirror_ppl.evaluation.assistance import (
     Listener,
     PlannerOptions,
     listeners,
-    play,
+    play_together,
     speaker,
 )
 from mirror_ppl.evaluation.played import Played
@@ -31,6 +31,9 @@ from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weig
 from mirror_ppl.people import simulated_people
 from mirror_ppl.people.robot_like import SELF_MODEL
 from mirror_ppl.version import __version__
+
+TOGETHER = 5
+"""People who play together: many save time, and few let more processes work at once."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +96,8 @@ class Pairing:
                 f"({simulated}); simulate and fit them anew with this one"
             )
 
-    def listener(self, number: int, inferred: bool = True) -> Listener:
-        """Return a person by number, with their rounds and their posterior."""
+    def listeners(self, numbers: Sequence[int], inferred: bool = True) -> list[Listener]:
+        """Return people by number, with their rounds and their posteriors."""
         everybody = simulated_people(
             self.domain.name,
             self.setting,
@@ -103,19 +106,32 @@ class Pairing:
             self.people_seed,
             self_model=self.self_model,
         )
-        listener = listeners(everybody, self.people, self.setting, self.rounds, self.seed)[number]
+        found = listeners(everybody, self.people, self.setting, self.rounds, self.seed)
+        chosen = [found[number] for number in numbers]
         if not inferred:
-            return listener
-        own = slice(number, number + 1)
+            return chosen
         draws = self.file.draws(self.human, self.draws)
-        person = Person(self.human, {site: value[:, own] for site, value in draws.items()})
-        return replace(listener, person=person)
+        return [
+            replace(one, person=Person(self.human, {site: v[:, [n]] for site, v in draws.items()}))
+            for n, one in zip(numbers, chosen, strict=True)
+        ]
 
-    def play(self, number: int, name: str, rates: dict[str, float] | None) -> Played:
-        """Play a person's rounds, by number, with one communicator."""
-        listener = self.listener(number, name.startswith("mirror"))
-        say = speaker(name, listener, self.planner, self.seed + number, rates)
-        return play(listener, say, self.keep_log)
+    def play(
+        self, numbers: Sequence[int], name: str, rates: Sequence[dict[str, float]] | None = None
+    ) -> list[Played]:
+        """Play the rounds of some people, by number, with one communicator.
+
+        Args:
+            numbers: of the people.
+            name: of the communicator.
+            rates: for ``random``, of each of them.
+        """
+        people = self.listeners(numbers, name.startswith("mirror"))
+        says = [
+            speaker(name, one, self.planner, self.seed + number, own)
+            for one, number, own in zip(people, numbers, rates or [None] * len(people), strict=True)
+        ]
+        return play_together(people, says, self.keep_log)
 
     def identity(self) -> str:
         """Hash of everything that results depend on."""
@@ -134,20 +150,22 @@ class Pairing:
 
 @dataclass(frozen=True)
 class Turn:
-    """One person with one communicator, or with several of which one depends on another.
+    """Some people with one communicator, or with several of which one depends on another.
 
     Attributes:
-        person: number of the person.
+        people: numbers of the people, who play together.
         communicators: by name; ``random`` comes after the communicator whose rates it has.
     """
 
-    person: int
+    people: tuple[int, ...]
     communicators: tuple[str, ...]
 
     @property
     def label(self) -> str:
         """Name in progress messages."""
-        return f"{' and '.join(self.communicators)}, person {self.person + 1}"
+        first, last = self.people[0] + 1, self.people[-1] + 1
+        who = f"person {first}" if first == last else f"people {first} to {last}"
+        return f"{' and '.join(self.communicators)}, {who}"
 
 
 def turns(communicators: Sequence[str], people: int) -> list[Turn]:
@@ -165,7 +183,10 @@ def turns(communicators: Sequence[str], people: int) -> list[Turn]:
     elif RATES_FROM in communicators:
         first.append((RATES_FROM,))
     first.sort(key=lambda names: not names[0].startswith(("mirror", "oracle")))
-    return [Turn(number, names) for names in first for number in range(people)]
+    groups = [
+        tuple(range(begin, min(begin + TOGETHER, people))) for begin in range(0, people, TOGETHER)
+    ]
+    return [Turn(group, names) for names in first for group in groups]
 
 
 def play_all(pairing: Pairing, chosen: Sequence[Turn], runner: Runner) -> dict[str, list[Played]]:
@@ -177,7 +198,9 @@ def play_all(pairing: Pairing, chosen: Sequence[Turn], runner: Runner) -> dict[s
         runner: does the work and keeps finished results.
     """
     identity = pairing.identity()
-    form = JsonFormat(lambda content: {name: Played(**one) for name, one in content.items()})
+    form = JsonFormat(
+        lambda content: {name: [Played(**one) for one in own] for name, own in content.items()}
+    )
     outcomes = replace(runner, identity=lambda turn: identity).run(
         chosen, partial(_play, pairing), form
     )
@@ -185,13 +208,13 @@ def play_all(pairing: Pairing, chosen: Sequence[Turn], runner: Runner) -> dict[s
     for outcome in outcomes:
         assert outcome.result is not None
         for name, own in outcome.result.items():
-            played.setdefault(name, []).append(own)
+            played.setdefault(name, []).extend(own)
     return played
 
 
-def _play(pairing: Pairing, turn: Turn) -> dict[str, Played]:
-    played: dict[str, Played] = {}
+def _play(pairing: Pairing, turn: Turn) -> dict[str, list[Played]]:
+    played: dict[str, list[Played]] = {}
     for name in turn.communicators:
-        rates = played[RATES_FROM].rates() if name == "random" else None
-        played[name] = pairing.play(turn.person, name, rates)
+        rates = [one.rates() for one in played[RATES_FROM]] if name == "random" else None
+        played[name] = pairing.play(turn.people, name, rates)
     return played

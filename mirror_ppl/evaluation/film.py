@@ -42,7 +42,8 @@ def film(pairing: Pairing, played: Mapping[str, Sequence[Played]]) -> Film:
     first, second = ([one.net for one in played[name]] for name in pair)
     gain = np.stack(second) - np.stack(first)
     person, number = (int(index) for index in np.unravel_index(gain.argmax(), gain.shape))
-    begin = pairing.listener(person, inferred=False).start.round(number).state
+    (listener,) = pairing.listeners([person], inferred=False)
+    begin = listener.start.round(number).state
     a, b = (strip(pairing.domain, begin, name, played[name][person], number) for name in pair)
     return Film(pairing.domain, person, number, (a, b))
 

@@ -97,7 +97,7 @@ def test_the_table_shows_the_numbers(posterior, capsys):
     assert {"task", "cost", "net"} <= set(captured.out.split())
     assert worth.index(" none ") < worth.index(" oracle ")
     assert all(len(line) <= 80 for line in captured.out.splitlines())
-    assert "4/4" in captured.err
+    assert "2/2" in captured.err
 
 
 def test_one_seed_gives_one_result(posterior, done, tmp_path):
@@ -140,17 +140,18 @@ class Stopped(Exception):
 
 
 def test_a_stopped_run_goes_on_where_it_was(posterior, tmp_path, monkeypatch):
+    monkeypatch.setattr(assistance_cells, "TOGETHER", 1)
     args = ("--posterior", posterior, *SMALL, "--communicator", "none", "all", "nearest")
     outputs = ("--json", tmp_path / "a.json")
     assert command(assist, *args, "--json", tmp_path / "whole.json") == 0
     played = []
     play = assistance_cells.Pairing.play
 
-    def stops(self, number, name, rates):
+    def stops(self, numbers, name, rates):
         if len(played) == 4:
             raise Stopped
-        played.append((name, number))
-        return play(self, number, name, rates)
+        played.append((name, numbers))
+        return play(self, numbers, name, rates)
 
     monkeypatch.setattr(assistance_cells.Pairing, "play", stops)
     with pytest.raises(Stopped):
@@ -167,6 +168,7 @@ def test_a_stopped_run_goes_on_where_it_was(posterior, tmp_path, monkeypatch):
 
 
 def test_damaged_parts_are_played_anew(posterior, tmp_path, monkeypatch):
+    monkeypatch.setattr(assistance_cells, "TOGETHER", 1)
     args = ("--posterior", posterior, *SMALL, "--communicator", "none")
     outputs = ("--json", tmp_path / "a.json")
 
@@ -181,7 +183,7 @@ def test_damaged_parts_are_played_anew(posterior, tmp_path, monkeypatch):
     assert len(parts) == 2
     parts[0].write_text("{")
     whole = json.loads(parts[1].read_text())
-    parts[1].write_text(json.dumps(whole | {"result": {"none": {"task": [1.0]}}}))
+    parts[1].write_text(json.dumps(whole | {"result": {"none": [{"task": [1.0]}]}}))
     assert command(assist, *args, *outputs) == 0
     assert results_of(tmp_path / "a.json")["communicators"]["none"]["cost"] == 0
     assert content(tmp_path) == ["a.json"]
@@ -217,8 +219,8 @@ def quickly(monkeypatch):
     play = assistance_cells.Pairing.play
 
     def play_only(*names):
-        def instead(self, number, name, rates):
-            return play(self, number, name if name in names else "none", rates)
+        def instead(self, numbers, name, rates):
+            return play(self, numbers, name if name in names else "none", rates)
 
         monkeypatch.setattr(assistance_cells.Pairing, "play", instead)
 
