@@ -35,6 +35,9 @@ class Record:
         training: of :class:`~mirror_ppl.training.self_model_options.SelfModelOptions`, by name.
         planning: settings of :class:`~mirror_ppl.communication.planners.PlannerOptions`.
         baselines: settings of baselines, by the baseline's name: ``bc`` and ``sqil``.
+        likelihood_power: power of the likelihood of recorded actions in posteriors. Below 1 it
+            takes account of errors of the robot's values that are alike in successive decisions,
+            which the model would otherwise take for evidence on a person.
         measured: rounds on which a self-model's returns and agreement are measured.
         slow: models that `evaluate` compares only on request, because they take minutes: `svi`
             with many values to sum over at each step, and SQIL with long rounds.
@@ -50,12 +53,19 @@ class Record:
     training: Mapping[str, Any] = field(default_factory=dict)
     planning: Mapping[str, Any] = field(default_factory=dict)
     baselines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    likelihood_power: float = 1.0
     measured: int = 4000
     slow: tuple[str, ...] = ("mirror-svi", "sqil-everything", "sqil-pooled")
     people: Any = None
     human_models: Any = field(default_factory=dict)
     pictures: Any = field(default_factory=dict)
     rounds: Any = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.likelihood_power <= 1:
+            raise DomainError(
+                f"likelihood_power must be above 0 and at most 1, not {self.likelihood_power}"
+            )
 
     def part(self, name: str) -> Any:
         """Return one of the attributes, imported if it is a string ``"module:name"``.

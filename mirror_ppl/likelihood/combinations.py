@@ -107,23 +107,24 @@ def unread_sites(human: HumanModel, supports: Mapping[str, Tensor] | None = None
 
 
 def _read(human: HumanModel, supports: Mapping[str, Tensor]) -> set[str]:
-    """Sites that ``perceive`` reads in a round without messages and in one with all messages."""
+    """Sites that ``perceive`` reads in a round without messages or with all messages."""
     domain, device = human.domain, next(human.parameters()).device
     sites = {**supports, **attention_sites(human)}
     implants = Readable({name: support[:1] for name, support in sites.items()})
+    state = domain.initial(1, torch.Generator(device).manual_seed(0))
+    without: Any = domain.nothing_known(1, device=device)
+    informed: Any = without
     with WithoutSites(BELIEVING):
-        for telling in (False, True):
-            state = domain.initial(1, torch.Generator(device).manual_seed(0))
-            knowledge: Any = domain.nothing_known(1, device=device)
-            for step in range(domain.horizon):
-                now = domain.observe(state)
-                told = {
-                    name: mask if telling else torch.zeros_like(mask)
-                    for name, mask in domain.communicable(now).items()
-                }
-                _, knowledge = human.perceive(implants, knowledge, now, told, step)
-                action = torch.full((1,), step % len(domain.actions), device=device)
-                state = domain.transition(state, action)
+        for step in range(domain.horizon):
+            now = domain.observe(state)
+            told = domain.communicable(now)
+            silence = {name: torch.zeros_like(mask) for name, mask in told.items()}
+            _, without = human.perceive(implants, without, now, silence, step)
+            _, informed = human.perceive(implants, informed, now, told, step)
+            if implants.read >= sites.keys():
+                break  # there is no other
+            action = torch.full((1,), step % len(domain.actions), device=device)
+            state = domain.transition(state, action)
     return implants.read
 
 

@@ -23,9 +23,13 @@ class NormalizedCategorical(Categorical):
 
     Args:
         log_probabilities: of each value, ``[..., n]``.
+        power: of the probabilities in the density that an observed value contributes: the
+            likelihood of a power posterior. Values are drawn with the probabilities themselves.
+            It is no ``poutine.scale``, as enumerated sites need a common one.
     """
 
-    def __init__(self, log_probabilities: Tensor) -> None:
+    def __init__(self, log_probabilities: Tensor, power: float = 1.0) -> None:
+        self.power = power
         self.logits = log_probabilities  # pyright: ignore[reportAttributeAccessIssue] - lazy
         self._param = log_probabilities
         self._num_events = log_probabilities.shape[-1]
@@ -35,13 +39,14 @@ class NormalizedCategorical(Categorical):
     def expand(self, batch_shape: torch.Size, _instance: object = None) -> NormalizedCategorical:
         """Expand to a batch shape; see :meth:`torch.distributions.Distribution.expand`."""
         del _instance
-        return NormalizedCategorical(self.logits.expand(*batch_shape, -1))
+        return NormalizedCategorical(self.logits.expand(*batch_shape, -1), self.power)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-probability ``[...]`` of values."""
+        """Log-probability ``[...]`` of values, times the power."""
         shape = torch.broadcast_shapes(value.shape, self.logits.shape[:-1])
         place = value.long().expand(shape)[..., None]
-        return self.logits.expand(*shape, -1).gather(-1, place).squeeze(-1)
+        found = self.logits.expand(*shape, -1).gather(-1, place).squeeze(-1)
+        return found if self.power == 1 else self.power * found
 
 
 class GaussianChain(TorchDistribution):

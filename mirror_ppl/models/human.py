@@ -110,6 +110,11 @@ class HumanModel(nn.Module):
         """Size Z of beliefs; larger beliefs begin with the robot's own."""
         return self.self_model.latent
 
+    @property
+    def likelihood_power(self) -> float:
+        """Power of the likelihood of recorded actions, from the world's record."""
+        return self.domain.record.likelihood_power
+
     def action_values(self, belief: Tensor) -> Tensor:
         """Return action values ``[..., A]`` at beliefs ``[..., Z]``, an argument of :meth:`act`."""
         return self.self_model.action_values(belief)
@@ -305,9 +310,13 @@ class HumanModel(nn.Module):
     def choose(
         self, implants: Implants, belief: Tensor, values: Tensor, action: Tensor | None = None
     ) -> Tensor:
-        """Sample the action ``[..., P, B]`` of one step, or observe the recorded action."""
+        """Sample the action ``[..., P, B]`` of one step, or observe the recorded action.
+
+        Its log-probability counts :attr:`likelihood_power` times in the density.
+        """
         chances = self.act(implants, belief, values)
-        return pyro.sample(ACTION, NormalizedCategorical(chances), obs=action)
+        likelihood = NormalizedCategorical(chances, self.likelihood_power)
+        return pyro.sample(ACTION, likelihood, obs=action)
 
     def model(self, rounds: Demonstrations, world: bool = False) -> None:
         """Run the program: what P people see, believe and do in their rounds, step by step.

@@ -14,6 +14,7 @@ from pyro.infer.inspect import get_dependencies
 from benchmarks.one_program import CHANGES, exact_mean, toy
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.people import simulate
@@ -48,6 +49,29 @@ def test_engines_have_the_posterior_of_the_program(guide, change, recordings):
         assert abs(found.mean() - expected) < 4 * found.std() / math.sqrt(400)
     else:
         assert abs(found.mean() - expected) < 0.03
+
+
+class Half(HumanModel):
+    """Each recorded action counts half in the density."""
+
+    likelihood_power = 0.5
+
+
+@torch.no_grad()
+def test_a_power_of_the_likelihood_counts_in_the_density_alone(recordings):
+    whole, half = HumanModel(self_model()), Half(self_model())
+    draws = draw_prior(whole, 1, 3, 0)
+    tables, of_half = compile(whole, recordings), compile(half, recordings)
+    predicted = tables.predict(draws)
+    assert torch.equal(of_half.predict(draws), predicted)
+    real, actions = recordings.mask, recordings.actions.clamp(min=0)
+    chosen = predicted.gather(-1, actions.expand(3, *actions.shape)[..., None])[..., 0]
+    likelihood = (chosen * real).sum((-2, -1))
+    joint, of_half = tables.log_joint(draws), of_half.log_joint(draws)
+    torch.testing.assert_close(of_half, joint - likelihood / 2, rtol=0, atol=1e-4)
+    one = {name: value[1] for name, value in draws.items()}
+    trace = poutine.trace(poutine.condition(half.model, data=one)).get_trace(recordings)
+    torch.testing.assert_close(trace.log_prob_sum(), of_half[1, 0], rtol=0, atol=1e-4)
 
 
 # --- Pyro's own tools -------------------------------------------------------------------------

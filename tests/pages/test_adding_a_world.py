@@ -363,6 +363,7 @@ def test_settings_are_looked_over(tmp_path, capsys):
         ('record = Record(training={"phasez": 3})', "training has phasez, expected some of"),
         ('record = Record(training={"phases": 0})', "phases must be at least 1, not 0"),
         ('record = Record(planning={"horizn": 3})', "planning has horizn"),
+        ("record = Record(likelihood_power=0.0)", "likelihood_power must be above 0 and at most"),
         ('record = Record(networks={"coder": 3})', "networks: "),
         ('record = Record(people="nowhere:PEOPLE")', 'people: there is no "nowhere:PEOPLE"'),
         ('record = Record(pictures="math:PICTURES")', 'pictures: there is no "math:PICTURES"'),
