@@ -30,6 +30,7 @@ RECORD = Record(
         "kinds": (0.5, 0.1, 0.4),
         "assumed": 0.5,
     },
+    likelihood_power=0.25,
     measured=100,
     people="mirror_ppl.domains.highway.participants:DRIVERS",
     pictures="mirror_ppl.domains.highway.sight:PICTURES",
