@@ -113,6 +113,7 @@ def main(options: Options) -> int:
     self_model, _ = load_self_model(weights, domain.name)
     human = load_human_model(options.human_model, self_model)
     check_contract(human)
+    counted, human.likelihood_power = human.likelihood_power, 1.0
     # What is so for everybody is learned first, as by a fit: people are drawn from what is open.
     fit_shipped_world(human, setting)
     network = network_for(guide, options.guide_file, human)
@@ -136,6 +137,11 @@ def main(options: Options) -> int:
         write_together({folder / "calibration.nc": calibration.content(), **drawn})
         runner.clean()
     _show(calibration, guide)
+    if counted < 1:
+        print(
+            f"A decision counts once here, {counted:g} times in fits of {domain.name}, where the "
+            "robot's values err: their intervals are wider than those tested"
+        )
     print(f"{folder / 'calibration.nc'}: ranks of every person")
     for path in drawn:
         print(path)

@@ -110,9 +110,9 @@ class HumanModel(nn.Module):
         """Size Z of beliefs; larger beliefs begin with the robot's own."""
         return self.self_model.latent
 
-    @property
+    @cached_property
     def likelihood_power(self) -> float:
-        """Power of the likelihood of recorded actions, from the world's record."""
+        """Power of the likelihood of recorded actions: the world's record has it, or set it."""
         return self.domain.record.likelihood_power
 
     def action_values(self, belief: Tensor) -> Tensor:

@@ -53,6 +53,15 @@ def test_it_prints_and_writes_what_it_found(tmp_path, capsys):
         assert len(image.convert("L").getcolors()) > 10
 
 
+def test_an_engine_is_tested_with_decisions_that_count_in_full(whole, tmp_path, capsys):
+    args = quick(tmp_path)
+    (tmp_path / "toy.py").write_text(TOY.replace("pass", "likelihood_power = 0.25"))
+    assert command(calibrate, *args) == 0
+    assert "A decision counts once here, 0.25 times in fits of driving" in capsys.readouterr().out
+    found = Calibration.load(tmp_path / "out" / "calibration.nc").data
+    assert found.drop_attrs().identical(whole.drop_attrs())
+
+
 def test_processes_share_the_people(whole, tmp_path):
     assert command(calibrate, *quick(tmp_path), "--jobs", 2) == 0
     assert Calibration.load(tmp_path / "out" / "calibration.nc").data.equals(whole)

@@ -345,3 +345,6 @@ def test_people_who_cannot_be_drawn_are_refused(kind, method):
     options = CalibrationOptions(people=2, rounds=(1,), batch=2)
     with pytest.raises(HumanModelError, match=f"{kind.__name__}.{method} has a factor"):
         calibrate(human, lambda rounds, seed: None, options, "fog", 0)
+    human.likelihood_power = 0.5
+    with pytest.raises(HumanModelError, match="likelihood_power is 0.5.*set it to 1 to calibrate"):
+        calibrate(human, lambda rounds, seed: None, options, "fog", 0)

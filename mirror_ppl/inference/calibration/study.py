@@ -142,7 +142,8 @@ def calibrate(
     Raises:
         UnknownNameError: there is no such setting.
         ValueError: ``infer`` or a summary returned invalid values.
-        HumanModelError: a method has a factor, an observed site, a scale or a mask.
+        HumanModelError: a method has a factor, an observed site, a scale or a mask; or the model
+            has a power of the likelihood.
     """
     require_known(setting, "setting", human.domain.settings, human.domain.name)
     _require_plain_program(human)
@@ -169,6 +170,11 @@ def calibrate(
 def _require_plain_program(human: HumanModel) -> None:
     """Refuse human models with factors and the like, which simulated people do not follow."""
     kind = type(human).__name__
+    if human.likelihood_power != 1:
+        raise HumanModelError(
+            f"{kind}.likelihood_power is {human.likelihood_power:g}: people who are simulated do "
+            "not follow a power of the likelihood; set it to 1 to calibrate an engine"
+        )
     for name, node in prior_nodes(human, {}, 1, 1).items():
         if correction(node) is not None:
             raise HumanModelError(

@@ -217,6 +217,7 @@ def _attributes(
         "domain_version": domain.version,
         "setting": train.setting,
         "human_model": type(human).__name__,
+        "likelihood_power": human.likelihood_power,
         "self_model": fingerprint(human.self_model),
         "guide": options.engine,
         "refined": options.refine,
