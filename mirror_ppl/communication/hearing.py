@@ -21,6 +21,7 @@ from torch import Tensor
 
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.communication.tracking import RunningSum
 from mirror_ppl.models.family.hearing import HEARS, HardOfHearing
 from mirror_ppl.models.human import HumanModel
 
@@ -111,6 +112,7 @@ class HearingPerson(Person):
         }
         self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
         self.percept_count = int(self.percept.max()) + 1
+        self._chances = RunningSum()
 
 
 def hearing(person: Person, hears: float) -> Person:

@@ -21,7 +21,7 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.communication.tracking import Tracks
+from mirror_ppl.communication.tracking import RunningSum, Tracks
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import AttentionValues, Proposal
@@ -74,6 +74,7 @@ class Person:
         self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
         self.percept_count = int(self.percept.max()) + 1
         self._tracks = Tracks()
+        self._chances = RunningSum()
 
     def _distinct_percepts(
         self, values: Mapping[str, Tensor], number: int
@@ -145,7 +146,9 @@ class Person:
     def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
         """Return log-probabilities ``[S, G]`` of actions so far, given attention ``[G]``."""
         number = len(next(iter(attention.values())))
-        total = torch.zeros(self.number, number, device=self.device)
+        known, total = self._chances.before(attention, past)
+        if total is None:
+            total = torch.zeros(self.number, number, device=self.device)
         everybody = copy(self)
         everybody.percepts = {
             **{name: value.repeat_interleave(number) for name, value in self.percepts.items()},
@@ -155,7 +158,7 @@ class Person:
         percept = self.percept[:, None] * number + torch.arange(
             number, device=self.device
         )  # [S, G]
-        for time, state in enumerate(everybody.states(past)):
+        for time, state in enumerate(everybody.states(past)[known:], known):
             mean = state.mean[None]
             acted = past.actions[time].expand(1, mean.shape[1])
             with self._conditioned():
@@ -164,6 +167,7 @@ class Person:
                 )
             found = found.expand(self.number, *found.shape[-2:])[:, 0]
             total = total + found.gather(-1, state.belief[percept])
+        self._chances.keep(attention, past, total)
         return total
 
     def _conditioned(self) -> ExitStack:

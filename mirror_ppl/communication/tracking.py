@@ -38,12 +38,7 @@ class Track:
     def leads_to(self, past: RoundSoFar) -> bool:
         """True if beliefs after these steps are those after the first steps of another round."""
         steps = len(self.states)
-        if steps > past.time:
-            return False
-        pairs = [(self.past.actions[: steps - 1], past.actions[: steps - 1])]
-        for mine, its in ((self.past.observation, past.observation), (self.past.told, past.told)):
-            pairs += [(part[:steps], its[name][:steps]) for name, part in mine.items()]
-        return all(torch.equal(one, other) for one, other in pairs)
+        return _begin_alike(self.past, past, steps, steps - 1)
 
     def of(self, percepts: Tensor) -> list[BeliefState] | None:
         """Return the states of percepts ``[u, sites]``; None if some of them were not tracked."""
@@ -96,8 +91,7 @@ class Tracks:
             if track is not None and len(track.percepts) == len(rows):
                 self.kept[:] = [one for one in self.kept if one is not track]
             if len(rows) <= PERCEPTS:
-                own = RoundSoFar(*(_copied(part) for part in vars(past).values()))
-                self.kept[:] = [*self.kept, Track(sites, rows, own, states)][-TRACKS:]
+                self.kept[:] = [*self.kept, Track(sites, rows, copied(past), states)][-TRACKS:]
         return states
 
     def _longest(
@@ -112,8 +106,50 @@ class Tracks:
         return None, []
 
 
-def _copied(part: Any) -> Any:
+@dataclass
+class RunningSum:
+    """A sum over the steps of a growing round, which goes on from where it was.
+
+    Attributes:
+        values: of sites, for which it is the sum.
+        past: the round so far.
+        total: of its steps; None before the first.
+    """
+
+    values: Mapping[str, Tensor] = field(default_factory=dict)
+    past: RoundSoFar | None = None
+    total: Tensor | None = None
+
+    def before(self, values: Mapping[str, Tensor], past: RoundSoFar) -> tuple[int, Tensor | None]:
+        """Return how many steps of a round were added up, and their sum."""
+        if self.past is None or self.values.keys() != values.keys():
+            return 0, None
+        steps = self.past.time
+        if not all(torch.equal(self.values[name], value) for name, value in values.items()):
+            return 0, None
+        return (steps, self.total) if _begin_alike(self.past, past, steps, steps) else (0, None)
+
+    def keep(self, values: Mapping[str, Tensor], past: RoundSoFar, total: Tensor) -> None:
+        """Keep the sum of a round so far."""
+        self.values, self.past, self.total = dict(values), copied(past), total
+
+
+def _begin_alike(one: RoundSoFar, other: RoundSoFar, steps: int, actions: int) -> bool:
+    """True if two rounds have the same first steps, but for what was done after some actions."""
+    if steps > other.time:
+        return False
+    pairs = [(one.actions[:actions], other.actions[:actions])]
+    for mine, its in ((one.observation, other.observation), (one.told, other.told)):
+        pairs += [(part[:steps], its[name][:steps]) for name, part in mine.items()]
+    return all(torch.equal(mine, its) for mine, its in pairs)
+
+
+def copied(past: RoundSoFar) -> RoundSoFar:
     """Return a copy, so that buffers that a caller uses again do not change what is kept."""
+    return RoundSoFar(*(_copied(part) for part in vars(past).values()))
+
+
+def _copied(part: Any) -> Any:
     if isinstance(part, Tensor):
         return part.clone()
     return {name: value.clone() for name, value in part.items()}

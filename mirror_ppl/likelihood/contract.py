@@ -22,6 +22,7 @@ from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants, has_own_program
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
+from mirror_ppl.shapes import broadcast_shapes
 from mirror_ppl.user_code import describe, is_of_package
 
 AXES = (
@@ -175,7 +176,7 @@ def _round_latents(human: HumanModel, implants: Implants, people: int) -> dict[s
         if not site["fn"].support.is_discrete:
             raise HumanModelError(f'"{name}" of round_latents is not discrete')
         shape, event = tuple(site["fn"].batch_shape), tuple(site["fn"].event_shape)
-        if event or torch.broadcast_shapes(shape, (people, 1)) != (people, 1):
+        if event or broadcast_shapes(shape, (people, 1)) != (people, 1):
             raise HumanModelError(
                 f'"{name}" of round_latents has shape {shape} and event shape {event}, expected '
                 f"({people}, 1) and () for {people} people with one round"

@@ -20,6 +20,7 @@ from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.densities import log_weighted_latents
 from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.shapes import broadcast_shapes
 
 NO_VIEW = -1
 """Index of a combination of implants that was dropped."""
@@ -216,7 +217,7 @@ class RecordedActions(TorchDistribution):
     def __init__(self, log_likelihoods: Tensor, place: Tensor, shape: torch.Size) -> None:
         self.log_likelihoods = log_likelihoods
         self.place = place
-        batch = torch.broadcast_shapes((*log_likelihoods.shape[:-1], 1), place.shape)
+        batch = broadcast_shapes((*log_likelihoods.shape[:-1], 1), place.shape)
         super().__init__(batch, shape, validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:

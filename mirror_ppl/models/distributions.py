@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Normal, constraints
 
 from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.shapes import broadcast_shapes
 
 Step = Callable[[Tensor, Tensor], Gaussian]
 
@@ -43,7 +44,7 @@ class NormalizedCategorical(Categorical):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-probability ``[...]`` of values, times the power."""
-        shape = torch.broadcast_shapes(value.shape, self.logits.shape[:-1])
+        shape = broadcast_shapes(value.shape, self.logits.shape[:-1])
         place = value.long().expand(shape)[..., None]
         found = self.logits.expand(*shape, -1).gather(-1, place).squeeze(-1)
         return found if self.power == 1 else self.power * found

@@ -46,6 +46,7 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
 from mirror_ppl.models.world_program import first_state, next_state, reward
+from mirror_ppl.shapes import broadcast_shapes
 
 Implants = Mapping[str, Tensor]
 """Values of sample sites by name, ``[..., P, 1]`` and event dimensions behind."""
@@ -218,7 +219,7 @@ class HumanModel(nn.Module):
         del step
         direction, distance = self.domain.distance(observation)
         reach = implant_priors.reach(self.domain, implants)  # [..., D]
-        batch = torch.broadcast_shapes(reach.shape[:-1], direction.shape[:-1])
+        batch = broadcast_shapes(reach.shape[:-1], direction.shape[:-1])
         own = reach.expand(*batch, -1).gather(-1, direction.expand(*batch, -1))
         return by_eye(self.domain, distance <= own)
 

@@ -21,6 +21,7 @@ from mirror_ppl.models.family import (
 )
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.shapes import broadcast_shapes
 
 
 class OneRadius(HumanModel):
@@ -80,7 +81,7 @@ class PerItem(HumanModel):
         times = [implants[site] for site in implant_priors.noticed_sites(self.domain)]
         noticed = torch.stack(torch.broadcast_tensors(*times), -1) <= step
         direction, _ = self.domain.distance(observation)
-        noticed = noticed.expand(torch.broadcast_shapes(noticed.shape, direction.shape))
+        noticed = noticed.expand(broadcast_shapes(noticed.shape, direction.shape))
         return by_eye(self.domain, noticed)
 
 

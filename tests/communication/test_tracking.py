@@ -5,6 +5,7 @@ import pickle
 import pytest
 import torch
 
+from mirror_ppl.communication import person as person_module
 from mirror_ppl.communication.hearing import HearingPerson
 from mirror_ppl.communication.person import Person, PlanningContext
 from mirror_ppl.communication.rounds import RoundSoFar
@@ -151,3 +152,22 @@ def test_many_percepts_are_not_kept(rounds):
 
     tracks.through(percepts, past, Now(**vars(initial)), lambda first: [None])  # pyright: ignore
     assert not tracks.kept
+
+
+def test_what_actions_say_of_hearing_is_added_up_once(rounds, monkeypatch):
+    moments = []
+    add = person_module.choices
+
+    def counted(*args):
+        moments.append(args)
+        return add(*args)
+
+    monkeypatch.setattr(person_module, "choices", counted)
+    person = person_of("driving", hears=0.7)
+    for step in range(STEPS):
+        PlanningContext.of(person, part(rounds, 0, step))
+    assert any(bool(told.any()) for told in part(rounds, 0, STEPS - 1).told.values())
+    assert len(moments) == STEPS - 1
+    del moments[:]
+    PlanningContext.of(person, part(rounds, 1, STEPS - 1))  # another round
+    assert len(moments) == STEPS - 1

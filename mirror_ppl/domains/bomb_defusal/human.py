@@ -39,6 +39,7 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
 from mirror_ppl.models.world_knowledge import WorldKnowledge
+from mirror_ppl.shapes import broadcast_shapes
 
 NOTICE_MEAN, NOTICE_CONCENTRATION = "notice_mean", "notice_concentration"
 READS, RULE, GUESS, FOUND, SOUGHT = "reads_type", "rule_", "guess", "found_", "sought_"
@@ -143,7 +144,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         sites = {GUESS: pyro.sample(GUESS, dist.Categorical(notices.new_full((2,), 0.5)))}
         for stage in range(STAGES):
             sought = implants.get(f"{SOUGHT}{stage}", one.new_zeros(1, 1, dtype=torch.long))
-            shape = torch.broadcast_shapes(notices.shape[:-1], sought.shape)
+            shape = broadcast_shapes(notices.shape[:-1], sought.shape)
             own = notices.expand(*shape, -1).gather(-1, sought.expand(shape)[..., None])
             name = f"{FOUND}{stage}"
             found = implant_priors.first_success(own.squeeze(-1), self.domain.horizon)
@@ -204,14 +205,14 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         stage, since = observation["ego"].long().unbind(-1)
         times = [implants[f"{FOUND}{number}"] for number in range(STAGES)]
         times = torch.stack(torch.broadcast_tensors(*times), -1)
-        shape = torch.broadcast_shapes(times.shape[:-1], stage.shape)
+        shape = broadcast_shapes(times.shape[:-1], stage.shape)
         place = stage.clamp(max=STAGES - 1).expand(shape)[..., None]
         found = times.expand(*shape, -1).gather(-1, place).squeeze(-1) <= since
         verbal = observation["verbal"][..., 0]
         reads = (implants[READS] == 1)[..., None]
         return {
             "visual": of_each(self.domain.sought, observation) & found[..., None],
-            "verbal": reads.expand(torch.broadcast_shapes(reads.shape, verbal.shape)),
+            "verbal": reads.expand(broadcast_shapes(reads.shape, verbal.shape)),
         }
 
     def perceive(self, implants, knowledge, observation, told, step):
@@ -224,7 +225,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
         view, knowledge = super().perceive(implants, knowledge, observation, told, step)
         guess = implants[GUESS].to(observation["verbal"])[..., None, None]
         known = view.visible["verbal"]
-        shape = torch.broadcast_shapes(known.shape, guess.shape[:-1])
+        shape = broadcast_shapes(known.shape, guess.shape[:-1])
         imagined = {"verbal": guess.expand(*shape, 1)}
         taken = {
             "visual": torch.zeros_like(view.visible["visual"]),
@@ -254,7 +255,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
     def _exchanged(self, presses: Tensor, rule: Tensor) -> Tensor:
         """Return values ``[..., P, B, 4]`` of buttons under a rule ``[..., P, 1]``."""
         order = self.exchanges.argmax(-1)[rule.long()]  # [..., P, 1, 4]
-        shape = torch.broadcast_shapes(order.shape, presses.shape)
+        shape = broadcast_shapes(order.shape, presses.shape)
         return presses.expand(shape).gather(-1, order.expand(shape))
 
     @torch.no_grad()

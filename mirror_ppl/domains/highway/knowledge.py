@@ -21,6 +21,7 @@ from mirror_ppl.domains.highway.messages import GROUPS, group_of
 from mirror_ppl.domains.highway.road import DECISION_TICKS, LENGTH, TICK, centre_of, lane_of
 from mirror_ppl.domains.highway.speech import AHEAD, DIRECTIONS, NOTHING, SIDES, WORDS
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
+from mirror_ppl.shapes import broadcast_shapes
 
 GROUP_OF = tuple(group_of(sector) for sector in range(SECTORS))
 """Direction of speech of each sector."""
@@ -123,7 +124,7 @@ def _once_each(function: Callable[..., Any], *parts: tuple[Tensor, int]) -> Any:
         function: of tensors ``[n, ...]``, to a tensor ``[n, ...]`` or a dataclass of such.
         parts: tensors ``[..., *]`` and their numbers of dimensions ``*``.
     """
-    batch = torch.broadcast_shapes(*(part.shape[: part.dim() - own] for part, own in parts))
+    batch = broadcast_shapes(*(part.shape[: part.dim() - own] for part, own in parts))
     flat = [
         part.expand(*batch, *part.shape[part.dim() - own :]).reshape(
             -1, *part.shape[part.dim() - own :]
