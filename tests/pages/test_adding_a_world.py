@@ -356,6 +356,19 @@ def test_people_are_played_with_the_robot_that_they_are_like(gone_through, monke
     assert "people were simulated with another self-model" in capsys.readouterr().err
 
 
+def test_a_world_with_an_impossible_record_is_refused_in_a_line(tmp_path, capsys):
+    from mirror_ppl.commands import check_domain
+
+    file = tmp_path / "power.py"
+    line = "    horizon = 8\n    record = Record(likelihood_power=0.0)\n"
+    world = FILE.read_text().replace("    horizon = 8\n", line)
+    file.write_text(f"from mirror_ppl.domains import Record\n{world}")
+    assert command(check_domain, f"{file}:RoundTable") == 2
+    error = capsys.readouterr().err
+    assert "likelihood_power must be above 0 and at most 1, not 0.0" in error
+    assert error.count("\n") == 1
+
+
 def test_settings_are_looked_over(tmp_path, capsys):
     from mirror_ppl.commands import check_domain
 
@@ -363,7 +376,6 @@ def test_settings_are_looked_over(tmp_path, capsys):
         ('record = Record(training={"phasez": 3})', "training has phasez, expected some of"),
         ('record = Record(training={"phases": 0})', "phases must be at least 1, not 0"),
         ('record = Record(planning={"horizn": 3})', "planning has horizn"),
-        ("record = Record(likelihood_power=0.0)", "likelihood_power must be above 0 and at most"),
         ('record = Record(networks={"coder": 3})', "networks: "),
         ('record = Record(people="nowhere:PEOPLE")', 'people: there is no "nowhere:PEOPLE"'),
         ('record = Record(pictures="math:PICTURES")', 'pictures: there is no "math:PICTURES"'),
