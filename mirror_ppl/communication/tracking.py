@@ -120,6 +120,10 @@ class RunningSum:
     past: RoundSoFar | None = None
     total: Tensor | None = None
 
+    def __reduce__(self) -> tuple[type[RunningSum], tuple[()]]:
+        """Leave out what can be computed again."""
+        return RunningSum, ()
+
     def before(self, values: Mapping[str, Tensor], past: RoundSoFar) -> tuple[int, Tensor | None]:
         """Return how many steps of a round were added up, and their sum."""
         if self.past is None or self.values.keys() != values.keys():

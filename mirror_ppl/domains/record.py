@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from mirror_ppl.checks import real_number
 from mirror_ppl.errors import DomainError
 
 SQIL_IN_LONG_ROUNDS: Mapping[str, Any] = {
@@ -18,6 +19,8 @@ SQIL_IN_LONG_ROUNDS: Mapping[str, Any] = {
     "patience": 60,
 }
 """Settings of SQIL for long rounds: it takes many steps until it imitates what people do."""
+LEAST_POWER = 0.001
+"""Least power of the likelihood; at 0 recordings would say nothing."""
 PARTS = ("people", "human_models", "pictures", "rounds")
 """Attributes of a record that may be strings ``"module:name"``."""
 
@@ -62,10 +65,7 @@ class Record:
     rounds: Any = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not 0 < self.likelihood_power <= 1:
-            raise DomainError(
-                f"likelihood_power must be above 0 and at most 1, not {self.likelihood_power}"
-            )
+        require_power(self.likelihood_power, "likelihood_power")
 
     def part(self, name: str) -> Any:
         """Return one of the attributes, imported if it is a string ``"module:name"``.
@@ -81,6 +81,15 @@ class Record:
             return getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
             raise DomainError(f'{name}: there is no "{value}": {error}') from error
+
+
+def require_power(value: Any, name: str) -> float:
+    """Return a power of the likelihood as a float.
+
+    Raises:
+        InputError: it is not a number from ``LEAST_POWER`` to 1.
+    """
+    return real_number(value, name, LEAST_POWER, 1.0)
 
 
 def settings_of(record: Record, kind: str, options: type) -> Mapping[str, Any]:

@@ -217,7 +217,7 @@ def play_together(
 
     Args:
         listeners: people of one population, with equally many rounds.
-        says: the communicator of each; all or none of them planners.
+        says: the communicator of each; either all are planners or none is.
         keep_log: True to keep every decision.
     """
     if not any(isinstance(say, Planning) for say in says):
@@ -241,7 +241,7 @@ def _play(
 ) -> list[tuple[Played, list[RoundSoFar]]]:
     """Play all rounds at once; also returns the observed rounds of each person."""
     domain = listeners[0].domain
-    driver = SimulatedPeople.join([one.driver for one in listeners])
+    driver = listeners[0].driver.join([one.driver for one in listeners])
     start = Start.join([one.start for one in listeners])
     channels, (people, number, _) = Channels(domain), start.action_noise.shape
     tallies = [Tally(domain, channels, number) for _ in says]

@@ -9,7 +9,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
+import torch
+
 from mirror_ppl.communication.person import Person
+from mirror_ppl.communication.planners import PLANNERS
 from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.domains.registry import code_of
 from mirror_ppl.errors import PosteriorError
@@ -32,8 +35,9 @@ from mirror_ppl.people import simulated_people
 from mirror_ppl.people.robot_like import SELF_MODEL
 from mirror_ppl.version import __version__
 
-TOGETHER = 5
-"""People who play together: many save time, and few let more processes work at once."""
+TOGETHER, PLANNED_TOGETHER = 5, 2
+"""People who play together, and with planners: a step of many takes hardly longer than one of few,
+but planners decide one after the other, and fewer together let more processes work at once."""
 
 
 @dataclass(frozen=True)
@@ -183,10 +187,12 @@ def turns(communicators: Sequence[str], people: int) -> list[Turn]:
     elif RATES_FROM in communicators:
         first.append((RATES_FROM,))
     first.sort(key=lambda names: not names[0].startswith(("mirror", "oracle")))
-    groups = [
-        tuple(range(begin, min(begin + TOGETHER, people))) for begin in range(0, people, TOGETHER)
-    ]
-    return [Turn(group, names) for names in first for group in groups]
+    found = []
+    for names in first:
+        size = PLANNED_TOGETHER if names[0] in PLANNERS else TOGETHER
+        groups = torch.arange(people).split(size)
+        found += [Turn(tuple(group.tolist()), names) for group in groups]
+    return found
 
 
 def play_all(pairing: Pairing, chosen: Sequence[Turn], runner: Runner) -> dict[str, list[Played]]:

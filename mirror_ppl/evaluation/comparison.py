@@ -207,6 +207,12 @@ def read_fit(path: Path, by: str = "loo") -> FitFile:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     if file is None or not (file.actions >= 0).any():
         raise PosteriorError(f"{path}: {LACKS[by]}")
+    power = float(attributes.get("likelihood_power", 1))
+    if by == "loo" and power != 1:
+        raise PosteriorError(
+            f"{path}: each decision counts {power:g} times in it, so that no round can be left out "
+            "of it by weighting; compare held-out rounds with --by heldout"
+        )
     if len(file.draws) < (least := LEAST_DRAWS if by == "loo" else 1):
         raise PosteriorError(f"{path}: holds {len(file.draws)} draws, expected {least} or more")
     return file

@@ -45,6 +45,7 @@ CODE = (
     *(f"evaluation/{name}.py" for name in ("played", "reachable_oracle", "study")),
     "cross_entropy.py",
     "row_hashing.py",
+    "shapes.py",
     "data/assets/*guide*.safetensors",
 )
 """Files whose change invalidates earlier results."""

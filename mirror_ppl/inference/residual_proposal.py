@@ -45,7 +45,8 @@ class ResidualProposal:
         human: the model of people; it samples ``residual_in`` and ``residual_out``.
         belief: beliefs at the selected moments ``[1, N, Z]``.
         values: action values there ``[1, N, A]``.
-        counts: expected counts of each action there ``[N, A]``.
+        counts: expected counts of each action there ``[N, A]``, each counting as often as in the
+            density (:attr:`HumanModel.likelihood_power`).
     """
 
     human: HumanModel
@@ -70,6 +71,7 @@ class ResidualProposal:
         # Counts of other moments are added to the moment with the nearest belief.
         nearest = torch.cdist(belief, belief[some]).argmin(-1)
         counts = counts.new_zeros(len(some), counts.shape[-1]).index_add(0, nearest, counts)
+        counts = human.likelihood_power * counts
         return cls(human, belief[some][None], values[some][None], counts)
 
     def gaussian(self, draws: Mapping[str, Tensor]) -> MultivariateNormal:

@@ -26,6 +26,7 @@ from mirror_ppl.models.dependencies import Sites, dependencies
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
+from mirror_ppl.user_code import is_of_package
 
 MAX_COMBINATIONS = 100_000
 
@@ -121,8 +122,8 @@ def _read(human: HumanModel, supports: Mapping[str, Tensor]) -> set[str]:
             silence = {name: torch.zeros_like(mask) for name, mask in told.items()}
             _, without = human.perceive(implants, without, now, silence, step)
             _, informed = human.perceive(implants, informed, now, told, step)
-            if implants.read >= sites.keys():
-                break  # there is no other
+            if implants.read >= sites.keys() and is_of_package(human):
+                break  # there is no other; a user's model may read what cannot be enumerated
             action = torch.full((1,), step % len(domain.actions), device=device)
             state = domain.transition(state, action)
     return implants.read

@@ -21,7 +21,7 @@ from torch import Tensor
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.likelihood.combinations import discrete_sites
-from mirror_ppl.likelihood.densities import PLATES, Given, log_prob
+from mirror_ppl.likelihood.densities import PLATES, Given, log_prob, power_of
 from mirror_ppl.likelihood.enumeration import acts_on_beliefs, draw_combinations, log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.screening import Screening
@@ -240,7 +240,7 @@ class Sequential(Compiled):
                 predicted = _over_latents(share[..., None] + logits, len(shape) + 1)
                 found.append(predicted.expand(*shape, -1))
             if _of_rounds(node):
-                so_far = so_far + log_prob(node)
+                so_far = so_far + log_prob(node) / power_of(node["fn"])
         return torch.stack(found, -2)
 
     @torch.no_grad()

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
+from mirror_ppl.domains.record import require_power
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.likelihood.agreement import check_agreement
 from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
@@ -47,9 +48,11 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
 
     Raises:
         HumanModelError: a method fails or returns the wrong thing; names the method and the line.
+        InputError: its power of the likelihood is none.
     """
     require_kind(human, HumanModel, "human")
     domain = human.domain
+    require_power(human.likelihood_power, f"{type(human).__name__}.likelihood_power")
     if not shipped and all(map(is_of_package, (human, human.self_model, domain))):
         return
     device = next(human.parameters()).device

@@ -162,6 +162,8 @@ def choices(
     belief: Tensor,
     values: Tensor,
     acted: Tensor,
+    *,
+    powered: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Log-probabilities of actions ``[..., P, N, A]`` and of the record ``[..., P, N]`` at moments.
 
@@ -174,6 +176,8 @@ def choices(
         belief: belief at each of N moments of each person, ``[P, N, Z]``.
         values: the self-model's action values there, ``[P, N, A]``.
         acted: the recorded action there, ``[P, N]``.
+        powered: whether recorded actions count as often as in posteriors
+            (:attr:`HumanModel.likelihood_power`); False for predictions, in which they count once.
     """
     with (
         poutine.block(),
@@ -187,11 +191,16 @@ def choices(
             raise HumanModelError(f'act samples "{name}" at every step; sample it in prior')
         if name != ACTION:
             check_plates(name, log_prob(node), belief.shape[-3], belief.shape[-2])
-    each = [log_prob(node) for node in nodes.values()]
+    each = [log_prob(node) / (1.0 if powered else power_of(node["fn"])) for node in nodes.values()]
     total = each[0] if len(each) == 1 else torch.stack(torch.broadcast_tensors(*each)).sum(0)
     if bool(total.isnan().any()):
         raise HumanModelError(f"{type(human).__name__}.act returns nan")
     return nodes[ACTION]["fn"].logits, total
+
+
+def power_of(distribution: Any) -> float:
+    """Return the power of a distribution's probabilities in the density; 1 for most."""
+    return getattr(distribution, "power", 1.0)
 
 
 def log_latents(

@@ -90,7 +90,7 @@ def _attentive(
     person = torch.arange(table.people, device=sight.device)[:, None]
     views = attention.sights[person, sight]  # [P, B, G']
     moments = table.moments[person[..., None], views].clamp(min=0)  # [P, B, G', T]
-    each, done = choices(human, implants, table.belief, table.values, table.acted)
+    each, done = choices(human, implants, table.belief, table.values, table.acted, powered=False)
     found = each.expand(table.people, *each.shape[-2:])[person[..., None, None], moments]
     done = done.expand(table.people, -1)[person[..., None, None], moments]
     along = done.cumsum(-1)
@@ -110,7 +110,9 @@ def _chained(
     number = len(next(iter(draws.values())))
     with conditioned(draws, number, table.people):
         implants = human.prior()
-        each, chosen = choices(human, implants, table.belief, table.values, table.acted)
+        each, chosen = choices(
+            human, implants, table.belief, table.values, table.acted, powered=False
+        )
         each = each.expand(number, table.people, *each.shape[-2:])  # [S, P, N, A]
         chosen = chosen.expand(number, *table.acted.shape)
         chances = chain.log_chances(human, implants, table.rounds)

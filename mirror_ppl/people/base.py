@@ -164,7 +164,10 @@ class SimulatedPeople(ABC):
 
     @classmethod
     def join(cls, people: Sequence[Self]) -> Self:
-        """Return people of one population together; undoes `select`."""
+        """Return people of one population together; undoes `select`.
+
+        What differs between them has to be in tensors; other fields are those of the first.
+        """
         first, *others = people
         if not others:
             return first

@@ -55,6 +55,7 @@ def _belongs_to(human: HumanModel) -> dict[str, str]:
         "domain": human.domain.name,
         "domain_version": human.domain.version,
         "human_model": type(human).__name__,
+        "likelihood_power": f"{human.likelihood_power:g}",
         "self_model": fingerprint(human.self_model),
     }
 
@@ -73,7 +74,7 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
     require_kind(human, HumanModel, "human")
     metadata, tensors = read_tensors(path, {FORMAT: "guide"})
     for name, own in _belongs_to(human).items():
-        found = metadata.get(name)
+        found = metadata.get(name, "1" if name == "likelihood_power" else None)
         if found != own:
             if name == "human_model":
                 found, own = model_name(str(found)), model_name(own)

@@ -555,6 +555,13 @@ def test_a_file_without_what_is_measured(paths, tmp_path, capsys):
         read_fit(padding, "heldout")
 
 
+def test_no_round_is_left_out_where_decisions_count_less_than_once(tmp_path, values):
+    path = write(tmp_path / "x.nc", values, np.full((2, 4, 3, 4), 0.5), likelihood_power=0.25)
+    with pytest.raises(PosteriorError, match=r"x\.nc: each decision counts 0\.25 times in it"):
+        read_fit(path)
+    assert len(read_fit(path, "heldout").draws) == 2
+
+
 @pytest.mark.parametrize("number", [0, 1])
 def test_too_few_draws(tmp_path, number):
     right = np.full((number, 4, 3, 4), 0.5)

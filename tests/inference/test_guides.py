@@ -478,6 +478,10 @@ def test_guides_of_something_else_are_refused(toy, network, tmp_path):
     other = HumanModel(toy.self_model)
     with pytest.raises(AssetError, match="is for human model ToyHuman, not mirror; train a"):
         load_guide(path, other)
+    less = ToyHuman(toy.self_model)
+    less.likelihood_power = 0.25
+    with pytest.raises(AssetError, match=r"is for likelihood power 1, not 0\.25; train a"):
+        load_guide(path, less)
 
     class Changed(ToyHuman):
         def prior(self):

@@ -105,6 +105,9 @@ def test_what_is_left_out_counts_as_what_is_nearest(human, table, monkeypatch):
     assert found.counts.shape == (5, 2)
     torch.testing.assert_close(found.counts.sum(0), counts.sum(0))
     assert found.counts.sum(-1).max() >= 20
+    monkeypatch.setattr(human, "likelihood_power", 0.25, raising=False)
+    less = ResidualProposal.of(human, table, counts)
+    torch.testing.assert_close(less.counts, found.counts / 4)
 
 
 def test_weights_are_right_whatever_is_proposed(human, table, monkeypatch):

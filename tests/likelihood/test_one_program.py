@@ -12,13 +12,17 @@ from pyro.infer import Predictive
 from pyro.infer.inspect import get_dependencies
 
 from benchmarks.one_program import CHANGES, exact_mean, toy
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.domains.driving import Driving
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.compiled import compile
+from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.people import simulate
 
+PerItem = VARIANTS["per-item"]
 STEPS, OBSERVED = 6, ("ego", "visual", "verbal")
 
 
@@ -72,6 +76,46 @@ def test_a_power_of_the_likelihood_counts_in_the_density_alone(recordings):
     one = {name: value[1] for name, value in draws.items()}
     trace = poutine.trace(poutine.condition(half.model, data=one)).get_trace(recordings)
     torch.testing.assert_close(trace.log_prob_sum(), of_half[1, 0], rtol=0, atol=1e-4)
+
+
+class OwnHalf(PerItem):
+    """The same, run as it is: it overrides the program."""
+
+    spans = PerItem.spans
+    likelihood_power = 0.5
+
+    def model(self, rounds, world=False):
+        super().model(rounds, world)
+
+
+class Searching(PerItem):
+    """Attention of which weighted samples are used."""
+
+    spans = HumanModel.spans
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", [PerItem, Searching, OwnHalf])
+def test_what_earlier_actions_say_of_attention_has_no_power(kind, monkeypatch, recordings):
+    """Predictions are those of the program, however often a decision counts in posteriors."""
+    monkeypatch.setattr(Driving, "horizon", STEPS)
+    short = recordings.select_rounds([0])
+    draws = draw_prior(PerItem(self_model()), 1, 2, 0)
+    human = kind(self_model())
+    human.likelihood_power = 1.0
+    torch.manual_seed(0)
+    expected = compile(human, short).predict(draws)
+    human.likelihood_power = 0.5
+    torch.manual_seed(0)
+    torch.testing.assert_close(compile(human, short).predict(draws), expected)
+
+
+@pytest.mark.parametrize("power", [0.0, -1.0, math.nan, 2.0, "half"])
+def test_a_power_is_a_number_up_to_1(power):
+    human = HumanModel(self_model())
+    human.likelihood_power = power
+    with pytest.raises(InputError, match=r"HumanModel\.likelihood_power must be"):
+        check_contract(human)
 
 
 # --- Pyro's own tools -------------------------------------------------------------------------

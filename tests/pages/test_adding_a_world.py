@@ -365,7 +365,7 @@ def test_a_world_with_an_impossible_record_is_refused_in_a_line(tmp_path, capsys
     file.write_text(f"from mirror_ppl.domains import Record\n{world}")
     assert command(check_domain, f"{file}:RoundTable") == 2
     error = capsys.readouterr().err
-    assert "likelihood_power must be above 0 and at most 1, not 0.0" in error
+    assert "likelihood_power must be from 0.001 to 1, not 0.0" in error
     assert error.count("\n") == 1
 
 

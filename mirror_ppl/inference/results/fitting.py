@@ -187,7 +187,8 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
             person["pareto_k"] = value if isfinite(value) else None
         if posterior.log_evidence is not None:
             value = float(posterior.log_evidence[number])
-            person["log_evidence"] = round(value, 3) if isfinite(value) else None
+            known = isfinite(value) and human.likelihood_power == 1
+            person["log_evidence"] = round(value, 3) if known else None
         if posterior.effective is not None:
             person["effective_draws"] = round(float(posterior.effective[number]), 1)
         person["check"] = predicted.checks[number]

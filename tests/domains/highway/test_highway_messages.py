@@ -99,7 +99,7 @@ def test_groups_are_described_and_counted_as_one():
     assert world.describe(seen, "visual", "both") == "both (a: size 1 m; b: size 2 m)"
     assert world.describe(seen, "visual", "c") == "c: size 3 m"
     tally = Tally(Highway(), CHANNELS, 1)
-    now = {name: part[None, None] for name, part in begun().now.items()}
+    now = {name: part[None] for name, part in begun().now.items()}
     tally.add_messages(now, torch.eye(12, dtype=torch.bool)[:1], torch.tensor([True]))
     assert {name: count.tolist() for name, count in tally.items.items()} == {
         "visual": [1], "verbal": [0],
