@@ -139,8 +139,8 @@ def main(options: Options) -> int:
     _show(calibration, guide)
     if counted < 1:
         print(
-            f"A decision counts once here, {counted:g} times in fits of {domain.name}, where the "
-            "robot's values err: their intervals are wider than those tested"
+            f"A decision counts once here and {counted:g} times in fits of this model, whose "
+            "intervals are therefore wider than those tested"
         )
     print(f"{folder / 'calibration.nc'}: ranks of every person")
     for path in drawn:

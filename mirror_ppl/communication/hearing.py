@@ -6,8 +6,9 @@ person (:class:`mirror_ppl.models.family.HardOfHearing`), drawn from::
 
     p(hears | psi, rounds so far)  ~  p(hears) prod_t p(a_t | psi, hears, a_{1:t-1}, told_{1:t})
 
-over the assisted rounds (:meth:`HearingPerson.after`) and the present round so far. The other
-implants are updated only by the next fit.
+over the assisted rounds (:meth:`HearingPerson.after`) and the present round so far, with the
+actions' probabilities to the model's ``likelihood_power``. The other implants are updated only by
+the next fit.
 """
 
 from __future__ import annotations

@@ -24,9 +24,9 @@ class NormalizedCategorical(Categorical):
 
     Args:
         log_probabilities: of each value, ``[..., n]``.
-        power: of the probabilities in the density that an observed value contributes: the
-            likelihood of a power posterior. Values are drawn with the probabilities themselves.
-            It is no ``poutine.scale``, as enumerated sites need a common one.
+        power: of the probabilities in ``log_prob``, the likelihood of a power posterior. Values
+            are drawn with the probabilities themselves, whose logarithms are ``logits``. It is no
+            ``poutine.scale``, as enumerated sites need a common one.
     """
 
     def __init__(self, log_probabilities: Tensor, power: float = 1.0) -> None:

@@ -57,7 +57,8 @@ def test_an_engine_is_tested_with_decisions_that_count_in_full(whole, tmp_path, 
     args = quick(tmp_path)
     (tmp_path / "toy.py").write_text(TOY.replace("pass", "likelihood_power = 0.25"))
     assert command(calibrate, *args) == 0
-    assert "A decision counts once here, 0.25 times in fits of driving" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "A decision counts once here and 0.25 times in fits of this model" in said
     found = Calibration.load(tmp_path / "out" / "calibration.nc").data
     assert found.drop_attrs().identical(whole.drop_attrs())
 
