@@ -12,8 +12,10 @@ from mirror_ppl.communication.communicator import Decision, Gain
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.objectives import Valued
 from mirror_ppl.communication.search import Found
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import Driving, DrivingState
 from mirror_ppl.domains.driving.people import Memory, TaskDrivers
+from mirror_ppl.domains.highway import Highway
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.evaluation.assistance import (
     COMMUNICATORS,
@@ -25,7 +27,8 @@ from mirror_ppl.evaluation.assistance import (
     play_together,
     speaker,
 )
-from mirror_ppl.people import draw_starts
+from mirror_ppl.evaluation.assistance_cells import turns
+from mirror_ppl.people import draw_starts, simulated_people
 from mirror_ppl.people.recordings import Start
 
 DOMAIN = Driving()
@@ -213,6 +216,34 @@ def test_people_who_play_together_play_as_each_alone(name):
         assert without_time(found) == without_time(alone)
         assert found.log == alone.log
     assert len({tuple(found.task) for found in together}) == 3
+
+
+@pytest.mark.parametrize("world", ["search_rescue", "bomb_defusal", "highway"])
+def test_rounds_of_people_who_play_together_may_end_at_different_steps(world, monkeypatch):
+    monkeypatch.setattr(Highway, "horizon", 2)
+    setting = get_domain(world).settings[-1]
+    everybody = simulated_people(world, setting, "diverse", 3, 7)
+    people = listeners(everybody, 3, setting, 2, 7)
+    says = [speaker("nearest", one, PlannerOptions(), 0) for one in people]
+    together = play_together(people, says)
+    for found, one in zip(together, people, strict=True):
+        alone = play(one, speaker("nearest", one, PlannerOptions(), 0))
+        assert found.task == pytest.approx(alone.task, abs=1e-4)
+        assert (found.items, found.steps) == (alone.items, alone.steps)
+    if world == "search_rescue":
+        assert len({found.steps for found in together}) > 1
+
+
+def test_people_are_divided_into_groups_that_play_together():
+    found = turns(["none", "mirror", "random", "oracle"], 7)
+    numbers = {one.communicators: [] for one in found}
+    for one in found:
+        numbers[one.communicators].append(one.people)
+    assert [*numbers] == [("oracle",), ("mirror", "random"), ("none",)]
+    assert numbers[("none",)] == numbers[("oracle",)] == [(0, 1, 2, 3, 4), (5, 6)]
+    assert numbers[("mirror", "random")] == [(0, 1), (2, 3), (4, 5), (6,)]
+    assert found[0].label == "oracle, people 1 to 5"
+    assert turns(["none"], 1)[0].label == "none, person 1"
 
 
 def test_all_say_everything_and_none_nothing():
