@@ -34,7 +34,7 @@ def played(listener):
 
 
 def pairing(listener):
-    return SimpleNamespace(domain=listener.domain, listener=lambda *_, **__: listener)
+    return SimpleNamespace(domain=listener.domain, listeners=lambda *_, **__: [listener])
 
 
 def stacked(states, name):

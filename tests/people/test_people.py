@@ -30,6 +30,7 @@ from mirror_ppl.domains.driving.populations import (
     derived_generator,
     reaches,
 )
+from mirror_ppl.domains.highway import Highway
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.people import populations_of, simulate
 from mirror_ppl.people.recordings import draw_starts, record
@@ -451,8 +452,9 @@ def test_the_same_call_gives_the_same_recordings(fog):
 
 
 @pytest.mark.parametrize("domain", list(DOMAINS))
-def test_messages_are_recorded_and_as_frequent_as_asked_for(domain):
+def test_messages_are_recorded_and_as_frequent_as_asked_for(domain, monkeypatch):
     """Of what can be told; the people are the same, and the rounds begin alike."""
+    monkeypatch.setattr(Highway, "horizon", 16)
     number = 4 if domain == "highway" else 20  # of many steps
     quiet = simulate(domain, people=2, rounds=number, seed=0)
     spoken_to = simulate(domain, people=2, rounds=number, seed=0, told=0.1)
