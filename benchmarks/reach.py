@@ -3,7 +3,7 @@ r"""How often posteriors of drivers hold their true reach: the table of docs/hig
     python -m mirror_ppl.fit --domain highway --setting fog --population diverse \
         --train-rounds 20 --explore 0 --out runs/highway_0
     python -m mirror_ppl.simulate --domain highway --setting fog --population diverse \
-        --people 30 --rounds 20 --seed 1 --out runs/highway_1.nc
+        --people 40 --rounds 20 --seed 1 --out runs/highway_1.nc
     python -m mirror_ppl.fit --demos runs/highway_1.nc --train-rounds 19 --explore 0 \
         --out runs/highway_1
     python -m benchmarks.reach runs/highway_0 runs/highway_1

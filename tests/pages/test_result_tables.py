@@ -36,18 +36,18 @@ def test_the_table_of_reaches_is_what_its_rows_say():
     found = page.partition("<!-- reach -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == table(rows)
     people = {(row["fit"], row["person"]): row for row in rows}.values()
-    assert len(people) == 40
+    assert len(people) == 50
     clear = sum(float(row["assumes_clear"]) == 1 for row in people)
     unreliable = sum(float(row["pareto_k"]) > 0.7 for row in people)
     suspect = sum(row["verdict"] == "suspect" for row in people)
     nats = [
-        f"{sum(float(row[name]) for row in people) / 40:.2f}".lstrip("0")
+        f"{sum(float(row[name]) for row in people) / 50:.2f}".lstrip("0")
         for name in ("nll", "floor", "nll_no_implants", "nll_base_rate")
     ]
     words = " ".join(page.split())
-    assert f"{clear} of 40 are found to take the road for clear" in words
+    assert f"{clear} of 50 are found to take the road for clear" in words
     assert f"Importance weights of {unreliable} are unreliable" in words
-    assert f"{suspect} of 40 are `suspect`" in words
+    assert f"{suspect} of 50 are `suspect`" in words
     own, entropy, none, base = nats
     assert (
         f"{own}; the drivers' own entropy is {entropy}, a robot without implants has {none}"
