@@ -37,6 +37,10 @@ def shipped_guide(domain: str, human_model: str = FIRST) -> Path:
     return asset_path(f"{domain}_guide{which}.safetensors")
 
 
+BEFORE = {"likelihood_power": "1"}
+"""Metadata that files from before they were kept do not have."""
+
+
 def save_guide(
     guide: AmortizedGuide, human: HumanModel, path: Path, card: Mapping[str, Any]
 ) -> None:
@@ -74,7 +78,7 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
     require_kind(human, HumanModel, "human")
     metadata, tensors = read_tensors(path, {FORMAT: "guide"})
     for name, own in _belongs_to(human).items():
-        found = metadata.get(name, "1" if name == "likelihood_power" else None)
+        found = metadata.get(name, BEFORE.get(name))
         if found != own:
             if name == "human_model":
                 found, own = model_name(str(found)), model_name(own)
@@ -129,6 +133,6 @@ def _shipped_network(human: HumanModel, names: Sequence[str]) -> AmortizedGuide 
     except (AssetError, IndexError):
         return None
     metadata, _ = read_tensors(path, {FORMAT: "guide"})
-    if _belongs_to(human).items() <= metadata.items():
+    if _belongs_to(human).items() <= {**BEFORE, **metadata}.items():
         return load_guide(path, human)[0]
     return None
