@@ -20,6 +20,8 @@ from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import fingerprint, read_tensors, save_tensors
 
 FORMAT = "mirror_ppl guide 3"
+BEFORE = {"likelihood_power": "1"}
+"""Metadata that files from before they were kept do not have."""
 FIRST = next(iter(VARIANTS))
 
 
@@ -35,10 +37,6 @@ def shipped_guide(domain: str, human_model: str = FIRST) -> Path:
     """
     which = "" if human_model == FIRST else f"_{human_model.replace('-', '_')}"
     return asset_path(f"{domain}_guide{which}.safetensors")
-
-
-BEFORE = {"likelihood_power": "1"}
-"""Metadata that files from before they were kept do not have."""
 
 
 def save_guide(
