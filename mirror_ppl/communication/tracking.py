@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -91,7 +90,7 @@ class Tracks:
             if track is not None and len(track.percepts) == len(rows):
                 self.kept[:] = [one for one in self.kept if one is not track]
             if len(rows) <= PERCEPTS:
-                self.kept[:] = [*self.kept, Track(sites, rows, copied(past), states)][-TRACKS:]
+                self.kept[:] = [*self.kept, Track(sites, rows, _copied(past), states)][-TRACKS:]
         return states
 
     def _longest(
@@ -135,7 +134,7 @@ class RunningSum:
 
     def keep(self, values: Mapping[str, Tensor], past: RoundSoFar, total: Tensor) -> None:
         """Keep the sum of a round so far."""
-        self.values, self.past, self.total = dict(values), copied(past), total
+        self.values, self.past, self.total = dict(values), _copied(past), total
 
 
 def _begin_alike(one: RoundSoFar, other: RoundSoFar, steps: int, actions: int) -> bool:
@@ -148,12 +147,10 @@ def _begin_alike(one: RoundSoFar, other: RoundSoFar, steps: int, actions: int) -
     return all(torch.equal(mine, its) for mine, its in pairs)
 
 
-def copied(past: RoundSoFar) -> RoundSoFar:
+def _copied(past: RoundSoFar) -> RoundSoFar:
     """Return a copy, so that buffers that a caller uses again do not change what is kept."""
-    return RoundSoFar(*(_copied(part) for part in vars(past).values()))
-
-
-def _copied(part: Any) -> Any:
-    if isinstance(part, Tensor):
-        return part.clone()
-    return {name: value.clone() for name, value in part.items()}
+    observation, told = (
+        {name: value.clone() for name, value in part.items()}
+        for part in (past.observation, past.told)
+    )
+    return RoundSoFar(observation, past.actions.clone(), told)

@@ -280,9 +280,9 @@ def _play(
                 decided = decisions[person]
                 logs[person] += [
                     {"round": r, "step": step}
-                    | _entry(domain, channels, own[r], int(action[person, r]), chances)
+                    | _entry(domain, channels, own[r], int(action[person, r]), each)
                     | ({} if decided is None else audit(decided[r]))
-                    for r, chances in enumerate(probability[person])
+                    for r, each in enumerate(probability[person])
                     if going[r]
                 ]
             rounds[person] = [

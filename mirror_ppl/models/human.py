@@ -315,8 +315,8 @@ class HumanModel(nn.Module):
 
         Its log-probability counts :attr:`likelihood_power` times in the density.
         """
-        chances = self.act(implants, belief, values)
-        likelihood = NormalizedCategorical(chances, self.likelihood_power)
+        log_probabilities = self.act(implants, belief, values)
+        likelihood = NormalizedCategorical(log_probabilities, self.likelihood_power)
         return pyro.sample(ACTION, likelihood, obs=action)
 
     def model(self, rounds: Demonstrations, world: bool = False) -> None:
