@@ -78,11 +78,10 @@ def test_a_power_of_the_likelihood_counts_in_the_density_alone(recordings):
     torch.testing.assert_close(trace.log_prob_sum(), of_half[1, 0], rtol=0, atol=1e-4)
 
 
-class OwnHalf(PerItem):
+class StepByStep(PerItem):
     """The same, run step by step, as it overrides the program."""
 
     spans = PerItem.spans
-    likelihood_power = 0.5
 
     def model(self, rounds, world=False):
         super().model(rounds, world)
@@ -95,7 +94,7 @@ class Searching(PerItem):
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("kind", [PerItem, Searching, OwnHalf])
+@pytest.mark.parametrize("kind", [PerItem, Searching, StepByStep])
 def test_what_earlier_actions_say_of_attention_has_no_power(kind, monkeypatch, recordings):
     """Predictions are those of the program, however often a decision counts in posteriors."""
     monkeypatch.setattr(Driving, "horizon", STEPS)
