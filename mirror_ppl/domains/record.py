@@ -21,6 +21,8 @@ SQIL_IN_LONG_ROUNDS: Mapping[str, Any] = {
 """Settings of SQIL for long rounds: it takes many steps until it imitates what people do."""
 LEAST_POWER = 0.001
 """Least power of the likelihood; at 0 recordings would say nothing."""
+LEAST_SIGHT_SCALE = 0.1
+"""Least ``sight_scale``; below that, directions would be equal."""
 PARTS = ("people", "human_models", "pictures", "rounds")
 """Attributes of a record that may be strings ``"module:name"``."""
 
@@ -41,6 +43,9 @@ class Record:
         likelihood_power: power of the likelihood of recorded actions in posteriors. Below 1 it
             takes account of errors of the robot's values that are alike in successive decisions,
             which the model would otherwise take for evidence on a person.
+        sight_scale: bins by which the prior ties how far people see in the directions of a group
+            (``direction_groups``); None if it does not
+            (:func:`mirror_ppl.models.implants.alike`).
         measured: rounds on which a self-model's returns and agreement are measured.
         slow: models that `evaluate` compares only on request, because they take minutes: `svi`
             with many values to sum over at each step, and SQIL with long rounds.
@@ -57,6 +62,7 @@ class Record:
     planning: Mapping[str, Any] = field(default_factory=dict)
     baselines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     likelihood_power: float = 1.0
+    sight_scale: float | None = None
     measured: int = 4000
     slow: tuple[str, ...] = ("mirror-svi", "sqil-everything", "sqil-pooled")
     people: Any = None
@@ -66,6 +72,8 @@ class Record:
 
     def __post_init__(self) -> None:
         require_power(self.likelihood_power, "likelihood_power")
+        if self.sight_scale is not None:
+            real_number(self.sight_scale, "sight_scale", LEAST_SIGHT_SCALE)
 
     def part(self, name: str) -> Any:
         """Return one of the attributes, imported if it is a string ``"module:name"``.

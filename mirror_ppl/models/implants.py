@@ -44,17 +44,51 @@ def perceptual_implants(
 ) -> dict[str, Tensor]:
     """Sample what a person sees and assumes, as indices that can be enumerated.
 
-    ``sight_<direction>`` is an index into the domain's ``reach_bins``, uniform. The data identify a
-    threshold only up to the distances that can occur, so these bins lose nothing.
+    ``sight_<direction>`` is an index into the domain's ``reach_bins``. The data identify a
+    threshold only up to the distances that can occur, so these bins lose nothing. The prior is
+    uniform, except in worlds whose record has a ``sight_scale``: there, each direction depends on
+    the first one of its group (`alike`).
     """
-    implants = {site: reach_implant(site, domain, like) for site in sight_sites(domain)}
+    sites, scale = sight_sites(domain), domain.record.sight_scale
+    implants: dict[str, Tensor] = {}
+    if scale is not None:
+        given = alike(len(domain.reach_bins), scale).to(like)
+        for first, *others in domain.direction_groups:
+            implants[sites[first]] = reach_implant(sites[first], domain, like)
+            near = given[implants[sites[first]]]
+            for place in others:
+                implants[sites[place]] = reach_implant(sites[place], domain, like, near)
+    for site in sites:
+        if site not in implants:
+            implants[site] = reach_implant(site, domain, like)
     return implants | assumption_implants(domain, like, assumption_probability)
 
 
-def reach_implant(site: str, domain: Domain, like: Tensor) -> Tensor:
-    """Sample how far a person sees, as an index into the domain's ``reach_bins``; uniform."""
-    bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
-    return pyro.sample(site, dist.Categorical(bins / bins.sum()))
+def reach_implant(
+    site: str, domain: Domain, like: Tensor, probability: Tensor | None = None
+) -> Tensor:
+    """Sample how far a person sees, as an index into the domain's ``reach_bins``.
+
+    Args:
+        site: name of the site.
+        domain: the world.
+        like: a tensor of the dtype and on the device of the prior.
+        probability: of each bin, ``[..., bins]``; equal unless given.
+    """
+    if probability is None:
+        bins = torch.ones(len(domain.reach_bins), dtype=like.dtype, device=like.device)
+        probability = bins / bins.sum()
+    return pyro.sample(site, dist.Categorical(probability))
+
+
+def alike(bins: int, scale: float) -> Tensor:
+    """Return ``p(i | j)``, ``[j, i]``, of bins of reach: proportional to ``exp(-|i - j| / scale)``.
+
+    People mostly see about equally far in directions next to each other. At a distance of
+    ``scale`` bins the probability is 1/e of that of the same bin.
+    """
+    place = torch.arange(bins, dtype=torch.get_default_dtype())
+    return torch.softmax(-(place - place[:, None]).abs() / scale, -1)
 
 
 def noticed_sites(domain: Domain) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ RECORD = Record(
         "assumed": 0.5,
     },
     likelihood_power=0.25,
+    sight_scale=1.0,
     measured=100,
     people="mirror_ppl.domains.highway.participants:DRIVERS",
     pictures="mirror_ppl.domains.highway.sight:PICTURES",
