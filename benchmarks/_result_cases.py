@@ -84,7 +84,7 @@ def posterior_values(path: Path, domain: str) -> Values:
 def population_values(path: Path) -> Values:
     """What `fit --prior-from` reads of a posterior."""
     found = load_population(path, Pooling(human_of("driving")), "fog")
-    parts = {"chances": found.chances, "mean": found.mean, "spread": found.spread}
+    parts = {"probabilities": found.probabilities, "mean": found.mean, "spread": found.spread}
     return {f"{name}_{part}": value for part, own in parts.items() for name, value in own.items()}
 
 

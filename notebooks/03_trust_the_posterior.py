@@ -184,7 +184,7 @@ calibration = calibrate(
     seed=0,
 )
 print("rejected:", calibration.rejected or "nothing")
-columns = ["site", "rounds", "p_value", "coverage_50", "coverage_90", "sharpness"]
+columns = ["site", "rounds", "p_value", "coverage_50", "coverage_90", "contraction"]
 calibration.table()[columns].round(2)
 
 # %%
@@ -193,8 +193,8 @@ from mirror_ppl.plots.calibration import plot_ecdf
 plot_ecdf(calibration)
 
 # %% [markdown]
-# Lines within the bands are compatible with calibration. `sharpness` is the width of the 90%
-# interval relative to the prior's: 1 for the prior, 0 for certainty.
+# Lines within the bands are compatible with calibration. `contraction` is one less the width of the
+# 90% interval relative to the prior's: 0 for the prior, 1 for certainty.
 #
 # ## 4. Identifiability
 #

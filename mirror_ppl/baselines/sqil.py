@@ -138,11 +138,11 @@ class SoftQ(RecurrentNetworks):
             )
             inputs.append(network_inputs(domain, observation, seen, heard, last))
             hidden = self.step(hidden, inputs[-1])
-            chances = self.act(hidden).exp()
+            probabilities = self.act(hidden).exp()
             last = torch.stack(
                 [
                     torch.multinomial(own, 1, generator=generator).squeeze(-1)
-                    for own, generator in zip(chances, generators, strict=True)
+                    for own, generator in zip(probabilities, generators, strict=True)
                 ]
             )
             actions.append(torch.where(domain.over(state), -1, last))

@@ -167,15 +167,15 @@ def _show(calibration: Calibration, guide: str) -> None:
     table = Table(
         title=f"Calibration of {guide}: {calibration.people} people drawn from the prior",
         caption="p: of uniform ranks; 50 to 90%: share of people whose interval holds the truth; "
-        "sharpness: 1 says no more than the prior, 0 is sure; k: share of people whose importance "
-        "weights are not to be trusted",
+        "contraction: 0 for the prior, 1 for certainty; k: share of people whose importance "
+        "weights are unreliable",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
     table.add_column("implant", no_wrap=True)
-    for name in ("rounds", "p", "50%", "80%", "90%", "sharpness", "k"):
+    for name in ("rounds", "p", "50%", "80%", "90%", "contraction", "k"):
         table.add_column(name, justify="right", no_wrap=True)
     rejected = set(calibration.rejected)
     for row in calibration.table().to_dict("records"):
@@ -186,7 +186,7 @@ def _show(calibration: Calibration, guide: str) -> None:
             f"{row['rounds']}",
             f"{row['p_value']:.3f}" + (" rejected" if wrong else ""),
             *(f"{100 * row[f'coverage_{level}']:.1f}" for level in (50, 80, 90)),
-            f"{row['sharpness']:.2f}",
+            f"{row['contraction']:.2f}",
             "-" if weights != weights else f"{100 * weights:.0f}%",
         )
     console_for_tables(WIDTH).print(table)

@@ -149,10 +149,10 @@ class Decision:
                 "chosen": index == self.chosen,
             }
             if valued is not None and valued.actions is not None:
-                chances = valued.actions[index, 0].tolist()
+                probabilities = valued.actions[index, 0].tolist()
                 row |= {
                     f"p({action})": chance
-                    for action, chance in zip(self.domain.actions, chances, strict=True)
+                    for action, chance in zip(self.domain.actions, probabilities, strict=True)
                 }
             rows.append(row)
         return pd.DataFrame(rows).sort_values("gain", ascending=False, kind="stable")
@@ -206,8 +206,8 @@ class Decision:
         # Their lane at later steps is not known.
         deed = self.domain.deed(self.observation, None if step else ranked[0][1], action)
         when = "" if step == 0 else f" in {step} step{'s' * (step > 1)}"
-        chances = f"with probability {without:.2f}; with the message, {told:.2f}"
-        return f"{text}: they would {deed}{when} {chances} {worth}"
+        likely = f"with probability {without:.2f}; with the message, {told:.2f}"
+        return f"{text}: they would {deed}{when} {likely} {worth}"
 
     @property
     def advice(self) -> str:

@@ -45,14 +45,14 @@ class HearingPerson(Person):
         names = [HEARS + modality.name for modality in human.domain.modalities]
         patterns = torch.tensor([*product((0, 1), repeat=len(names))], device=own.device)
         self.patterns = dict(zip(names, patterns.T, strict=True))
-        chances = []
+        probabilities = []
         for name, pattern in self.patterns.items():
             chance, given = hears, own.draws.get(name)
             if given is not None:
                 chance = (float(given.sum()) + hears) / (own.number + 1)
-            chances.append(torch.where(pattern == 1, chance, 1 - chance))
+            probabilities.append(torch.where(pattern == 1, chance, 1 - chance))
         # [S, H], by draw and pattern; from the second round on they differ between draws.
-        self.log_hears = torch.stack(chances).log().sum(0).expand(own.number, -1)
+        self.log_hears = torch.stack(probabilities).log().sum(0).expand(own.number, -1)
         generator = torch.Generator().manual_seed(0)
         self.ladder = (torch.randperm(own.number, generator=generator) + 0.5) / own.number
         self.ladder = self.ladder.to(own.device)
@@ -75,9 +75,9 @@ class HearingPerson(Person):
     @property
     def hears(self) -> dict[str, float]:
         """Probability that messages of each modality reach them, averaged over draws."""
-        chances = self.log_hears.softmax(-1).mean(0)
+        probabilities = self.log_hears.softmax(-1).mean(0)
         return {
-            name.removeprefix(HEARS): float(chances @ pattern.to(chances))
+            name.removeprefix(HEARS): float(probabilities @ pattern.to(probabilities))
             for name, pattern in self.patterns.items()
         }
 
@@ -91,17 +91,17 @@ class HearingPerson(Person):
     def _log_likelihoods(self, past: RoundSoFar) -> Tensor:
         """Return log-likelihoods of actions so far in a round under each pattern, ``[S, H]``."""
         if not self.human.has_round_latents:
-            return self._log_chances(self.patterns, past)
-        attention, log_chances = self._attending(past)
+            return self._log_probabilities(self.patterns, past)
+        attention, log_probabilities = self._attending(past)
         number, patterns = len(next(iter(attention.values()))), len(self.log_hears[0])
         values = {name: value.repeat(patterns) for name, value in attention.items()}
         values |= {name: own.repeat_interleave(number) for name, own in self.patterns.items()}
-        found = self._log_chances(values, past).unflatten(-1, (patterns, number))
-        return (found + log_chances[:, None]).logsumexp(-1)
+        found = self._log_probabilities(values, past).unflatten(-1, (patterns, number))
+        return (found + log_probabilities[:, None]).logsumexp(-1)
 
-    def _drawn(self, log_chances: Tensor) -> dict[str, Tensor]:
+    def _drawn(self, log_probabilities: Tensor) -> dict[str, Tensor]:
         """Draw a pattern for each draw by stratified sampling, ``[S, 1, 1]`` by site."""
-        steps = log_chances.softmax(-1).cumsum(-1)
+        steps = log_probabilities.softmax(-1).cumsum(-1)
         chosen = (self.ladder[:, None] > steps).sum(-1).clamp(max=steps.shape[-1] - 1)
         return {name: pattern[chosen][:, None, None] for name, pattern in self.patterns.items()}
 
@@ -113,7 +113,7 @@ class HearingPerson(Person):
         }
         self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
         self.percept_count = int(self.percept.max()) + 1
-        self._chances = RunningSum()
+        self._probabilities = RunningSum()
 
 
 def hearing(person: Person, hears: float) -> Person:

@@ -122,17 +122,17 @@ class ExpectedUtility:
                 observation = {
                     name: part.flatten(0, 1) for name, part in rollouts.observation(step).items()
                 }
-                chances = tree.act(observation, step, channels)
+                probabilities = tree.act(observation, step, channels)
                 gains = (
                     rollouts.advantages(step, self.discount)
                     if self.terminal_value
                     else rollouts.rewards(step)
                 )
                 gained = gains[tree.draw_of_world(), tree.path]
-                utility += tree.of_each(discounts[step] * (chances * gained).sum(-1))
-                predicted.append(tree.of_each(chances).mean(1))
+                utility += tree.of_each(discounts[step] * (probabilities * gained).sum(-1))
+                predicted.append(tree.of_each(probabilities).mean(1))
                 if step < horizon - 1 or (self.terminal_value and ends):
-                    tree.branch(chances, rollouts, step, self.enumerate_above, seed)
+                    tree.branch(probabilities, rollouts, step, self.enumerate_above, seed)
             if self.terminal_value and ends:
                 # There is no terminal value where the round ends.
                 left = rollouts.values(horizon)[tree.draw_of_world(), tree.path]
@@ -219,8 +219,8 @@ class _Tree:
         place = torch.arange(len(self.draw), device=key.device) - begin[self.draw]
         padded = torch.zeros(len(counts), int(counts.max()), dtype=torch.long, device=key.device)
         padded[self.draw, place] = self.state.belief[self.belief]
-        log_chances = self.person.act(beliefs[padded], values[padded])[self.draw, place]
-        return self.weight[:, None] * log_chances.exp()
+        log_probabilities = self.person.act(beliefs[padded], values[padded])[self.draw, place]
+        return self.weight[:, None] * log_probabilities.exp()
 
     def _merge(self, rest: Tensor) -> None:
         """Merge groups that have the same sequences and the same ``rest`` ``[C, l, N]``."""
@@ -242,29 +242,29 @@ class _Tree:
         self.belief = self.belief[course]
 
     def branch(
-        self, chances: Tensor, rollouts: RolloutTree, step: int, threshold: float, seed: int
+        self, probabilities: Tensor, rollouts: RolloutTree, step: int, threshold: float, seed: int
     ) -> None:
         """Extend the sequences by one action.
 
         Args:
-            chances: weights of the extended sequences ``[E, A]``.
+            probabilities: weights of the extended sequences ``[E, A]``.
             rollouts: states that they lead to.
             step: number of actions of the present sequences.
             threshold: ``enumerate_above``, see :class:`ExpectedUtility`.
             seed: of the sampling, which is the same for all candidates.
         """
-        weight = chances
+        weight = probabilities
         if threshold > 0:
-            small = chances < threshold
+            small = probabilities < threshold
             # Systematic sampling: improbable siblings share one number, so that the number kept
             # differs from its expectation by less than one.
-            total = torch.where(small, chances, 0.0).cumsum(-1) / threshold
+            total = torch.where(small, probabilities, 0.0).cumsum(-1) / threshold
             place = torch.full_like(self.draw, step)
             noise = uniform_of(seed, place, self.draw, rollouts.names(step)[self.path])
             shifted = total + noise[:, None]
             passed = shifted.floor()
             before = torch.cat([torch.zeros_like(passed[:, :1]), passed[:, :-1]], -1)
-            weight = torch.where(small, threshold * (passed - before), chances)
+            weight = torch.where(small, threshold * (passed - before), probabilities)
         course, action = (weight > 0).nonzero(as_tuple=True)
         self.weight = weight[course, action]
         self.path = rollouts.follow(step, self.path[course], action)

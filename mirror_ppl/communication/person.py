@@ -74,7 +74,7 @@ class Person:
         self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
         self.percept_count = int(self.percept.max()) + 1
         self._tracks = Tracks()
-        self._chances = RunningSum()
+        self._probabilities = RunningSum()
 
     def _distinct_percepts(
         self, values: Mapping[str, Tensor], number: int
@@ -96,10 +96,10 @@ class Person:
         if not self.human.has_round_latents:
             return self
         values, log_prior = self._attending(past)
-        log_chances = self._log_chances(values, past) + log_prior
+        log_probabilities = self._log_probabilities(values, past) + log_prior
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(past.time)
-            chosen = torch.multinomial(log_chances.softmax(-1), 1).squeeze(-1)
+            chosen = torch.multinomial(log_probabilities.softmax(-1), 1).squeeze(-1)
         own = {name: value[chosen] for name, value in values.items()}
         person = copy(self)
         person.percepts, person.percept = self._distinct_percepts(
@@ -143,10 +143,10 @@ class Person:
         """Proposed values that do not depend on the round; computed once."""
         return self._attention.values(None, 0)
 
-    def _log_chances(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
+    def _log_probabilities(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
         """Return log-probabilities ``[S, G]`` of actions so far, given attention ``[G]``."""
         number = len(next(iter(attention.values())))
-        known, total = self._chances.before(attention, past)
+        known, total = self._probabilities.before(attention, past)
         if total is None:
             total = torch.zeros(self.number, number, device=self.device)
         everybody = copy(self)
@@ -167,7 +167,7 @@ class Person:
                 )
             found = found.expand(self.number, *found.shape[-2:])[:, 0]
             total = total + found.gather(-1, state.belief[percept])
-        self._chances.keep(attention, past, total)
+        self._probabilities.keep(attention, past, total)
         return total
 
     def _conditioned(self) -> ExitStack:

@@ -42,8 +42,8 @@ class FixedSites(Messenger):
 
     def _pyro_sample(self, message: Any) -> None:
         if message["name"] in self.values:
-            chances = message["fn"].probs
-            only = torch.zeros_like(chances)
+            probabilities = message["fn"].probs
+            only = torch.zeros_like(probabilities)
             only[..., int(self.values[message["name"]])] = 1.0
             message["fn"] = Categorical(only)
 

@@ -24,7 +24,7 @@ class Played:
         mishaps: number of steps with the domain's mishap, ``[R]``.
         items: number of communicated items by modality, ``[R]`` each.
         relevant: number of relevant ones, by notion of relevance and modality, ``[R]``.
-        chances: number of communicable items, by modality, summed over rounds.
+        communicable: number of communicable items, by modality, summed over rounds.
         steps: number of decisions: steps of all rounds before their ends.
         milliseconds: mean time of a decision.
         log: one entry per decision, if requested.
@@ -37,7 +37,7 @@ class Played:
     mishaps: list[int]
     items: dict[str, list[int]]
     relevant: dict[str, dict[str, list[int]]]
-    chances: dict[str, int]
+    communicable: dict[str, int]
     steps: int
     milliseconds: float
     log: list[dict[str, Any]] = field(default_factory=list)
@@ -62,7 +62,7 @@ class Played:
                 }
                 for notion, own in first.relevant.items()
             },
-            {name: sum(one.chances[name] for one in parts) for name in first.chances},
+            {name: sum(one.communicable[name] for one in parts) for name in first.communicable},
             steps,
             sum(one.milliseconds * one.steps for one in parts) / steps,
             [entry | {"round": place} for place, one in enumerate(parts) for entry in one.log],
@@ -75,7 +75,9 @@ class Played:
 
     def rates(self) -> dict[str, float]:
         """Share of the communicable items that were communicated, by modality."""
-        return {name: sum(items) / max(self.chances[name], 1) for name, items in self.items.items()}
+        return {
+            name: sum(items) / max(self.communicable[name], 1) for name, items in self.items.items()
+        }
 
 
 class Tally:
@@ -87,7 +89,7 @@ class Tally:
         self.mishaps = torch.zeros(rounds, dtype=torch.long)
         self.items = {m.name: torch.zeros_like(self.mishaps) for m in self.domain.modalities}
         self.relevant: dict[str, dict[str, Tensor]] = {}
-        self.chances = dict.fromkeys(self.items, 0)
+        self.communicable = dict.fromkeys(self.items, 0)
         self.steps = 0
 
     def add_messages(self, observation: Observation, flags: Tensor, under_way: Tensor) -> None:
@@ -98,7 +100,7 @@ class Tally:
         messages = self._by_modality(flags)
         for name, mask in messages.items():
             self.items[name] += mask.sum(-1)
-            self.chances[name] += int(may[name][under_way].sum())
+            self.communicable[name] += int(may[name][under_way].sum())
         for notion, masks in self.domain.relevance(observation).items():
             counts = self.relevant.setdefault(
                 notion, {name: torch.zeros_like(count) for name, count in self.items.items()}
@@ -124,7 +126,7 @@ class Tally:
             self.mishaps.tolist(),
             _lists(self.items),
             {notion: _lists(counts) for notion, counts in self.relevant.items()},
-            self.chances,
+            self.communicable,
             self.steps,
             1000 * seconds / self.steps,
             log,

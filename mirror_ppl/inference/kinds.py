@@ -62,9 +62,9 @@ def infer_kinds(
         report = partial(_report, job.report, place, len(models))
         found.append(infer(replace(job, human=model, report=report)))
     with torch.random.fork_rng(devices=[]):
-        chances = sample_sites(job.human, 1)[KIND]["fn"].probs.flatten()
+        probabilities = sample_sites(job.human, 1)[KIND]["fn"].probs.flatten()
     evidences = torch.stack([_evidence(one) for one in found], -1)  # [P, K]
-    log_joint = evidences + chances.log().to(evidences)
+    log_joint = evidences + probabilities.log().to(evidences)
     shares = log_joint.softmax(-1)
     drawn = []
     for person in range(people):

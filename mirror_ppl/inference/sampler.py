@@ -151,13 +151,13 @@ class _Stage:
         number: number of draws.
         scalars: proposal of the scalar sites; ``None`` for the prior.
         residual: True if the residual was proposed, too.
-        log_chances: log-probabilities of values of the proposed discrete sites ``[n]``.
+        log_probabilities: log-probabilities of values of the proposed discrete sites ``[n]``.
     """
 
     number: int
     scalars: Proposal | None = None
     residual: bool = False
-    log_chances: Mapping[str, Tensor] = field(default_factory=dict)
+    log_probabilities: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 class Sampler:
@@ -202,7 +202,7 @@ class Sampler:
         self.place = torch.zeros(0, len(self.sites), device=table.index.device)
         self.supports = _policy_supports(human, table)
         self._stages: list[_Stage] = []
-        self._log_chances: dict[str, Tensor] = {}
+        self._log_probabilities: dict[str, Tensor] = {}
         self._policies: list[Draws] = []
         self._joints: list[Tensor] = []
         self._log_prior = torch.zeros(2, 0, device=table.index.device)  # of scalars, of discrete
@@ -279,7 +279,7 @@ class Sampler:
             anybody = own[: self._stages[0].number].double().mean(0)
             likely = found.log_weights.exp().double() @ own.double()
             anyhow = (anybody + 1 / len(support)) / 2  # in few draws the prior may miss some
-            self._log_chances[name] = (
+            self._log_probabilities[name] = (
                 DEFENSIVE_SHARE * anyhow + (1 - DEFENSIVE_SHARE) * likely
             ).log()
 
@@ -295,8 +295,8 @@ class Sampler:
             name: site(place[:, column]).view(number, 1, 1)
             for column, (name, site) in enumerate(self.sites.items())
         }
-        for name, log_chances in self._log_chances.items():
-            chosen = torch.multinomial(log_chances.exp(), number, replacement=True)
+        for name, log_probabilities in self._log_probabilities.items():
+            chosen = torch.multinomial(log_probabilities.exp(), number, replacement=True)
             given[name] = self.supports[name][chosen].view(number, 1, 1)
         drawn = (*self.sites, *self.supports)
         policy, log_priors = complete(self.human, self.table, given, number, drawn)
@@ -310,7 +310,7 @@ class Sampler:
             self._log_residual = torch.cat([self._log_residual, found], 1)
         self._add(policy, self._joint(policy, number), place, log_priors)
         residual = self._residual is not None
-        self._stages.append(_Stage(number, proposal, residual, dict(self._log_chances)))
+        self._stages.append(_Stage(number, proposal, residual, dict(self._log_probabilities)))
 
     def _add(
         self, policy: Draws, joint: Tensor, place: Tensor, log_priors: Mapping[str, Tensor]
@@ -352,8 +352,11 @@ class Sampler:
             density = of_scalars if stage.scalars is None else stage.scalars.log_prob(self.place)
             density = density + (either if stage.residual else prior)
             discrete = of_discrete
-            if stage.log_chances:
-                own = [chances[places_in[name]] for name, chances in stage.log_chances.items()]
+            if stage.log_probabilities:
+                own = [
+                    probabilities[places_in[name]]
+                    for name, probabilities in stage.log_probabilities.items()
+                ]
                 discrete = torch.stack(own).sum(0).to(density)
             parts.append(density + discrete + math.log(stage.number / len(joint)))
         mixture = torch.logsumexp(torch.stack(parts), 0)

@@ -114,15 +114,15 @@ def site_probabilities(
     found = {}
     for name, node in nodes.items():
         support = node["fn"].enumerate_support(expand=False)
-        chances = node["fn"].log_prob(support).exp().reshape(len(support), -1)  # [n, W]
-        chances = chances.expand(-1, number)
-        found[name] = chances.mean(-1) if weights is None else chances @ weights
+        probabilities = node["fn"].log_prob(support).exp().reshape(len(support), -1)  # [n, W]
+        probabilities = probabilities.expand(-1, number)
+        found[name] = probabilities.mean(-1) if weights is None else probabilities @ weights
     return found
 
 
 def choose_values(
     supports: Mapping[str, Tensor],
-    chances: Mapping[str, Tensor],
+    probabilities: Mapping[str, Tensor],
     number: int,
     generator: torch.Generator,
 ) -> AttentionValues:
@@ -130,7 +130,7 @@ def choose_values(
 
     Args:
         supports: support of each site ``[n]``.
-        chances: probabilities of these values ``[n]``, none of them 0.
+        probabilities: probabilities of these values ``[n]``, none of them 0.
         number: number of values G; fewer if there are fewer combinations.
         generator: source of randomness.
     """
@@ -138,7 +138,7 @@ def choose_values(
     places = torch.zeros(1, 0, dtype=torch.long, device=device)
     log_mass = torch.zeros(1, dtype=torch.double, device=device)
     log_chosen = torch.zeros(1, dtype=torch.double, device=device)
-    for own in chances.values():
+    for own in probabilities.values():
         size = len(own)
         places = torch.cat(
             [
@@ -156,7 +156,7 @@ def choose_values(
         name: support[place]
         for (name, support), place in zip(supports.items(), places.T, strict=True)
     }
-    log_weights = -log_chosen.to(next(iter(chances.values())).dtype)
+    log_weights = -log_chosen.to(next(iter(probabilities.values())).dtype)
     everything = torch.arange(len(log_weights), device=device)
     return AttentionValues(values, log_weights, everything, torch.zeros_like(log_weights))
 
@@ -229,14 +229,14 @@ class Proposal:
             likely = self._known("likely", self.likely, covariates)
         elif weights is not None:
             likely = site_probabilities(self.human, self.anybody, weights, covariates)
-        chances = {}
+        probabilities = {}
         for name, own in likely.items():
             own = (1 - ANY_WAY) * own + ANY_WAY * prior[name]
             if log_proposal and name in log_proposal:
                 own = torch.softmax(own.log() + log_proposal[name].to(own), 0)
-            chances[name] = (1 - ANY_VALUE) * own + ANY_VALUE / len(own)
-        generator = torch.Generator(next(iter(chances.values())).device).manual_seed(seed)
-        chosen = choose_values(self.supports, chances, self.number, generator)
+            probabilities[name] = (1 - ANY_VALUE) * own + ANY_VALUE / len(own)
+        generator = torch.Generator(next(iter(probabilities.values())).device).manual_seed(seed)
+        chosen = choose_values(self.supports, probabilities, self.number, generator)
         return replace(chosen, covariates=covariates)
 
     def _known(

@@ -39,7 +39,7 @@ class Level:
 
     Attributes:
         view: view of the span's steps, ``[P, S, K]``, an index into the V views.
-        value: the value that leads to it, an index into the site's :meth:`Chain.log_chances`,
+        value: the value that leads to it, an index into the site's :meth:`Chain.log_probabilities`,
             ``[P, S, K]``; ``NO_VALUE`` in padding.
         following: state in which the next span begins ``[P, S, K]``; unused at the last span.
         rounds: round of each state ``[P, S]``; ``NO_VALUE`` in padding.
@@ -76,7 +76,7 @@ class Chain:
         """Number of sights U, padding included."""
         return self.levels[0].view.shape[1]
 
-    def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
+    def log_probabilities(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
         """Log-probabilities of values ``[..., P, B, I, 2 n]`` of the I sites.
 
         First of each value, then of it or any later one. Runs inside the person plate.
@@ -112,16 +112,16 @@ class Chain:
             parts.append(torch.cat([own, later], -1))
         return torch.stack(torch.broadcast_tensors(*parts), -2)
 
-    def marginal(self, likelihoods: Tensor, log_chances: Tensor) -> Tensor:
+    def marginal(self, likelihoods: Tensor, log_probabilities: Tensor) -> Tensor:
         """Log-likelihood ``[..., P, U]`` of sights, given that of views ``[..., P, V]``.
 
         Args:
             likelihoods: log-likelihood of the recorded actions under each view.
-            log_chances: see :meth:`log_chances`.
+            log_probabilities: see :meth:`log_probabilities`.
         """
         after = None
         for number, level in reversed(list(enumerate(self.levels))):
-            score = _taken(likelihoods, level.view) + self.chances(log_chances, number)
+            score = _taken(likelihoods, level.view) + self.probabilities(log_probabilities, number)
             if after is not None:
                 score = score + _taken(after, level.following)
             score = torch.where(level.value == NO_VALUE, NEVER, score)
@@ -129,9 +129,14 @@ class Chain:
         assert after is not None
         return after
 
-    def chances(self, log_chances: Tensor, number: int) -> Tensor:
-        """Log-probabilities of one level's values, ``[..., P, S, K]``; see :meth:`log_chances`."""
-        level, own = self.levels[number], log_chances[..., number, :]
+    def probabilities(self, log_probabilities: Tensor, number: int) -> Tensor:
+        """Return log-probabilities ``[..., P, S, K]`` of one level's values.
+
+        Args:
+            log_probabilities: those of all levels (:meth:`log_probabilities`).
+            number: of the level.
+        """
+        level, own = self.levels[number], log_probabilities[..., number, :]
         place = level.rounds[..., None].clamp(min=0) * own.shape[-1] + level.value.clamp(min=0)
         return _taken(own.flatten(-2), place)
 

@@ -115,8 +115,10 @@ def _chained(
         )
         each = each.expand(number, table.people, *each.shape[-2:])  # [S, P, N, A]
         chosen = chosen.expand(number, *table.acted.shape)
-        chances = chain.log_chances(human, implants, table.rounds)
-        chances = chances.expand(number, table.people, table.rounds, *chances.shape[-2:])
+        probabilities = chain.log_probabilities(human, implants, table.rounds)
+        probabilities = probabilities.expand(
+            number, table.people, table.rounds, *probabilities.shape[-2:]
+        )
         sight = table.sight_of(implants).expand(number, table.people, table.rounds)
     *_, steps = table.recorded.shape
     actions = each.shape[-1]
@@ -124,8 +126,8 @@ def _chained(
     found = each.new_full(shape, -math.log(actions))  # in padding
     for person in range(table.people):
         alone = chain.of_person(person)
-        own = chances[:, person : person + 1]
-        by_level = [alone.chances(own, level)[:, 0] for level in range(len(alone.levels))]
+        own = probabilities[:, person : person + 1]
+        by_level = [alone.probabilities(own, level)[:, 0] for level in range(len(alone.levels))]
         for place in table.real[person].nonzero().flatten().tolist():
             so_far = each.new_full((number, chain.sights), NEVER)
             so_far.scatter_(1, sight[:, person, place, None], 0.0)

@@ -32,8 +32,8 @@ def of_moments(
     """Log-likelihood ``[..., P, U]`` of sights, given that of moments ``[..., P, N]``."""
     if table.attention is None:
         return table.along_views(moments)
-    chances = table.attention.log_chances(human, implants, table.rounds)
-    return table.attention.marginal(table.along_views(moments), chances)
+    probabilities = table.attention.log_probabilities(human, implants, table.rounds)
+    return table.attention.marginal(table.along_views(moments), probabilities)
 
 
 class TableProgram:

@@ -65,7 +65,7 @@ class Attention:
     rounds: Tensor
     covariates: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def log_chances(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
+    def log_probabilities(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
         """Weighted log-probabilities of the values ``[..., P, B, G]``, inside the person plate."""
         del rounds
         return log_weighted_latents(human, implants, self.values, self.log_weights, self.covariates)
@@ -75,7 +75,7 @@ class Attention:
 
         Args:
             likelihoods: log-likelihood of the recorded actions under each view.
-            log_weights: weights of values, see :meth:`log_chances`, ``[..., P, B, G]``.
+            log_weights: weights of values, see :meth:`log_probabilities`, ``[..., P, B, G]``.
         """
         shape = self.sights.shape[1:]
         views = self.sights.flatten(1).expand(*likelihoods.shape[:-1], -1)

@@ -263,8 +263,10 @@ class ViewTableBuilder:
             likelihoods = self._log_likelihoods(views)[:, None]
             together = Chain.one_after_another(chains, [len(part.moments) for _, part in parts])
             with self._deciding(self.policies):
-                chances = together.log_chances(self.human, self.human.prior(), len(rounds))
-            found = together.marginal(likelihoods, chances)[:, 0]
+                probabilities = together.log_probabilities(
+                    self.human, self.human.prior(), len(rounds)
+                )
+            found = together.marginal(likelihoods, probabilities)[:, 0]
             self._screen(found.unflatten(-1, (len(rounds), -1)).sum(1), self.screening)
         every = torch.arange(len(alive), device=alive.device)
         for one, chain, (_, part) in zip(rounds.each(), chains, parts, strict=True):
@@ -421,10 +423,10 @@ class ViewTableBuilder:
         values = {name: value[None, None] for name, value in attended.values.items()}
         with self._deciding(self.policies):
             implants = self.human.prior()
-            chances = log_weighted_latents(
+            probabilities = log_weighted_latents(
                 self.human, implants, values, attended.log_weights[None, None], attended.covariates
             )
-        return likelihoods + chances[:, 0]
+        return likelihoods + probabilities[:, 0]
 
     def _of_moments(
         self, policies: Mapping[str, Tensor], views: ManyViews, some: Tensor | slice = slice(None)

@@ -234,7 +234,7 @@ def recorded(
             start, message_noise=_message_noise(number, rounds, seed, setting, domain, device)
         )
     recording = record(people, start, progress, told)
-    chances = people.predictive(
+    probabilities = people.predictive(
         recording.probabilities, recording.observation, recording.actions, recording.told
     )
     return Demonstrations(
@@ -250,7 +250,7 @@ def recorded(
         rewards=recording.rewards,
         scenarios=start.scenario,
         truth=truth,
-        action_entropy=torch.special.entr(chances).sum(-1),
+        action_entropy=torch.special.entr(probabilities).sum(-1),
         provenance={"population": population, "seed": seed, "version": __version__}
         | people.provenance()
         | ({"told": told} if told > 0 else {}),

@@ -152,16 +152,16 @@ def plot_action(decision: Decision, action: str = "switch") -> Picture:
     number = actions.index(require_known(action, "action", actions))
     if found.valued.actions is None:
         raise ValueError("the objective of this decision predicts no actions")
-    chances = found.valued.actions / found.valued.actions.sum(-1, keepdim=True)
+    probabilities = found.valued.actions / found.valued.actions.sum(-1, keepdim=True)
     name = candidate_name(Channels(decision.domain), found.candidates[decision.chosen])
     lines = [(0, "silence", GREY, "s", "--")]
     if decision.chosen != 0:
         lines.append((decision.chosen, name, BLUE, "o", "-"))
     figure = Picture(figsize=(7.5, 3.6), layout="constrained")
     ax = figure.subplots()
-    steps = range(chances.shape[1])
+    steps = range(probabilities.shape[1])
     for index, label, color, marker, dashes in lines:
-        predicted = chances[index, :, number].tolist()
+        predicted = probabilities[index, :, number].tolist()
         ax.plot(steps, predicted, lw=2, ms=7, label=label, color=color, marker=marker, ls=dashes)
     ax.set_ylim(-0.04, 1.04)
     ax.set_xticks(steps, ["now", *map(str, steps[1:])])

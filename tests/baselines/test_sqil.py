@@ -74,10 +74,10 @@ def test_played_rounds_are_of_the_domain_and_of_the_networks(name):
     before, after = actions[..., :-1], done[..., 1:]
     assert (before == after)[before >= 0].all()
     # They act as their values say, each by its own.
-    chances = networks(inputs).softmax(-1)[..., 0]
+    probabilities = networks(inputs).softmax(-1)[..., 0]
     for place in range(2):
         real = actions[place] >= 0
-        expected, rate = chances[place][real].detach(), (actions[place][real] == 0).float()
+        expected, rate = probabilities[place][real].detach(), (actions[place][real] == 0).float()
         error = (expected * (1 - expected)).sum().sqrt() / len(rate)
         assert abs(float(rate.mean() - expected.mean())) < 4.5 * float(error) + 1e-6
 

@@ -59,8 +59,8 @@ def test_channels_that_reach_a_person_are_inferred_exactly(driving):
             belief = gone_through(human, own | hears, observation, told, rounds.actions[0, 0, :8])
             implants = {name: value[draw] for name, value in draws.items()}
             belief = belief.view(1, 8, -1)
-            chances = driving.act(implants, belief, driving.action_values(belief))
-            done = chances.view(8, 2)[torch.arange(8), rounds.actions[0, 0, :8]].sum()
+            probabilities = driving.act(implants, belief, driving.action_values(belief))
+            done = probabilities.view(8, 2)[torch.arange(8), rounds.actions[0, 0, :8]].sum()
             prior = torch.tensor([0.2, 0.8])[list(pattern)].log().sum()
             expected[draw, place] = done + prior
     torch.testing.assert_close(found, expected.softmax(-1), atol=1e-4, rtol=1e-3)

@@ -84,7 +84,7 @@ def robot(past):
     return state
 
 
-def chances(model, draw, past, told):
+def probabilities(model, draw, past, told):
     """Probabilities of the next action of one draw, told this now: through the whole round."""
     now = past.then(CHANNELS.split(told), 0, past.now)  # the last observation is not used
     steps = past.time + 1
@@ -108,7 +108,7 @@ def worth(model, draw, past, world, candidate, horizon, discount):
         utility = -(0.01 * shown**2 + 0.03 * said**2)
         # What has left the road, or fallen behind, can no longer be told of, or shown.
         told = told & CHANNELS.join(DOMAIN.communicable(past.now))
-        for action, chance in enumerate(chances(model, draw, past, told)):
+        for action, chance in enumerate(probabilities(model, draw, past, told)):
             predicted[step, action] += weight * chance
             following, observation, reward = world.step(state, action)
             seen = {name: value[0] for name, value in observation.items()}

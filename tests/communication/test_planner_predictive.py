@@ -121,8 +121,8 @@ def test_the_table_of_alternatives_says_the_same(generator):
     decision = Communicator(Person(human, draws), objective).plan(past)
     table = decision.alternatives.sort_index()
     assert len(table) > 8
-    chances = torch.tensor(table[[f"p({action})" for action in DOMAIN.actions]].to_numpy())
+    probabilities = torch.tensor(table[[f"p({action})" for action in DOMAIN.actions]].to_numpy())
     some = slice(None, None, len(table) // 8)
-    for flags, found in zip(decision.found.candidates[some, 0], chances[some], strict=True):
+    for flags, found in zip(decision.found.candidates[some, 0], probabilities[some], strict=True):
         (expected,) = predicted(human, draws, recorded(past, [], []), [flags])
         torch.testing.assert_close(found.float(), expected.mean(0), rtol=0, atol=1e-5)

@@ -103,7 +103,7 @@ def test_rewards_costs_and_collisions_are_those_of_the_scene(played):
 def test_items_and_opportunities_are_counted_by_modality(played):
     assert played.items == {"visual": [2, 0], "verbal": [3, 0]}
     # On the road: 4, 2 and 2 cars; of these ahead or abreast 2, 1 and 2.
-    assert played.chances == {"visual": 5, "verbal": 8}
+    assert played.communicable == {"visual": 5, "verbal": 8}
     assert played.rates() == {"visual": 2 / 5, "verbal": 3 / 8}
 
 
@@ -147,8 +147,8 @@ def test_the_log_has_every_decision_and_the_probability_of_the_action(scene, pla
     memory, state = Memory.empty((1,)), DrivingState(*(part[:, 0] for part in vars(START).values()))
     for step, entry in enumerate(first):
         told = CHANNELS.split(CHANNELS.flags(SCRIPT.get(step, {}))[None])
-        chances, memory = scene.driver.step(memory, DOMAIN.observe(state), told)
-        expected = dict(zip(DOMAIN.actions, chances[0].tolist(), strict=True))
+        probabilities, memory = scene.driver.step(memory, DOMAIN.observe(state), told)
+        expected = dict(zip(DOMAIN.actions, probabilities[0].tolist(), strict=True))
         assert entry["true_probability"] == pytest.approx(expected)
         state = DOMAIN.transition(state, torch.tensor([DOMAIN.actions.index(entry["action"])]))
     assert json.loads(json.dumps(played.log)) == played.log
@@ -199,7 +199,7 @@ def test_all_play_the_same_rounds_with_the_same_action_noise():
     assert without_time(run("random", {"visual": 1.0, "verbal": 1.0})) == without_time(run("all"))
     # Cars' courses depend on no person, so all have the same opportunities to speak of them.
     for name in ("all", "nearest", "oracle"):
-        assert run(name, rounds=5).chances == run("none", rounds=5).chances
+        assert run(name, rounds=5).communicable == run("none", rounds=5).communicable
     other = play(listener(seed=1), lambda rounds, truth: (flags, None))
     assert without_time(other) != without_time(silence)
 
@@ -248,7 +248,7 @@ def test_people_are_divided_into_groups_that_play_together():
 
 def test_all_say_everything_and_none_nothing():
     everything, silence = run("all"), run("none")
-    assert {name: sum(items) for name, items in everything.items.items()} == everything.chances
+    assert {name: sum(items) for name, items in everything.items.items()} == everything.communicable
     assert everything.rates() == {"visual": 1.0, "verbal": 1.0}
     assert silence.rates() == {"visual": 0.0, "verbal": 0.0}
     assert silence.cost == [0.0] * 20
@@ -258,7 +258,7 @@ def test_random_messages_have_the_rate_that_is_asked_for():
     rates = {"visual": 0.1, "verbal": 0.35}
     played = run("random", rates, rounds=100)
     for name, rate in rates.items():
-        number = played.chances[name]
+        number = played.communicable[name]
         assert number > 1000
         # Each opportunity is taken or not: within 4 standard deviations, 1 seed of 16,000 fails.
         spread = math.sqrt(number * rate * (1 - rate))

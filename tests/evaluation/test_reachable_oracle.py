@@ -121,7 +121,7 @@ def test_no_message_is_sent_when_the_round_is_over():
         played = play(someone, speaker(name, someone, PlannerOptions(), 0), keep_log=True)
         steps = [entry["step"] for entry in played.log if entry["round"] == 0]
         assert steps == list(range(len(steps))) and len(steps) < WORLD.horizon
-        assert sum(played.items["visual"]) <= played.chances["visual"]
+        assert sum(played.items["visual"]) <= played.communicable["visual"]
         assert played.mishaps == [0] * 20 or name != "all"
 
 

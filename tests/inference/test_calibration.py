@@ -132,8 +132,8 @@ def test_exact_posteriors_of_coins_are_right(coins, seed):
     }  # fmt: skip
     table = result.table().set_index(["site", "rounds"])
     for site in ("rate", "style", "hasty"):
-        assert table.loc[(site, 4), "sharpness"] < table.loc[(site, 1), "sharpness"] < 1
-    assert table.loc[("first weight", 4), "sharpness"] == pytest.approx(1, abs=0.1)
+        assert table.loc[(site, 4), "contraction"] > table.loc[(site, 1), "contraction"] > 0
+    assert table.loc[("first weight", 4), "contraction"] == pytest.approx(0, abs=0.1)
     assert table.loc[("hasty", 4), "prior_probability"] == pytest.approx(0.58, abs=0.03)
     assert np.isnan(table["high_pareto_k"]).all()
     assert result.data.attrs["human_model"] == "Coins"
@@ -156,7 +156,7 @@ def test_the_prior_is_calibrated_and_not_sharp(coins, seed):
         coins, lambda rounds, own: coin_posterior(rounds, own, 0.0), options, "fog", seed
     )
     assert replace(result, failure_rate=RARELY).rejected == []
-    np.testing.assert_allclose(result.table()["sharpness"], 1, atol=0.1)
+    np.testing.assert_allclose(result.table()["contraction"], 0, atol=0.1)
 
 
 def test_shorter_recordings_begin_the_longer_ones_of_the_same_people(coins, seed):
@@ -322,7 +322,7 @@ def test_the_package_s_own_human_model_runs(seed):
     assert result.data["discrete"].values.tolist() == [1, 1, 1, 1, 1, 1, 0, 0]
     table = result.table()
     assert table["p_value"].between(0, 1).all()
-    assert table["sharpness"].between(0, 2).all()
+    assert table["contraction"].between(-1, 1).all()
 
 
 class Watched(ToyHuman):

@@ -61,8 +61,8 @@ def test_the_base_rate_is_of_the_rounds_before(recordings):
     switched = int(train.actions.sum())
     chance = (switched + 0.5) / (train.actions.numel() + 1)
     often = base_rate(train, test, 2)
-    chances = torch.tensor([1 - chance, chance])
-    torch.testing.assert_close(often, -chances.log()[test.actions.flatten()])
+    probabilities = torch.tensor([1 - chance, chance])
+    torch.testing.assert_close(often, -probabilities.log()[test.actions.flatten()])
 
 
 def test_without_rounds_before_the_robot_is_as_its_prior(recordings):

@@ -78,13 +78,13 @@ def test_posterior_entropy_is_that_of_the_exact_conditionals(toy, rounds, draws)
 
 
 def test_a_population_takes_the_place_of_the_prior(toy, rounds, draws):
-    chances = torch.arange(1.0, 8) / 28
+    probabilities = torch.arange(1.0, 8) / 28
     known = Population(
-        {"reach": chances[None]}, *({rate: torch.ones(1) for rate in RATES} for _ in range(2))
+        {"reach": probabilities[None]}, *({rate: torch.ones(1) for rate in RATES} for _ in range(2))
     )
     found = identify(toy, rounds, draws, 0, known, rounds=0)
     for person in range(3):
-        exact = conditionals(toy, rounds, draws, person) * chances
+        exact = conditionals(toy, rounds, draws, person) * probabilities
         exact = exact / exact.sum(-1, keepdim=True)
         expected = entropy(exact.mean(0))
         torch.testing.assert_close(found.entropy[person, 0], expected, rtol=1e-3, atol=1e-4)
@@ -95,8 +95,8 @@ def test_what_the_prior_rules_out_has_no_entropy(toy, rounds):
 
     class Short(ToyHuman):
         def prior(self):
-            chances = torch.tensor([0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0])
-            reach = pyro.sample("reach", dist.Categorical(chances))
+            probabilities = torch.tensor([0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0])
+            reach = pyro.sample("reach", dist.Categorical(probabilities))
             one = torch.ones(())
             rates = {rate: pyro.sample(rate, dist.Beta(one, one)) for rate in RATES}
             return {"reach": reach} | rates
@@ -105,8 +105,8 @@ def test_what_the_prior_rules_out_has_no_entropy(toy, rounds):
     nobody = rounds.select_people([0]).select_rounds([])
     draws = infer(human, nobody, InferenceOptions(draws=POLICIES), 0).draws
     draws["reach"] = torch.arange(POLICIES).remainder(7)[:, None, None]  # all are looked at
-    chances = {"reach": torch.tensor([[0.9, 0.1]])}
-    known = Population(chances, *({rate: torch.ones(1) for rate in RATES} for _ in range(2)))
+    probabilities = {"reach": torch.tensor([[0.9, 0.1]])}
+    known = Population(probabilities, *({rate: torch.ones(1) for rate in RATES} for _ in range(2)))
     found = identify(human, nobody, draws, 0, known, rounds=0)
     expected = entropy(torch.tensor([0.9, 0.1]))
     torch.testing.assert_close(found.all_entropy[0], expected, rtol=1e-3, atol=1e-4)
@@ -185,11 +185,11 @@ def test_the_population_shares_no_information_with_the_policy(toy, rounds):
     """Without a round sight and policy are independent, however populations differ."""
     nobody = rounds.select_people([0]).select_rounds([])
     draws = infer(toy, nobody, InferenceOptions(draws=POLICIES), 0).draws
-    chances = torch.distributions.Dirichlet(torch.ones(7)).sample(torch.Size([POLICIES]))
+    probabilities = torch.distributions.Dirichlet(torch.ones(7)).sample(torch.Size([POLICIES]))
     rates = ({rate: torch.ones(POLICIES) for rate in RATES} for _ in range(2))
-    found = identify(toy, nobody, draws, 0, Population({"reach": chances}, *rates), rounds=0)
+    found = identify(toy, nobody, draws, 0, Population({"reach": probabilities}, *rates), rounds=0)
     assert float(found.all_shared[0]) < 1e-5
-    expected = entropy(chances.mean(0))
+    expected = entropy(probabilities.mean(0))
     torch.testing.assert_close(found.all_entropy[0], expected, rtol=1e-3, atol=1e-4)
 
 

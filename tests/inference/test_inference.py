@@ -68,8 +68,8 @@ class Nested(Few):
     def prior(self):
         trust = pyro.sample("trust", dist.Beta(2.0, 2.0))
         own = super().prior()
-        chances = torch.stack([1 - trust, trust], -1)
-        own["assumes_clear"] = pyro.sample("assumes_clear_too", dist.Categorical(chances))
+        probabilities = torch.stack([1 - trust, trust], -1)
+        own["assumes_clear"] = pyro.sample("assumes_clear_too", dist.Categorical(probabilities))
         return own | {"assumes_clear_too": own["assumes_clear"], "trust": trust}
 
     def perceive(self, implants, knowledge, observation, told, step):
@@ -178,8 +178,8 @@ def test_prior_of_combinations_may_depend_on_other_sites(self_model, rounds):
     assert table.sites == ("sight_front_own", "assumes_clear_too")
     policy = some_policy(human, 3) | {"trust": torch.tensor([[0.1], [0.5], [0.8]])}
     trust = policy["trust"]
-    chances = torch.stack([1 - trust, trust], -1)  # [P, 1, 2]
-    expected = (torch.arange(1.0, 8)[:, None] / 28 * chances).log().flatten(1)
+    probabilities = torch.stack([1 - trust, trust], -1)  # [P, 1, 2]
+    expected = (torch.arange(1.0, 8)[:, None] / 28 * probabilities).log().flatten(1)
     torch.testing.assert_close(log_prior(human, table, policy), expected)
 
 

@@ -49,8 +49,10 @@ def by_rate(in_sight, otherwise):
 
 def population(mean, spread, number):
     """A population that is known exactly."""
-    chances = {"reach": torch.arange(1.0, 8) / 28}
-    one = Population(*({n: v[None] for n, v in part.items()} for part in (chances, mean, spread)))
+    probabilities = {"reach": torch.arange(1.0, 8) / 28}
+    one = Population(
+        *({n: v[None] for n, v in part.items()} for part in (probabilities, mean, spread))
+    )
     return one.spaced(number)
 
 
@@ -60,9 +62,9 @@ def test_densities_by_hand(pooling, draws):
     assert {value.shape for value in (*place.values(), log_prior)} == {(3, 5)}
     assert torch.equal(known["reach"].argmax(-1), draws["reach"][..., 0].T)
     assert (known["reach"].sum(-1) == 1).all()
-    chances = {"reach": torch.arange(1.0, 8) / 28}
+    probabilities = {"reach": torch.arange(1.0, 8) / 28}
     mean, spread = by_rate(0.5, -1.0), by_rate(0.7, 0.4)
-    found = pooling.log_density(chances, mean, spread, known, place)
+    found = pooling.log_density(probabilities, mean, spread, known, place)
     for person in range(3):
         for draw in range(5):
             reach = int(draws["reach"][draw, person])
@@ -84,8 +86,8 @@ def test_the_program_weighs_people_by_the_mean_of_ratios(pooling, draws):
         {site: trace.nodes[f"{site}_{name}"]["value"] for site in RATES}
         for name in ("mean", "spread")
     )
-    chances = {"reach": trace.nodes["reach_chances"]["value"]}
-    density = pooling.log_density(chances, mean, spread, known, place)
+    probabilities = {"reach": trace.nodes["reach_probabilities"]["value"]}
+    density = pooling.log_density(probabilities, mean, spread, known, place)
     trace.compute_log_prob()
     expected = (density - log_prior).exp().mean(-1).log()
     torch.testing.assert_close(trace.nodes["rounds"]["log_prob"], expected)
@@ -97,19 +99,19 @@ def test_the_sampler_s_densities_are_those_of_the_program(pooling, draws):
     known, place, log_prior = pooling.read(one)
     values = torch.stack([place[name][:, 0] for name in RATES], -1)
     values = ((values - pooling.centre) / pooling.width).double()
-    priors = HyperPriors(pooling.prior_chances, CONCENTRATION_WIDTH, SPREAD, SPREAD_WIDTH)
+    priors = HyperPriors(pooling.prior_probabilities, CONCENTRATION_WIDTH, SPREAD, SPREAD_WIDTH)
     continuous = ContinuousSites(3, priors, values)
-    discrete = DiscreteSite(3, pooling.prior_chances["reach"].double(), CONCENTRATION_WIDTH)
+    discrete = DiscreteSite(3, pooling.prior_probabilities["reach"].double(), CONCENTRATION_WIDTH)
     count = known["reach"][:, 0].sum(0).double()
     generator, offsets = torch.Generator().manual_seed(0), []
     for _ in range(20):
         cells = torch.randint(200, 440, (3,), generator=generator).tolist()
         logs = continuous.grid[cells[:2]]
         mean = torch.randn(2, generator=generator).double()
-        chances = torch.rand(7, generator=generator).double() + 0.05
-        chances = chances / chances.sum()
+        probabilities = torch.rand(7, generator=generator).double() + 0.05
+        probabilities = probabilities / probabilities.sum()
         concentration = discrete.grid[cells[2]].exp()
-        population = {"reach_concentration": concentration, "reach_chances": chances}
+        population = {"reach_concentration": concentration, "reach_probabilities": probabilities}
         for column, name in enumerate(RATES):
             centre, width = pooling.centre[column], pooling.width[column]
             population[f"{name}_mean"] = centre + width * mean[column]
@@ -121,7 +123,7 @@ def test_the_sampler_s_densities_are_those_of_the_program(pooling, draws):
         own = continuous.log_densities(values)[[0, 1], cells[:2]] - logs  # of spreads, not logs
         own = own + continuous.mean(values, logs.exp()).log_prob(mean)
         other = discrete.log_densities(count)[cells[2]] - concentration.log()
-        other = other + discrete.chances(count, concentration).log_prob(chances)
+        other = other + discrete.probabilities(count, concentration).log_prob(probabilities)
         offsets.append(joint - float(own.sum() + other))
     assert max(offsets) - min(offsets) < 2e-3 * max(map(abs, offsets))
 
@@ -139,8 +141,8 @@ def test_sites_that_depend_on_others_keep_their_prior():
     }
     spread = {name: torch.full((1,), 0.01) for name in pooling.sites}
     mean["notice_mean"] = torch.tensor([0.05]).logit()
-    chances = {name: prior[None] for name, prior in pooling.prior_chances.items()}
-    new = pooling.newcomers(Population(chances, mean, spread).spaced(number), 1, 0)
+    probabilities = {name: prior[None] for name, prior in pooling.prior_probabilities.items()}
+    new = pooling.newcomers(Population(probabilities, mean, spread).spaced(number), 1, 0)
     notice_mean, notices = new["notice_mean"], new["notices_terminal 3"]
     assert notice_mean.mean() == pytest.approx(0.05, abs=0.002)
     # Beta with this mean, and a concentration of about 100 or more.
@@ -149,12 +151,12 @@ def test_sites_that_depend_on_others_keep_their_prior():
 
 def test_people_are_drawn_by_their_weights(pooling, draws):
     known, place, log_prior = pooling.read(draws)
-    chances, number = {"reach": torch.arange(1.0, 8) / 28}, 4000
+    probabilities, number = {"reach": torch.arange(1.0, 8) / 28}, 4000
     mean, spread = by_rate(0.5, -1.0), by_rate(0.7, 0.9)
     found = pooling.pooled(draws, population(mean, spread, number), 0)
     pooled = found.draws
     weights = torch.softmax(
-        pooling.log_density(chances, mean, spread, known, place) - log_prior, -1
+        pooling.log_density(probabilities, mean, spread, known, place) - log_prior, -1
     )
     torch.testing.assert_close(found.effective, 1 / weights.square().sum(-1), rtol=1e-3, atol=0)
     for person in range(3):

@@ -67,8 +67,8 @@ def test_a_pooled_fit_holds_its_population_and_a_newcomer(folder, toy):
     data = az.from_netcdf(str(folder / "pooled" / "posterior.nc"))
     assert data["posterior"].attrs["pooling"] == "partial"
     population, newcomer = data["population"], data["newcomer"]
-    assert population["reach_chances"].dims == ("chain", "draw", "reach_value")
-    np.testing.assert_allclose(population["reach_chances"].sum("reach_value"), 1, rtol=1e-4)
+    assert population["reach_probabilities"].dims == ("chain", "draw", "reach_value")
+    np.testing.assert_allclose(population["reach_probabilities"].sum("reach_value"), 1, rtol=1e-4)
     assert set(newcomer.data_vars) == set(data["posterior"].data_vars)
     assert {value.shape for value in newcomer.data_vars.values()} == {(1, 60)}
     # Somebody without rounds is not known better than the newcomer, but better than by the prior.
@@ -95,7 +95,7 @@ def test_the_population_comes_back_as_it_was(folder, toy):
     found = load_population(path, pooling)
     assert len(found) == 60
     group = az.from_netcdf(str(path))["population"]
-    np.testing.assert_array_equal(found.chances["reach"], group["reach_chances"][0])
+    np.testing.assert_array_equal(found.probabilities["reach"], group["reach_probabilities"][0])
     for name in toy_rates(found):
         np.testing.assert_array_equal(found.mean[name], group[f"{name}_mean"][0])
         np.testing.assert_array_equal(found.spread[name], group[f"{name}_spread"][0])
@@ -151,12 +151,14 @@ def test_what_the_prior_rules_out_stays_ruled_out(toy):
 
     class Short(ToyHuman):
         def prior(self):
-            chances = torch.tensor([0.5, 0.5, 0, 0, 0, 0, 0])
-            return super().prior() | {"reach": pyro.sample("short", dist.Categorical(chances))}
+            probabilities = torch.tensor([0.5, 0.5, 0, 0, 0, 0, 0])
+            return super().prior() | {
+                "reach": pyro.sample("short", dist.Categorical(probabilities))
+            }
 
     pooling = Pooling(Short(toy.self_model))
     assert pooling.supports["short"].tolist() == [0, 1]
-    assert pooling.prior_chances["short"].tolist() == pytest.approx([0.5, 0.5])
+    assert pooling.prior_probabilities["short"].tolist() == pytest.approx([0.5, 0.5])
 
 
 @pytest.mark.parametrize(
@@ -203,7 +205,10 @@ def damaged(folder, name, change):
         (lambda group: group.drop_vars("otherwise_mean"), 'lacks "otherwise_mean"'),
         (lambda group: group.assign(otherwise_mean=group["otherwise_mean"] * np.nan), "no numbers"),
         (lambda group: group.assign(in_sight_spread=-group["in_sight_spread"]), "not positive"),
-        (lambda group: group.assign(reach_chances=2 * group["reach_chances"]), "no probabilities"),
+        (
+            lambda group: group.assign(reach_probabilities=2 * group["reach_probabilities"]),
+            "no probabilities",
+        ),
         (lambda group: group.isel(reach_value=slice(3)), "no probabilities"),
     ],
 )

@@ -65,10 +65,10 @@ def test_draws_have_the_exact_posterior(grids):
             )
         )
     expected = torch.stack(totals).softmax(0) @ torch.stack(moments)
-    chances, means, spreads = sample_population(people(), PRIORS, DRAWS, 0)
-    assert chances["sees"].shape == (DRAWS, 2) and means.shape == spreads.shape == (DRAWS, 1)
-    torch.testing.assert_close(chances["sees"].sum(-1), torch.ones(DRAWS))
-    for place, value in enumerate((means[:, 0], spreads[:, 0].log(), chances["sees"][:, 0])):
+    probabilities, means, spreads = sample_population(people(), PRIORS, DRAWS, 0)
+    assert probabilities["sees"].shape == (DRAWS, 2) and means.shape == spreads.shape == (DRAWS, 1)
+    torch.testing.assert_close(probabilities["sees"].sum(-1), torch.ones(DRAWS))
+    for place, value in enumerate((means[:, 0], spreads[:, 0].log(), probabilities["sees"][:, 0])):
         # Of 2,000 draws that depend on each other at least 500 count; grids are finer than that.
         centre = expected[2 * place]
         width = (expected[2 * place + 1] - centre**2).sqrt()
@@ -142,8 +142,8 @@ def test_the_seed_decides():
 def test_impossible_values_have_small_probabilities():
     """Nobody has a value that the prior hardly allows: its chance has a logarithm all the same."""
     priors = HyperPriors({"sees": torch.tensor([1e-6, 1 - 1e-6])}, 1.0, 0.5, 0.5)
-    chances, *_ = sample_population(people(torch.ones_like(SEES)), priors, 50, 0)
-    assert (chances["sees"] > 0).all() and (chances["sees"][:, 0] < 1e-3).all()
+    probabilities, *_ = sample_population(people(torch.ones_like(SEES)), priors, 50, 0)
+    assert (probabilities["sees"] > 0).all() and (probabilities["sees"][:, 0] < 1e-3).all()
 
 
 def test_sweeps_are_reported():

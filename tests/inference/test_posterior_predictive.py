@@ -137,12 +137,12 @@ def test_predictive_draws_do_not_depend_on_other_people(human, train, draws, who
 
 
 def test_predictive_draws_follow_the_probabilities():
-    chances = torch.tensor([[0.1, 0.2, 0.7], [0.5, 0.5, 0.0]])  # of two people
-    log_probabilities = chances.log()[None, :, None, None].expand(500, 2, 4, 5, 3)
+    exact = torch.tensor([[0.1, 0.2, 0.7], [0.5, 0.5, 0.0]])  # of two people
+    log_probabilities = exact.log()[None, :, None, None].expand(500, 2, 4, 5, 3)
     generators = [torch.Generator().manual_seed(number) for number in range(2)]
     drawn = _drawn(log_probabilities, generators)
     assert drawn.shape == (500, 2, 4, 5) and drawn.dtype == torch.int8
-    for person, expected in enumerate(chances):
+    for person, expected in enumerate(exact):
         often = torch.bincount(drawn[:, person].flatten().long(), minlength=3) / 10_000
         torch.testing.assert_close(often, expected, atol=0.02, rtol=0)
     assert not torch.equal(drawn[:, 0], drawn[:, 1])

@@ -1,4 +1,4 @@
-"""Ranks of the truth: ties, coverage, sharpness, and wrong posteriors that have to be found."""
+"""Ranks of the truth: ties, coverage, contraction, and wrong posteriors that have to be found."""
 
 from dataclasses import replace
 
@@ -90,11 +90,11 @@ def test_numbers_by_hand(rng):
     assert n["prior_probability"] == pytest.approx(6 / 16)
     assert n["entropy"] == pytest.approx(divided / 2)
     assert n["prior_entropy"] == pytest.approx(divided)
-    assert n["sharpness"] == pytest.approx(0.5)
+    assert n["contraction"] == pytest.approx(0.5)
     # Quantiles of four numbers d apart are 0.9 * 3 d from each other.
     np.testing.assert_allclose(data.data["width"].sel(site="x")[0], [2.7, 27])
     assert data.data["prior_width"].sel(site="x") == pytest.approx(90)
-    assert x["sharpness"] == pytest.approx((2.7 + 27) / 2 / 90)
+    assert x["contraction"] == pytest.approx(1 - (2.7 + 27) / 2 / 90)
     assert np.isnan([x["probability"], x["entropy"], x["prior_entropy"]]).all()
     assert n["rounds"] == x["rounds"] == 3
     assert n["high_pareto_k"] == x["high_pareto_k"] == 0.5
@@ -132,7 +132,7 @@ def test_wrong_posteriors_are_rejected_and_cover_what_they_should(rng, width, sh
         # The ends of intervals are known to a hundredth with so many draws.
         slack = 0.01 + norm.isf(RARELY) * np.sqrt(held * (1 - held) / people)
         assert row[f"coverage_{100 * level:.0f}"] == pytest.approx(held, abs=slack)
-    assert row["sharpness"] == pytest.approx(width * np.sqrt(0.5), rel=0.1)
+    assert 1 - row["contraction"] == pytest.approx(width * np.sqrt(0.5), rel=0.1)
 
 
 def test_files_hold_everything(rng, tmp_path):

@@ -334,7 +334,7 @@ def test_discrete_sites_count_as_they_were_drawn(toy, table, monkeypatch):
     scalars, _ = sampler._log_prior.double()
     habit = found.policy["habit"].flatten()
     prior = torch.tensor(CHANCES).double()[habit].log()
-    learned = sampler._log_chances["habit"][habit]
+    learned = sampler._log_probabilities["habit"][habit]
     own = gaussian.log_prob(sampler.place).double()
     stages = [scalars + prior, own + prior, own + learned]
     shares = torch.tensor([0.5, 0.3, 0.2]).double().log()

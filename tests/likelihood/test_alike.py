@@ -104,10 +104,10 @@ def test_members_are_drawn_by_their_prior(self_model, one):
         for place in range(len(alike)):
             members = alike.members[begin[place] : alike.end[place]]
             assert torch.isin(drawn[place], members).all()
-            chances = prior[members].double().softmax(0)
+            probabilities = prior[members].double().softmax(0)
             counts = (drawn[place][:, None] == members).sum(0).double()
             if len(members) > 1:
-                assert chisquare(counts.numpy(), (4000 * chances).numpy()).pvalue > 1e-4
+                assert chisquare(counts.numpy(), (4000 * probabilities).numpy()).pvalue > 1e-4
 
 
 def test_weights_of_sets_are_those_of_all_combinations(self_model, one):
@@ -120,11 +120,11 @@ def test_weights_of_sets_are_those_of_all_combinations(self_model, one):
     every = log_joints(human, table, found.policy)[:, 0]
     torch.testing.assert_close(found.log_joint.logsumexp(-1), every.logsumexp(-1))
     drawn = found.sample(4000, combination_values(human, table))
-    chances = (found.log_weights.exp()[:, None] * every.double().softmax(-1)).sum(0)
+    probabilities = (found.log_weights.exp()[:, None] * every.double().softmax(-1)).sum(0)
     number = drawn["sight_front_own"] * 2 + drawn["assumes_clear"]
     share = torch.bincount(number.flatten(), minlength=14) / 4000
     # Of 20 draws, resampled: what is left is the noise of drawing combinations.
-    assert (share - chances).abs().max() < 5 * (0.25 / 4000) ** 0.5
+    assert (share - probabilities).abs().max() < 5 * (0.25 / 4000) ** 0.5
 
 
 def test_rare_policies_stay_rare(self_model, one):

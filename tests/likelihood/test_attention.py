@@ -103,8 +103,8 @@ def drawn(human, number, people=1, seed=0):
 
 def geometric(probability):
     """Probabilities of each number of failures, by hand."""
-    chances = [probability * (1 - probability) ** n for n in range(STEPS)]
-    return torch.tensor([*chances, (1 - probability) ** STEPS])
+    probabilities = [probability * (1 - probability) ** n for n in range(STEPS)]
+    return torch.tensor([*probabilities, (1 - probability) ** STEPS])
 
 
 def by_hand(human, implants, recordings, person, number):
@@ -140,8 +140,10 @@ def test_the_probability_of_attention_is_that_of_the_program(per_item):
     expected = weights.clone()
     for person, number, value in itertools.product(range(3), range(2), range(7)):
         for notices, noticed in zip(NOTICES, NOTICED, strict=True):
-            chances = geometric(float(implants[notices][person, 0]))
-            expected[person, number, value] += chances[values[noticed][person, number, value]].log()
+            probabilities = geometric(float(implants[notices][person, 0]))
+            expected[person, number, value] += probabilities[
+                values[noticed][person, number, value]
+            ].log()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
     assert pyro.get_param_store().keys() == {}.keys()
 
@@ -281,9 +283,9 @@ def test_likelihoods_are_sums_over_when_something_was_noticed(self_model, record
     for person, own in enumerate(lengths):
         expected = torch.zeros(())
         for number, length in enumerate(own):
-            chances = by_hand(human, implants, rounds, person, number)
+            probabilities = by_hand(human, implants, rounds, person, number)
             done = rounds.actions[person, number].clamp(min=0)
-            along = chances[:, torch.arange(STEPS), done][:, :length].sum(-1)
+            along = probabilities[:, torch.arange(STEPS), done][:, :length].sum(-1)
             prior = geometric(float(implants[NOTICES[0]][person])).log()
             expected = expected + torch.logsumexp(along + prior, 0)
         torch.testing.assert_close(found[person], expected, rtol=1e-3, atol=1e-3)
@@ -361,8 +363,8 @@ def test_the_posterior_is_the_exact_one(self_model):
     each = [by_hand(human, known, rounds, 0, number) for number in range(8)]
     total = torch.zeros(200)
     prior = torch.stack([geometric(float(value)) for value in grid]).log()
-    for number, chances in enumerate(each):
-        along = chances[:, torch.arange(STEPS), rounds.actions[0, number]].sum(-1)
+    for number, probabilities in enumerate(each):
+        along = probabilities[:, torch.arange(STEPS), rounds.actions[0, number]].sum(-1)
         total += torch.logsumexp(along + prior, -1)
     exact = torch.softmax(total, 0)
     mean = (exact * grid).sum()
@@ -513,8 +515,8 @@ def test_rare_attention_is_found_out(self_model, recordings):
         away = (there.percepts["away"][there.percept] == 1).double().mean()
         values = torch.tensor([0.0, 1.0])
         alike = {n: value[:1] for n, value in draws.items()}
-        log_chances = Person(human, alike)._log_chances({"away": values}, past)[0]
-        expected = torch.softmax(log_chances + torch.tensor([0.98, 0.02]).log(), 0)[1]
+        log_probabilities = Person(human, alike)._log_probabilities({"away": values}, past)[0]
+        expected = torch.softmax(log_probabilities + torch.tensor([0.98, 0.02]).log(), 0)[1]
         # Assumptions differ between draws, the first of which is held against all.
         if expected > 0.9:
             told += 1

@@ -294,8 +294,8 @@ class Hangs(BombDefusalHuman):
 
     def round_latents(self, implants):
         sites = super().round_latents(implants)
-        chances = torch.linspace(0.1, 0.9, 61)[sites["found_0"].long()]
-        mood = pyro.sample("mood", dist.Bernoulli(chances))
+        probabilities = torch.linspace(0.1, 0.9, 61)[sites["found_0"].long()]
+        mood = pyro.sample("mood", dist.Bernoulli(probabilities))
         return {**sites, "mood": mood}
 
 

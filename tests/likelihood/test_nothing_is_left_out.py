@@ -73,9 +73,9 @@ class Assigns(HumanModel):
 
     def prior(self):
         implants = super().prior()
-        chances = torch.full((*implants["lapse"].shape, 2), 0.5)
-        chances[..., 1] = implants["lapse"]
-        return implants | {"dozes": pyro.sample("dozes", dist.Categorical(chances))}
+        probabilities = torch.full((*implants["lapse"].shape, 2), 0.5)
+        probabilities[..., 1] = implants["lapse"]
+        return implants | {"dozes": pyro.sample("dozes", dist.Categorical(probabilities))}
 
     def act(self, implants, belief, values):
         logits = super().act(implants, belief, values).clone()

@@ -66,7 +66,7 @@ def beliefs(human, world):
     return torch.randn(1, 5, human.belief_size, generator=torch.Generator().manual_seed(1))
 
 
-def chances(human, implants, belief):
+def probabilities(human, implants, belief):
     return human.act(implants, belief, human.action_values(belief))
 
 
@@ -85,12 +85,12 @@ def test_of_each_kind_all_is_that_model(world, kind):
     implants = {name: value[0] for name, value in draw_prior(everybody, 1, 1, 3).items()}
     implants[KIND] = torch.tensor([[everybody.family.index(kind)]])  # pyright: ignore
     belief = beliefs(everybody, world)
-    found = chances(everybody, implants, belief)
+    found = probabilities(everybody, implants, belief)
     names = own.beliefs if isinstance(own, SeveralBeliefs) else ("now",)
     assert isinstance(everybody, SeveralBeliefs)
     parts = belief.chunk(len(everybody.beliefs), -1)
     part = torch.cat([parts[everybody.beliefs.index(name)] for name in names], -1)
-    torch.testing.assert_close(found, chances(own, implants, part), atol=2e-4, rtol=1e-3)
+    torch.testing.assert_close(found, probabilities(own, implants, part), atol=2e-4, rtol=1e-3)
     torch.testing.assert_close(found.exp().sum(-1), torch.ones(1, 5))
 
 
@@ -99,12 +99,12 @@ def test_of_many_draws_each_is_as_it_is_alone(driving):
     human = AnyKind(driving)
     draws = draw_prior(human, 1, 40, 3)
     belief = beliefs(human, "driving")
-    together = chances(human, draws, belief)
+    together = probabilities(human, draws, belief)
     assert together.shape == (40, 1, 5, 2)
     for number in range(40):
         alone = {name: value[number] for name, value in draws.items()}
         torch.testing.assert_close(
-            together[number], chances(human, alone, belief), atol=2e-4, rtol=1e-3
+            together[number], probabilities(human, alone, belief), atol=2e-4, rtol=1e-3
         )
 
 
@@ -192,8 +192,8 @@ def test_late_follows_the_belief_before(driving):
     implants = {name: value[0] for name, value in draw_prior(human, 1, 1, 3).items()}
     belief = beliefs(human, "driving")
     now, before = belief.chunk(2, -1)
-    half = chances(human, implants | {LATE: torch.tensor([[0.5]])}, belief).exp()
-    both = [chances(base, implants, part).exp() for part in (now, before)]
+    half = probabilities(human, implants | {LATE: torch.tensor([[0.5]])}, belief).exp()
+    both = [probabilities(base, implants, part).exp() for part in (now, before)]
     torch.testing.assert_close(half, (both[0] + both[1]) / 2)
 
 
@@ -214,7 +214,7 @@ def test_who_shares_no_goal_does_not_look_at_values(driving):
     implants = {name: value[0] for name, value in draw_prior(human, 1, 1, 3).items()}
     implants |= {SHARES_GOAL: torch.zeros(1, 1), "prefers_switch": torch.full((1, 1), 1.5)}
     implants |= {"residual_in": torch.zeros(1, 1, 49, 8), "residual_out": torch.zeros(1, 1, 9, 2)}
-    found = chances(human, implants, beliefs(human, "driving"))
+    found = probabilities(human, implants, beliefs(human, "driving"))
     torch.testing.assert_close(found[..., 1] - found[..., 0], torch.full((1, 5), 1.5))
 
 

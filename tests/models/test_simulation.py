@@ -49,8 +49,8 @@ def test_actions_are_those_of_beliefs_along_whole_rounds(self_model, kind):
     told = {name: torch.zeros_like(mask) for name, mask in played.told.items()}
     eyes = {name: value for name, value in implants.items() if name.split("_")[0] != "residual"}
     belief = gone_through(human, eyes, observation, told, played.actions).flatten(1, 2)
-    chances = human.act(implants, belief, human.action_values(belief)).exp()
-    done = chances.gather(-1, played.actions.flatten(1)[..., None])
+    probabilities = human.act(implants, belief, human.action_values(belief)).exp()
+    done = probabilities.gather(-1, played.actions.flatten(1)[..., None])
     assert done.mean() > 0.99
     # What the other action would have been is clear, too, and which it is differs.
     assert 0.05 < played.actions.float().mean() < 0.5

@@ -58,16 +58,16 @@ def test_people_who_defuse_bombs_wait_however_long_and_then_press():
                 view, knowledge = human.perceive(own, knowledge, now, told, step)
                 evidence = human.evidence(view, now)
                 belief = human.believe(belief, evidence, last, view.still).mean
-                chances = torch.softmax(4 * model.action_values(belief), -1)
+                probabilities = torch.softmax(4 * model.action_values(belief), -1)
                 live, symbols = read_panel(now["visual"])
                 symbol = symbols.take_along_dim(live[:, None], -1).squeeze(-1)
                 right = 1 + right_button(OLD_RULES, guess, symbol)
                 if since < when:
-                    assert chances[:, WAIT].mean() > 0.98
+                    assert probabilities[:, WAIT].mean() > 0.98
                     last = torch.full_like(last, WAIT)
                 else:
                     assert (human.believed_kind(belief) == guess).all()
-                    assert chances.take_along_dim(right[:, None], -1).mean() > 0.8
+                    assert probabilities.take_along_dim(right[:, None], -1).mean() > 0.8
                     last = right
                 state, step = world.transition(state, last), step + 1
 

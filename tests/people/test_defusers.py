@@ -118,13 +118,15 @@ def test_predictions_are_the_frequencies_of_what_people_do(seed, told):
         )
         message_noise = torch.rand(30, 20, 60, 7, generator=torch.Generator().manual_seed(seed))
         recording = record(people, replace(start, message_noise=message_noise), told=told)
-        chances = people.predictive(
+        probabilities = people.predictive(
             recording.probabilities, recording.observation, recording.actions, recording.told
         )
-        torch.testing.assert_close(chances.sum(-1), torch.ones_like(chances[..., 0]))
-        chosen = chances.gather(-1, recording.actions[..., None]).squeeze(-1)
+        torch.testing.assert_close(probabilities.sum(-1), torch.ones_like(probabilities[..., 0]))
+        chosen = probabilities.gather(-1, recording.actions[..., None]).squeeze(-1)
         assert float(chosen.min()) > 0
-        excess = (-chosen.log() - torch.special.entr(chances).sum(-1)).sum(-1).flatten().double()
+        excess = (
+            (-chosen.log() - torch.special.entr(probabilities).sum(-1)).sum(-1).flatten().double()
+        )
         assert abs(excess.mean()) < 4.5 * excess.std() / len(excess) ** 0.5
 
 
@@ -142,8 +144,8 @@ def test_predictions_by_hand():
 
     def check(*expected):
         found = people.predictive(None, observation, torch.tensor([[actions]]), told)
-        for step, chances in enumerate(expected):
-            assert found[0, 0, step].tolist() == pytest.approx(chances)
+        for step, probabilities in enumerate(expected):
+            assert found[0, 0, step].tolist() == pytest.approx(probabilities)
 
     half = [0.9, 0.05, 0.0, 0.0, 0.05]
     sure = [0.9, 0.0, 0.0, 0.0, 0.1]
@@ -162,16 +164,16 @@ def test_branches_are_all_that_chance_may_decide():
     memory = someone.start(1)
     observation = WORLD.observe(bomb(1))
     nobody = tell()
-    chances, minds, actions = someone.branches(memory, observation, nobody)
-    assert chances[0, 0].tolist() == pytest.approx([0.45, 0.45, 0.05, 0.05])
+    probabilities, minds, actions = someone.branches(memory, observation, nobody)
+    assert probabilities[0, 0].tolist() == pytest.approx([0.45, 0.45, 0.05, 0.05])
     assert actions[0, 0].argmax(-1).tolist() == [WAIT, WAIT, RED, YELLOW]
     # From one of these minds the guess is made, and only the search goes on.
     second = map_state(lambda part: part[:, :, 1], minds)
-    chances, _, _ = someone.branches(second, observation, nobody)
-    assert chances[0, 0].tolist() == pytest.approx([0, 0.9, 0, 0.1])
+    probabilities, _, _ = someone.branches(second, observation, nobody)
+    assert probabilities[0, 0].tolist() == pytest.approx([0, 0.9, 0, 0.1])
     # Told everything nothing is left to chance but what they would have guessed.
-    chances, _, actions = someone.branches(memory, observation, tell([2], kind=True))
-    assert chances[0, 0].tolist() == [0, 0, 0.5, 0.5]
+    probabilities, _, actions = someone.branches(memory, observation, tell([2], kind=True))
+    assert probabilities[0, 0].tolist() == [0, 0, 0.5, 0.5]
     assert actions[0, 0].argmax(-1).tolist() == [WAIT, WAIT, YELLOW, YELLOW]
     assert someone.kept(memory).mind_noise.shape == (1, 1, 0)
 

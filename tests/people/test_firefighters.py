@@ -55,8 +55,8 @@ def state(place, blocked=0, victim=0, found=False):
 def looking(someone, place, memory=None, told=None, **what):
     """Probabilities of actions and memory after a look."""
     memory = someone.start(1) if memory is None else memory
-    chances, memory = someone.step(memory, WORLD.observe(state(place, **what)), told)
-    return chances[0, 0], memory
+    probabilities, memory = someone.step(memory, WORLD.observe(state(place, **what)), told)
+    return probabilities[0, 0], memory
 
 
 def message(**items):
@@ -102,21 +102,21 @@ def test_steps_are_those_of_shortest_ways(place, goal, ways):
     memory = wanting(goal)
     carrying = goal == ENTRY
     room = goal - TOP_LEFT if TOP_LEFT <= goal <= TOP_RIGHT else 1
-    chances, after = looking(someone, place, memory, found=carrying, victim=room)
+    probabilities, after = looking(someone, place, memory, found=carrying, victim=room)
     assert int(after.goal) == goal
     expected = [0.05 + 0.8 * (action in ways) / len(ways) for action in range(4)]
-    assert chances.tolist() == pytest.approx(expected, abs=1e-6)
+    assert probabilities.tolist() == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_known_obstacle_is_walked_around():
     """At the lower end of the left corridor, which is blocked: back to the hall."""
-    chances, memory = looking(person(), (5, 1), wanting(LEFT), blocked=1)
+    probabilities, memory = looking(person(), (5, 1), wanting(LEFT), blocked=1)
     assert int(memory.goal) == RIGHT
-    assert chances.tolist() == [0.0, 1.0, 0.0, 0.0]
+    assert probabilities.tolist() == [0.0, 1.0, 0.0, 0.0]
     # Who does not see it goes on.
-    chances, memory = looking(person(0.5), (5, 1), wanting(LEFT), blocked=1)
+    probabilities, memory = looking(person(0.5), (5, 1), wanting(LEFT), blocked=1)
     assert int(memory.goal) == LEFT
-    assert chances.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert probabilities.tolist() == [1.0, 0.0, 0.0, 0.0]
 
 
 # --- what is possible -------------------------------------------------------------------------
@@ -213,9 +213,9 @@ def test_they_see_by_radius_and_hear_nothing():
 
 
 def test_action_noise_chooses_actions_with_their_probabilities():
-    chances = torch.tensor([0.1, 0.0, 0.6, 0.3])
+    probabilities = torch.tensor([0.1, 0.0, 0.6, 0.3])
     action_noise = (torch.arange(1000) + 0.5) / 1000
-    counts = torch.bincount(act(chances.expand(1000, 4), action_noise), minlength=4)
+    counts = torch.bincount(act(probabilities.expand(1000, 4), action_noise), minlength=4)
     assert counts.tolist() == [100, 0, 600, 300]
     # Of two actions the second is taken where the noise is below its probability.
     two = act(torch.tensor([[0.7, 0.3]] * 2), torch.tensor([0.299, 0.301]))
@@ -274,13 +274,13 @@ def test_predictions_without_reading_minds_are_right_on_average(seed, told):
         4, 300, WORLD.horizon, items, generator=torch.Generator().manual_seed(seed)
     )
     recording = record(people, replace(start, message_noise=message_noise), told=told)
-    chances = people.predictive(
+    probabilities = people.predictive(
         recording.probabilities, recording.observation, recording.actions, recording.told
     )
-    torch.testing.assert_close(chances.sum(-1), torch.ones(chances.shape[:-1]))
+    torch.testing.assert_close(probabilities.sum(-1), torch.ones(probabilities.shape[:-1]))
     alive = torch.arange(WORLD.horizon) < recording.lengths[..., None]
-    surprise = -chances.gather(-1, recording.actions[..., None])[..., 0].log()
-    excess = ((surprise - torch.special.entr(chances).sum(-1)) * alive).sum(-1).flatten()
+    surprise = -probabilities.gather(-1, recording.actions[..., None])[..., 0].log()
+    excess = ((surprise - torch.special.entr(probabilities).sum(-1)) * alive).sum(-1).flatten()
     # Differences of a martingale: rounds are independent. 4.5 standard errors, 1 of 150,000 seeds.
     assert excess.mean().abs() < 4.5 * excess.std() / len(excess) ** 0.5
     # Reading their minds predicts better.

@@ -464,10 +464,10 @@ def test_messages_are_recorded_and_as_frequent_as_asked_for(domain, monkeypatch)
     can_be = get_domain(domain).communicable(
         {name: value[:, :, :-1] for name, value in spoken_to.observation().items()}
     )
-    chances = sum(int((can_be[n] & spoken_to.mask[..., None]).sum()) for n in can_be)
+    probabilities = sum(int((can_be[n] & spoken_to.mask[..., None]).sum()) for n in can_be)
     told = sum(int(mask.sum()) for mask in spoken_to.told.values())
     assert not any((mask & ~can_be[name]).any() for name, mask in spoken_to.told.items())
-    assert abs(told - 0.1 * chances) < 4.5 * (0.09 * chances) ** 0.5
+    assert abs(told - 0.1 * probabilities) < 4.5 * (0.09 * probabilities) ** 0.5
     assert spoken_to.provenance["told"] == 0.1 and "told" not in quiet.provenance
 
 

@@ -118,12 +118,12 @@ class SimulatedDefusers(SimulatedPeople):
         kinds = len(KINDS)
         guess = one_hot(decided.guess.clamp(min=0), kinds).to(found.dtype)
         guess = torch.where((decided.guess == UNDECIDED)[..., None], 1 / kinds, guess)
-        chances = (found[..., None] * guess[..., None, :]).flatten(-2)
-        which = torch.arange(2 * kinds, device=chances.device).expand(chances.shape)
+        probabilities = (found[..., None] * guess[..., None, :]).flatten(-2)
+        which = torch.arange(2 * kinds, device=probabilities.device).expand(probabilities.shape)
 
         def of_each(part: Tensor, behind: int = 0) -> Tensor:
             part = part.unsqueeze(-1 - behind)
-            return part.expand(*chances.shape, *part.shape[chances.dim() :])
+            return part.expand(*probabilities.shape, *part.shape[probabilities.dim() :])
 
         minds = Mind(
             of_each(decided.informed),
@@ -135,11 +135,11 @@ class SimulatedDefusers(SimulatedPeople):
         )
         seen = {
             name: value.unsqueeze(decided.guess.dim()).expand(
-                *chances.shape, *value.shape[decided.guess.dim() :]
+                *probabilities.shape, *value.shape[decided.guess.dim() :]
             )
             for name, value in observation.items()
         }
-        return chances, minds, self._acts(minds, seen)
+        return probabilities, minds, self._acts(minds, seen)
 
     def kept(self, memory: Mind) -> Mind:
         """Return knowledge, guess and found terminals; see `SimulatedPeople.kept`."""

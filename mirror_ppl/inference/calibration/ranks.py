@@ -4,7 +4,7 @@ If people are drawn from the prior, their actions from the program, and inferenc
 truth is exchangeable with its S posterior draws: its rank among them is uniform over 0 .. S.
 Posteriors that are too narrow give too many extreme ranks, too wide ones too few, and shifted ones
 too many at one end. The prior, or a posterior that ignores part of the data, is calibrated, too:
-``sharpness`` measures how much is inferred. This module does not depend on the source of draws.
+``contraction`` measures how much is inferred. This module does not depend on the source of draws.
 """
 
 from __future__ import annotations
@@ -108,9 +108,9 @@ class Calibration:
               ``p_histogram`` and ``p_ecdf``, or the latter alone where the former is NaN because
               people are too few;
             - ``coverage_50``, ``coverage_50_se`` and so on: :attr:`coverage` with its error;
-            - ``sharpness``: 1 for the prior, 0 for certainty. The mean width of the 90% interval,
-              relative to the prior's; for discrete sites the mean entropy, relative to the
-              prior's;
+            - ``contraction`` of the posterior: 0 for the prior, 1 for certainty. One less the mean
+              width of the 90% interval, relative to the prior's; for discrete sites one less the
+              mean entropy, relative to the prior's;
             - for discrete sites (else NaN) ``probability``, the posterior's of the truth, and
               ``entropy`` in nats, both means, and ``prior_probability`` and ``prior_entropy``;
             - ``high_pareto_k``: share of people above 0.7; NaN if there are no weights.
@@ -138,7 +138,7 @@ class Calibration:
         kind = "entropy" if own["discrete"] else "width"
         before = float(own[f"prior_{kind}"])
         # Undefined for a site that is certain under the prior.
-        row["sharpness"] = float(own[kind].mean()) / before if before > 0 else np.nan
+        row["contraction"] = 1 - float(own[kind].mean()) / before if before > 0 else np.nan
         for name in ("probability", "entropy"):
             row[name] = float(own[name].mean())
             row[f"prior_{name}"] = float(own[f"prior_{name}"])

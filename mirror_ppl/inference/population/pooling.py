@@ -5,12 +5,12 @@ hyper-parameters, unless its prior already depends on other sites (how soon each
 noticed, given the person's mean over terminals) or it is knowledge of the world
 (`WorldKnowledge.world_sites`). These, and weights of the residual, keep their prior::
 
-    concentration_d ~ LogNormal(log(n_d), 1)      discrete site d with n_d values; large if
-    chances_d  ~ Dirichlet(concentration_d p_d)     the population is close to its prior p_d
-    mean_c     ~ Normal(m_c, s_c)                 continuous site c, in unconstrained space,
-    spread_c   ~ LogNormal(log(s_c / 2), 0.5)       whose prior has mean m_c and deviation s_c
-    psi_p      ~ Categorical(chances_d), Normal(mean_c, spread_c)        person p
-    actions_p  ~ the human model given psi_p
+    concentration_d ~ LogNormal(log(n_d), 1)            discrete site d with n_d values; large if
+    probabilities_d ~ Dirichlet(concentration_d p_d)    the population is close to its prior p_d
+    mean_c          ~ Normal(m_c, s_c)                  continuous site c, in unconstrained space,
+    spread_c        ~ LogNormal(log(s_c / 2), 0.5)      whose prior has mean m_c and deviation s_c
+    psi_p           ~ Categorical(probabilities_d), Normal(mean_c, spread_c)        person p
+    actions_p       ~ the human model given psi_p
 
 Given the population, people are independent, and each was already inferred under the human model's
 own prior. With S draws of those posteriors, up to a constant::
@@ -51,7 +51,7 @@ MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
 """Draws from which a population is inferred: at most per person, at most in total, and at least
 per person."""
 PRIOR_DRAWS = 4000
-LEAST_CHANCE = 1e-6
+LEAST_PROBABILITY = 1e-6
 """Prior probability of a value of a discrete site below which it counts as impossible."""
 CONCENTRATION_WIDTH = 1.0
 """Standard deviation of the logarithm of the concentration."""
@@ -68,16 +68,16 @@ class Population:
     """Posterior of hyper-parameters, S draws.
 
     Attributes:
-        chances: by discrete site, probabilities of its values ``[S, n]``.
+        probabilities: by discrete site, probabilities of its values ``[S, n]``.
         mean, spread: by continuous site, in unconstrained space, ``[S]``.
     """
 
-    chances: dict[str, Tensor]
+    probabilities: dict[str, Tensor]
     mean: dict[str, Tensor]
     spread: dict[str, Tensor]
 
     def __len__(self) -> int:
-        return len(next(iter([*self.chances.values(), *self.mean.values()])))
+        return len(next(iter([*self.probabilities.values(), *self.mean.values()])))
 
     def spaced(self, number: int) -> Population:
         """Select this many draws, evenly spaced; with repetitions if there are too few."""
@@ -122,14 +122,18 @@ class Pooling:
         self.sites = {name: site for name, site in scalar_sites(human).items() if name in nodes}
         drawn = unconstrained(self.sites, values_of(nodes), PRIOR_DRAWS)
         self.centre, self.width = drawn.mean(0), drawn.std(0)
-        self.supports, self.prior_chances = {}, {}
+        self.supports, self.prior_probabilities = {}, {}
         for name, node in nodes.items():
             if node["fn"].has_enumerate_support and not node["fn"].event_dim:
                 values = node["fn"].enumerate_support()
-                chances = node["fn"].log_prob(values).exp().flatten(1).mean(1)
-                possible = chances > LEAST_CHANCE  # prior-impossible values stay impossible
+                probabilities = node["fn"].log_prob(values).exp().flatten(1).mean(1)
+                possible = (
+                    probabilities > LEAST_PROBABILITY
+                )  # prior-impossible values stay impossible
                 self.supports[name] = values.flatten(1)[possible, 0]
-                self.prior_chances[name] = chances[possible] / chances[possible].sum()
+                self.prior_probabilities[name] = (
+                    probabilities[possible] / probabilities[possible].sum()
+                )
 
     def program(
         self, known: Mapping[str, Tensor], place: Mapping[str, Tensor], log_prior: Tensor
@@ -141,24 +145,26 @@ class Pooling:
             place: values of continuous sites in unconstrained space, by site, ``[P, S]``.
             log_prior: log prior of the draws under the human model, ``[P, S]``.
         """
-        chances = {}
-        for name, prior in self.prior_chances.items():
+        probabilities = {}
+        for name, prior in self.prior_probabilities.items():
             size = prior.new_tensor(float(len(prior)))
             prior_of = dist.LogNormal(size.log(), torch.full_like(size, CONCENTRATION_WIDTH))
             concentration = pyro.sample(f"{name}_concentration", prior_of)
-            chances[name] = pyro.sample(f"{name}_chances", dist.Dirichlet(concentration * prior))
+            probabilities[name] = pyro.sample(
+                f"{name}_probabilities", dist.Dirichlet(concentration * prior)
+            )
         mean, spread = {}, {}
         for name, centre, width in zip(self.sites, self.centre, self.width, strict=True):
             mean[name] = pyro.sample(f"{name}_mean", dist.Normal(centre, width))
             half = dist.LogNormal((SPREAD * width).log(), torch.full_like(width, SPREAD_WIDTH))
             spread[name] = pyro.sample(f"{name}_spread", half)
-        ratio = self.log_density(chances, mean, spread, known, place) - log_prior
+        ratio = self.log_density(probabilities, mean, spread, known, place) - log_prior
         with pyro.plate("person", len(log_prior)):
             pyro.factor("rounds", torch.logsumexp(ratio, -1) - math.log(ratio.shape[-1]))
 
     @staticmethod
     def log_density(
-        chances: Mapping[str, Tensor],
+        probabilities: Mapping[str, Tensor],
         mean: Mapping[str, Tensor],
         spread: Mapping[str, Tensor],
         known: Mapping[str, Tensor],
@@ -169,7 +175,7 @@ class Pooling:
         for name, value in place.items():
             total = total + dist.Normal(mean[name], spread[name]).log_prob(value)
         for name, value in known.items():
-            total = total + value @ chances[name].log()
+            total = total + value @ probabilities[name].log()
         return total
 
     def read(
@@ -213,16 +219,16 @@ class Pooling:
         some = torch.linspace(0, held - 1, used).round().long()
         known, place, log_prior = self.read({name: value[some] for name, value in draws.items()})
         own = torch.stack([place[name] for name in self.sites], -1)
-        chances, mean, spread = sample_population(
+        probabilities, mean, spread = sample_population(
             PeoplesDraws(known, (own - self.centre) / self.width, log_prior),
-            HyperPriors(self.prior_chances, CONCENTRATION_WIDTH, SPREAD, SPREAD_WIDTH),
+            HyperPriors(self.prior_probabilities, CONCENTRATION_WIDTH, SPREAD, SPREAD_WIDTH),
             number,
             seed,
             lambda done, total: report("population", done, total, ""),
         )
         mean, spread = self.centre + self.width * mean, self.width * spread
         return Population(
-            chances,
+            probabilities,
             dict(zip(self.sites, mean.unbind(-1), strict=True)),
             dict(zip(self.sites, spread.unbind(-1), strict=True)),
         )
@@ -241,11 +247,11 @@ class Pooling:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             for index in range(len(population)):
-                chances, mean, spread = (
+                probabilities, mean, spread = (
                     {name: value[index] for name, value in part.items()}
                     for part in vars(population).values()
                 )
-                density = self.log_density(chances, mean, spread, known, place)
+                density = self.log_density(probabilities, mean, spread, known, place)
                 weights = torch.softmax(density - log_prior, -1)
                 effective.append(1 / weights.square().sum(-1))
                 chosen.append(torch.multinomial(weights, 1)[:, 0])
@@ -266,8 +272,10 @@ class Pooling:
             torch.manual_seed(seed)
             given: Draws = {}
             for name, support in self.supports.items():
-                chances = population.chances[name][:, None].expand(-1, people * tries, -1)
-                given[name] = support[dist.Categorical(chances).sample()][..., None]
+                probabilities = population.probabilities[name][:, None].expand(
+                    -1, people * tries, -1
+                )
+                given[name] = support[dist.Categorical(probabilities).sample()][..., None]
             for name, site in self.sites.items():
                 normal = dist.Normal(population.mean[name], population.spread[name])
                 given[name] = site(normal.sample(torch.Size([people * tries])).T)[..., None]

@@ -11,7 +11,7 @@ the site's other parameters integrated out; the rest is conjugate::
         spread ~ p(spread) N(x; 0, spread^2 I + 1 1')     mean ~ N(n x' / (n + spread^2), ...)
     n people of whom k have each value of a discrete site
         concentration ~ p(concentration) DirichletMultinomial(k; concentration p_d)
-        chances ~ Dirichlet(concentration p_d + k)
+        probabilities ~ Dirichlet(concentration p_d + k)
 
 This is exact except for the grid, whose cells are a fortieth of the prior's standard deviation, and
 which ends eight standard deviations below and above the median.
@@ -41,14 +41,14 @@ class HyperPriors:
     """Hyper-priors of concentrations and spreads.
 
     Attributes:
-        chances: prior probabilities of each discrete site's values ``[n]``, by site.
+        probabilities: prior probabilities of each discrete site's values ``[n]``, by site.
         concentration_width: standard deviation of the logarithm of a concentration, whose median
             is the number of values.
         spread: median of a continuous site's spread, in standard deviations of its prior.
         spread_width: standard deviation of its logarithm.
     """
 
-    chances: dict[str, Tensor]
+    probabilities: dict[str, Tensor]
     concentration_width: float
     spread: float
     spread_width: float
@@ -87,13 +87,13 @@ def sample_population(
         report: called with the number of sweeps.
     """
     place = people.place.double()
-    known = [people.known[name].double() for name in priors.chances]
+    known = [people.known[name].double() for name in priors.probabilities]
     # A draw's log-density is linear in these, [P, S, F].
     features = torch.cat([place, place.square(), *known], -1)
     log_prior = people.log_prior.double()
     sites = {
         name: DiscreteSite(len(place), prior.double(), priors.concentration_width)
-        for name, prior in priors.chances.items()
+        for name, prior in priors.probabilities.items()
     }
     which = {name: people.known[name].argmax(-1) for name in sites}
     continuous = ContinuousSites(len(place), priors, place)
@@ -106,13 +106,15 @@ def sample_population(
         for sweep in range(total):
             own = torch.multinomial(weights, 1)[:, 0]
             mean, spread = continuous.draw(place[everybody, own])
-            chances = {name: site.draw(which[name][everybody, own]) for name, site in sites.items()}
+            probabilities = {
+                name: site.draw(which[name][everybody, own]) for name, site in sites.items()
+            }
             linear = torch.cat(
-                [mean / spread**2, -0.5 / spread**2, *map(torch.log, chances.values())]
+                [mean / spread**2, -0.5 / spread**2, *map(torch.log, probabilities.values())]
             )
             weights = torch.softmax(features @ linear - log_prior, -1)
             if sweep >= WARMUP and (sweep - WARMUP) % THIN == THIN - 1:
-                kept.append((chances, mean, spread))
+                kept.append((probabilities, mean, spread))
             report(sweep + 1, total)
     return (
         {name: torch.stack([one[0][name] for one in kept]).to(people.place) for name in sites},
@@ -202,7 +204,7 @@ class DiscreteSite:
         """Log densities of concentrations ``[CELLS]``, given counts of people by value ``[n]``."""
         return self.constant + (self.alone + count).lgamma().sum(-1)
 
-    def chances(self, count: Tensor, concentration: Tensor) -> Dirichlet:
+    def probabilities(self, count: Tensor, concentration: Tensor) -> Dirichlet:
         """Conditional of the probabilities ``[n]`` of values, given counts ``[n]``."""
         return Dirichlet(concentration * self.prior + count)
 
@@ -210,4 +212,4 @@ class DiscreteSite:
         """Draw probabilities ``[n]`` of values, given people's values ``[P]``."""
         count = torch.bincount(value, minlength=len(self.prior)).to(self.prior)
         concentration = _from_grid(self.grid, self.log_densities(count))
-        return self.chances(count, concentration).sample().clamp(min=SMALLEST)
+        return self.probabilities(count, concentration).sample().clamp(min=SMALLEST)

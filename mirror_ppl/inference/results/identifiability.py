@@ -167,11 +167,11 @@ def identify(
         grid = {site: value[candidates] for site, value in combination_values(human, table).items()}
         if population is not None and pooling is not None:
             # The mean over the population, which is independent of this person's policy draws.
-            chances = {
+            probabilities = {
                 site: value.mean(0, keepdim=True).expand(len(chosen), *value.shape[1:])
-                for site, value in population.chances.items()
+                for site, value in population.probabilities.items()
             }
-            joint = joint + _instead_of_prior(grid, chances, pooling)
+            joint = joint + _instead_of_prior(grid, probabilities, pooling)
         weights = torch.log_softmax(joint, -1)  # [S, C]
         told = (weights.new_zeros(0),) * 2
         if rounds:
@@ -196,7 +196,7 @@ def identify(
 
 
 def _instead_of_prior(
-    grid: Mapping[str, Tensor], chances: Mapping[str, Tensor], pooling: Pooling
+    grid: Mapping[str, Tensor], probabilities: Mapping[str, Tensor], pooling: Pooling
 ) -> Tensor:
     """Log ratio ``[S, C]`` of the population's prior of combinations to the model's own.
 
@@ -206,7 +206,7 @@ def _instead_of_prior(
     for site, support in pooling.supports.items():
         if site in grid:
             same = grid[site][:, None] == support
-            ratio = (chances[site] / pooling.prior_chances[site]).log()
+            ratio = (probabilities[site] / pooling.prior_probabilities[site]).log()
             # Values that are impossible under the prior have probability 0.
             ratio = torch.where(same.any(-1), ratio[:, same.long().argmax(-1)], -torch.inf)
             total = total + ratio

@@ -1,7 +1,7 @@
 """The population in a posterior file: hyper-parameters, and a new person from it ("round zero").
 
 There are two groups besides the standard ones. ``population``: for each discrete site the
-probabilities of its values, ``<site>_chances``; for each continuous one mean and spread in
+probabilities of its values, ``<site>_probabilities``; for each continuous one mean and spread in
 unconstrained space (of its logarithm or logit), ``<site>_mean`` and ``<site>_spread``.
 ``newcomer``: draws of the implants of a person from the population without recorded rounds.
 """
@@ -50,9 +50,9 @@ def add_population(
     domain = pooling.human.domain
     variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
     coordinates = {}
-    for name, chances in population.chances.items():
+    for name, probabilities in population.probabilities.items():
         axis = f"{name}_value"
-        variables[f"{name}_chances"] = ((*SAMPLE, axis), chances.cpu().numpy()[None])
+        variables[f"{name}_probabilities"] = ((*SAMPLE, axis), probabilities.cpu().numpy()[None])
         values = pooling.supports[name].cpu()
         bins = torch.tensor(domain.reach_bins)
         coordinates[axis] = (bins[values] if is_reach(name, values) else values).numpy()
@@ -112,15 +112,19 @@ def load_population(path: Path, pooling: Pooling, setting: str | None = None) ->
             found[name] = torch.as_tensor(value.reshape(-1, *value.shape[2:])).to(like)
         return found
 
-    chances = part(pooling.supports, "chances", 1)
-    for name, value in chances.items():
+    probabilities = part(pooling.supports, "probabilities", 1)
+    for name, value in probabilities.items():
         sums = value.sum(-1)
         if value.shape[1] != len(pooling.supports[name]) or (value <= 0).any():
-            raise PosteriorError(f'{path}: "{name}_chances" are no probabilities of its values')
+            raise PosteriorError(
+                f'{path}: "{name}_probabilities" are no probabilities of its values'
+            )
         if not torch.allclose(sums, torch.ones_like(sums), atol=1e-3):
-            raise PosteriorError(f'{path}: "{name}_chances" are no probabilities of its values')
+            raise PosteriorError(
+                f'{path}: "{name}_probabilities" are no probabilities of its values'
+            )
     spread = part(pooling.sites, "spread", 0)
     for name, value in spread.items():
         if (value <= 0).any():
             raise PosteriorError(f'{path}: "{name}_spread" has values that are not positive')
-    return Population(chances, part(pooling.sites, "mean", 0), spread)
+    return Population(probabilities, part(pooling.sites, "mean", 0), spread)

@@ -71,9 +71,9 @@ class OneOfKinds(HumanModel):
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of all models, and the kind, of every person."""
         other = (1 - USUAL) / (len(self.family) - 1)
-        chances = torch.tensor([USUAL, *[other] * (len(self.family) - 1)])
-        chances = chances.to(next(self.self_model.parameters()))
-        return super().prior() | {KIND: pyro.sample(KIND, dist.Categorical(chances))}
+        probabilities = torch.tensor([USUAL, *[other] * (len(self.family) - 1)])
+        probabilities = probabilities.to(next(self.self_model.parameters()))
+        return super().prior() | {KIND: pyro.sample(KIND, dist.Categorical(probabilities))}
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Return log-probabilities of actions ``[..., P, B, A]`` under each person's kind."""

@@ -1,12 +1,12 @@
-"""How well actions are predicted of people who are told things, when all implants are known.
+"""How well actions are predicted of people who receive messages, when all implants are known.
 
-    python -m benchmarks.told
+    python -m benchmarks.after_messages
 
-Simulated people are told communicable items at random. Their true probabilities of actions are
-compared with those of the human model that has their own sight, consistency and assumptions, so
-what remains is what the model gets wrong: nats of Kullback-Leibler divergence an action, for rounds
-in which nothing, pictures, utterances or both are told, one item in ten at each step. Beside it the
-same model when it leaves memory to the encoder, and when it does not know what people assume.
+Simulated people receive communicable items at random, one in ten at each step. Their true
+probabilities of actions are compared with those of the human model that has their own sight,
+consistency and assumptions, so what remains is the model's error: nats of Kullback-Leibler
+divergence an action, for rounds with no messages, with pictures, with utterances, or with both.
+Two variants stand beside it: memory left to the encoder, and assumptions not known.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ class Told:
     Attributes:
         observation: ``[B, T, ...]``.
         told: masks ``[B, T, K]``.
-        chances: true probabilities of actions ``[B, T, A]``.
+        probabilities: true probabilities of actions ``[B, T, A]``.
         actions: ``[B, T]``.
     """
 
     observation: Observation
     told: Visibility
-    chances: Tensor
+    probabilities: Tensor
     actions: Tensor
 
 
@@ -124,19 +124,19 @@ def tell(
         for name, may in domain.communicable(observation).items():
             chosen = torch.rand(may.shape, generator=generator) < rate
             told[name] = may & chosen & (name in modalities)
-        chances, memory = driver.step(
+        probabilities, memory = driver.step(
             memory,
             {name: value[None] for name, value in observation.items()},
             {name: mask[None] for name, mask in told.items()},
         )
-        action = (torch.rand(len(state.lane), generator=generator) < chances[0, :, 1]).long()
-        steps.append((observation, told, chances[0], action))
+        action = (torch.rand(len(state.lane), generator=generator) < probabilities[0, :, 1]).long()
+        steps.append((observation, told, probabilities[0], action))
         state = domain.transition(state, action)
-    observations, messages, chances, actions = zip(*steps, strict=True)
+    observations, messages, probabilities, actions = zip(*steps, strict=True)
     return Told(
         {name: torch.stack([one[name] for one in observations], 1) for name in observations[0]},
         {name: torch.stack([one[name] for one in messages], 1) for name in messages[0]},
-        torch.stack(chances, 1),
+        torch.stack(probabilities, 1),
         torch.stack(actions, 1),
     )
 
@@ -162,7 +162,7 @@ def divergence(person: Person, rounds: Told) -> Tensor:
     )
     belief = torch.stack([state.believed for state in states], 1).flatten(0, 1)[None]
     predicted = person.act(belief, human.self_model.action_values(belief))[0]
-    true = rounds.chances.flatten(0, 1)
+    true = rounds.probabilities.flatten(0, 1)
     return (true * (true.clamp(min=1e-9).log() - predicted)).sum(-1).mean()
 
 
