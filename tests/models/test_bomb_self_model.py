@@ -157,7 +157,8 @@ def test_a_robot_is_taught_and_judged_by_the_rules_that_it_was_taught(tmp_path):
     assert "share_clear" not in quality
 
 
-def test_training_writes_a_self_model_of_the_world_as_it_is(tmp_path, capsys):
+def test_training_writes_a_self_model_of_the_world_as_it_is(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(BombDefusal, "record", replace(BombDefusal.record, measured=200))
     out = tmp_path / "bomb.safetensors"
     main(Options(domain="bomb_defusal", out=out, phases=1, steps=1))
     self_model, card = load_self_model(out, "bomb_defusal")
