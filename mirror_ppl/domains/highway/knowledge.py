@@ -79,7 +79,7 @@ def remember(
     empty = visual.new_tensor([RANGE, 0.0, 0.0])
     said = torch.where(heard, observation["verbal"][..., 0], float(NOTHING))
     visual = torch.where(seen[..., None], visual, empty)
-    sight = _once_each(
+    sight = once_each(
         lambda ego, visual, verbal: cars_in({"ego": ego, "visual": visual, "verbal": verbal}),
         (ego, 1),
         (visual, 2),
@@ -101,7 +101,7 @@ def imagined(memory: Memory, observation: Observation) -> Observation:
         return scan(state_with(ego, Cars(**dict(zip(names, cars, strict=True)))))
 
     parts = [(getattr(memory, name), 1) for name in names]
-    return {**observation, "visual": _once_each(scanned, (observation["ego"], 1), *parts)}
+    return {**observation, "visual": once_each(scanned, (observation["ego"], 1), *parts)}
 
 
 def out_of_sight(sees: Callable[[Observation], Visibility], observation: Observation):
@@ -115,7 +115,7 @@ def out_of_sight(sees: Callable[[Observation], Visibility], observation: Observa
     return hidden
 
 
-def _once_each(function: Callable[..., Any], *parts: tuple[Tensor, int]) -> Any:
+def once_each(function: Callable[..., Any], *parts: tuple[Tensor, int]) -> Any:
     """Apply a function of batches to each distinct row of them once.
 
     Many people who see differently far know of the same cars.
@@ -133,6 +133,8 @@ def _once_each(function: Callable[..., Any], *parts: tuple[Tensor, int]) -> Any:
     ]
     rows = torch.cat([as_whole_numbers(part).flatten(1) for part in flat], 1)
     first, index = distinct_rows(rows)
+    if len(first) == len(rows):  # in their order, so that all are rounded as without this
+        first = index = torch.arange(len(rows), device=rows.device)
     found = function(*(part[first] for part in flat))
 
     def spread(part: Tensor) -> Tensor:

@@ -12,15 +12,15 @@ with ``Q(a, m_t)`` the return of keeping up manoeuvre ``a`` for six seconds amon
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Domain, Observation, Visibility, by_eye
 from mirror_ppl.domains.highway import expert
-from mirror_ppl.domains.highway.estimate import state_with
-from mirror_ppl.domains.highway.knowledge import Memory, nothing, remember
+from mirror_ppl.domains.highway.estimate import Cars, state_with
+from mirror_ppl.domains.highway.knowledge import Memory, nothing, once_each, remember
 from mirror_ppl.domains.highway.world import SIGHT_OF, Highway
 from mirror_ppl.models.implants import ASSUMES, SIGHT
 from mirror_ppl.people.base import SimulatedPeople
@@ -72,10 +72,11 @@ class HighwayDrivers(SimulatedPeople):
             seen, heard = seen | told["visual"], heard | told["verbal"]
         limits = self._limits(observation["ego"])
         memory = remember(memory, observation, seen, heard, lambda distance: distance > limits)
-        state = state_with(observation["ego"], memory)
         lengths = (1,) * (memory.x.dim() - 2)
-        caution = self.caution.view(-1, *lengths).expand(memory.x.shape[:-1])
-        values = expert.values(state, weights=dict.fromkeys(CAREFUL, caution))
+        parts = [(getattr(memory, part.name), 1) for part in fields(Cars)]
+        caution = self.caution.view(-1, *lengths, 1)
+        # Messages that tell a driver nothing new lead to the same cars.
+        values = once_each(_values, (observation["ego"], 1), (caution, 1), *parts)
         return torch.softmax(self.consistency.view(-1, *lengths, 1) * values, -1), memory
 
     def _limits(self, ego: Tensor) -> Tensor:
@@ -87,3 +88,9 @@ class HighwayDrivers(SimulatedPeople):
         """Return their sight thresholds, and that they take for granted what they do not see."""
         own = {SIGHT + name: self.reach[:, i] for i, name in enumerate(self.domain.directions)}
         return own | {ASSUMES + "clear": torch.ones_like(self.consistency)}
+
+
+def _values(ego: Tensor, caution: Tensor, *cars: Tensor) -> Tensor:
+    """Return the return ``[n, A]`` of each manoeuvre among cars ``[n, 6]``, fields of `Cars`."""
+    state = state_with(ego, Cars(*cars))
+    return expert.values(state, weights=dict.fromkeys(CAREFUL, caution[:, 0]))

@@ -7,7 +7,7 @@ from highway_states import state_of
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains.base import by_eye
 from mirror_ppl.domains.highway import Highway, expert
-from mirror_ppl.domains.highway.knowledge import REMEMBERED, _once_each, imagined
+from mirror_ppl.domains.highway.knowledge import REMEMBERED, imagined, once_each
 from mirror_ppl.domains.highway.lidar import RANGE
 from mirror_ppl.domains.highway.participants import simulated_highway_drivers
 from mirror_ppl.models.human import at_step
@@ -102,7 +102,7 @@ def test_what_is_worked_out_once_for_equal_rows_is_right_for_each(generator):
         calls.append(len(one))
         return one.sum(-1) + 10 * other[:, 0]
 
-    found = _once_each(function, (values[:, None], 1), (number, 1))
+    found = once_each(function, (values[:, None], 1), (number, 1))
     torch.testing.assert_close(found, values.sum(-1)[:, None] + 10 * number[..., 0])
     assert calls == [len(values.unique(dim=0)) * 2]
 

@@ -104,7 +104,7 @@ def test_groups_are_described_and_counted_as_one():
     assert {name: count.tolist() for name, count in tally.items.items()} == {
         "visual": [1], "verbal": [0],
     }  # fmt: skip
-    assert tally.probabilities == {"visual": 6, "verbal": 6}
+    assert tally.communicable == {"visual": 6, "verbal": 6}
 
 
 @pytest.mark.parametrize(
