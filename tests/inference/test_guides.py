@@ -1,4 +1,4 @@
-"""Every guide against a person whose posterior is known exactly, and what guides have in common."""
+"""Every guide against a person whose posterior is known exactly, and guides that are trained."""
 
 import json
 import math
@@ -8,24 +8,21 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_draws import DRAWS, bound, options_of
+from example_views import ragged
 from running import command
 from scipy import stats
-from test_views import ragged
 
 from mirror_ppl.commands import calibrate as calibrate_command
 from mirror_ppl.commands import fit, simulate, train
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.errors import AssetError, CheckpointError, HumanModelError, UnknownNameError
+from mirror_ppl.errors import AssetError, HumanModelError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions
 from mirror_ppl.inference.amortized import AmortizedOptions, evidence_of, sample_amortized
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, reference_places
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
-from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_identity
-from mirror_ppl.inference.nuts import NUTSOptions
-from mirror_ppl.inference.results import fitting
+from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer
 from mirror_ppl.inference.sampler import Sampler
-from mirror_ppl.inference.svi import SVIOptions
-from mirror_ppl.likelihood.enumeration import acts_on_beliefs
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
@@ -35,10 +32,9 @@ from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import RATES, ToyHuman, toy_posterior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.training import guide as guide_training
-from mirror_ppl.training.guide import GuideOptions, simulate_examples, train_guide
+from mirror_ppl.training.guide import GuideOptions, train_guide
 from mirror_ppl.training.guide_file import load_guide, network_for, save_guide
 
-DRAWS = 400
 TRAINING = GuideOptions(people=150, rounds=(1, 3), steps=600, batch=64, together=50)
 
 
@@ -68,20 +64,11 @@ def network(trained):
     return trained[0]
 
 
-def options_of(guide):
-    return InferenceOptions(guide, DRAWS, SVIOptions(steps=400) if guide == "svi" else None)
-
-
 QUICK = {
     "importance": ImportanceOptions(256, 100.0),
     "amortized": AmortizedOptions(256, ImportanceOptions(256, 100.0)),
 }
 """Settings of the engines that are calibrated here."""
-
-
-def bound(variance, draws):
-    """What a mean of draws may be off by once in a million."""
-    return -stats.norm.ppf(5e-7) * (variance / draws) ** 0.5
 
 
 # --- against the exact posterior --------------------------------------------------------------
@@ -187,87 +174,6 @@ def test_calibration_notices_wrong_posteriors(toy, network, kind):
     assert {site for site, _ in result.rejected} == set(RATES)
 
 
-# --- weights ----------------------------------------------------------------------------------
-
-
-def test_weights_do_not_depend_on_what_was_proposed(toy, recordings):
-    table = build_view_table(toy, recordings.select_people([1]))
-    exact = toy_posterior(toy, recordings.select_people([1]))
-    for mean, width in ((0.0, 1.0), (-1.0, 2.0)):
-        torch.manual_seed(0)
-        sampler = Sampler(toy, table)
-        sampler.draw(500)
-        sampler.propose(dist.Normal(torch.full((2,), mean), width).to_event(1), 1500)
-        found = sampler.weighted()
-        for site in RATES:
-            value = (found.log_weights.exp() * found.policy[site].flatten()).sum()
-            off = abs(float(value - exact.mean(site)[0]))
-            assert off < float(bound(exact.variance(site)[0], found.effective / 2))
-
-
-def test_unreliable_weights_are_reported(toy, recordings):
-    table = build_view_table(toy, recordings.select_people([1]))
-    torch.manual_seed(0)
-    sampler = Sampler(toy, table)
-    sampler.draw(1)
-    sampler.propose(dist.Normal(torch.full((2,), 6.0), 0.3).to_event(1), 400)
-    assert sampler.weighted().pareto_k > 0.7
-
-
-def test_pruning_leaves_the_posterior_as_it_is(toy, recordings):
-    table = build_view_table(toy, recordings.select_people([0]))
-    whole, pruned = Sampler(toy, table), Sampler(toy, table)
-    for sampler in (whole, pruned):
-        torch.manual_seed(0)
-        sampler.draw(100)
-    pruned.prune(0.5)
-    kept = torch.isin(whole.combinations.first, pruned.combinations.first)
-    assert 0 < int(kept.sum()) < len(whole.combinations)
-    torch.manual_seed(1)
-    policy, joint = whole._policies[0], whole._joints[0]
-    assert torch.equal(pruned._joints[0], joint[:, kept])
-    torch.testing.assert_close(pruned._joint(policy, len(joint)), joint[:, kept])
-    behind = (joint.max() - joint).amin(0)
-    assert torch.equal(kept, behind <= 0.5)
-
-
-@pytest.mark.parametrize("guide", ["importance", "svi"])
-def test_models_with_little_to_infer(toy, recordings, guide):
-    """Sight alone, and an implant that actions do not depend on."""
-    some, few = recordings.select_people([0]), SVIOptions(steps=2) if guide == "svi" else None
-
-    class OnlySight(ToyHuman):
-        def act(self, implants, belief, values):
-            rate = torch.where(belief[..., 0] > 0, 0.8, 0.1)
-            return torch.stack([torch.log1p(-rate), torch.log(rate)], -1)
-
-    class OnlyReach(OnlySight):
-        def prior(self):
-            like = next(self.self_model.parameters())
-            bins = like.new_ones(7) / 7
-            return {"reach": pyro.sample("reach", dist.Categorical(bins))}
-
-    human = OnlySight(toy.self_model)
-    draws = infer(human, some, InferenceOptions(guide, 40, few), 0).draws
-    assert draws["reach"].shape == draws["in_sight"].shape == (40, 1, 1)
-    if guide == "importance":  # svi needs a continuous site for its guide
-        draws = infer(OnlyReach(toy.self_model), some, InferenceOptions(guide, 40), 0).draws
-        assert list(draws) == ["reach"] and draws["reach"].shape == (40, 1, 1)
-
-
-def test_a_prior_that_depends_on_what_is_seen_is_refused(toy, recordings):
-    class Hierarchical(ToyHuman):
-        def prior(self):
-            implants = super().prior()
-            far = (implants["reach"] > 2).float()
-            return implants | {"depends": pyro.sample("depends", dist.Beta(1 + far, 2 - far))}
-
-    human = Hierarchical(toy.self_model)
-    for guide in ("importance", "svi"):
-        with pytest.raises(HumanModelError, match='"depends" depends on a discrete site'):
-            infer(human, recordings, InferenceOptions(guide, 5), 0)
-
-
 def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):
     nobody = ragged(recordings, [[]] * 6)
     for guide in ("importance", "amortized"):
@@ -276,6 +182,30 @@ def test_nobody_s_rounds_leave_the_prior(toy, recordings, network):
         assert stats.kstest(values.numpy(), stats.beta(1, 4).cdf).pvalue > 1e-4
         counts = torch.bincount(found.draws["reach"].flatten(), minlength=7)
         assert stats.chisquare(counts.numpy()).pvalue > 1e-5
+
+
+def test_people_do_not_depend_on_the_other_people(toy, recordings, network):
+    for guide in ("importance", "amortized"):
+        together = infer(toy, recordings.select_people([0, 1]), options_of(guide), 0, network)
+        alone = infer(toy, recordings.select_people([0]), options_of(guide), 0, network)
+        for name, value in alone.draws.items():
+            assert torch.equal(together.draws[name][:, :1], value)
+            assert value.dtype == (torch.long if name == "reach" else torch.float)
+
+
+def test_the_package_s_own_model_and_its_prior(self_model):
+    human = HumanModel(self_model)
+    some = load_demonstrations(asset_path("driving_fog_paper.nc"))
+    some = some.select_people([0]).select_rounds([0, 1])
+    found = infer(
+        human, some, InferenceOptions("importance", 50, settings=ImportanceOptions(128, 10.0)), 0
+    )
+    assert list(found.draws)[:4] == [f"sight_{name}" for name in human.domain.directions]
+    assert found.draws["residual_in"].shape[:3] == (50, 1, 1)
+    guide = AmortizedGuide(reference_places(human))
+    assert guide.ways.shape == (64, 2)
+    untrained = sample_amortized(human, guide, sightings_of(human, some, 0, [0, 1]))
+    assert untrained.effective > 10  # weights make up for what it has not learned
 
 
 # --- what the amortized guide reads -----------------------------------------------------------
@@ -337,125 +267,6 @@ def test_the_guide_is_a_program_with_the_density_it_says(toy, recordings, networ
         expected = expected - site.log_abs_det_jacobian(place[:, column], value)
     found = trace.log_prob_sum()
     torch.testing.assert_close(found, expected.sum(), atol=1e-4, rtol=1e-4)
-
-
-def test_training_goes_on_where_it_was(toy, tmp_path):
-    options = GuideOptions(people=12, rounds=(1, 2), steps=1, together=4)
-    path = tmp_path / "guide.checkpoint"
-
-    def stop(name, done, total, message):
-        if done == 8:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        simulate_examples(toy, options, 0, stop, path)
-    done = []
-    whole = simulate_examples(toy, options, 0, lambda *told: done.append(told[1]), path)
-    assert done == [8, 12]
-    again = simulate_examples(toy, options, 0)
-    for name, value in vars(again).items():
-        assert torch.equal(getattr(whole, name), value), name
-    with pytest.raises(CheckpointError, match="other options"):
-        simulate_examples(toy, options, 1, checkpoint=path)
-    # Nor is another model gone on with, even one of the same file.
-    other = Other(toy.self_model)
-    assert run_identity(Peeking(toy.self_model), None, []) != run_identity(other, None, [])
-    with pytest.raises(CheckpointError, match="other options"):
-        simulate_examples(other, options, 0, checkpoint=path)
-
-
-# --- one interface ----------------------------------------------------------------------------
-
-
-def test_people_do_not_depend_on_the_other_people(toy, recordings, network):
-    for guide in ("importance", "amortized"):
-        together = infer(toy, recordings.select_people([0, 1]), options_of(guide), 0, network)
-        alone = infer(toy, recordings.select_people([0]), options_of(guide), 0, network)
-        for name, value in alone.draws.items():
-            assert torch.equal(together.draws[name][:, :1], value)
-            assert value.dtype == (torch.long if name == "reach" else torch.float)
-
-
-def test_inference_goes_on_from_its_checkpoint(toy, recordings, tmp_path):
-    run = (tmp_path / "fit.checkpoint", "this run")
-
-    def stop(name, done, total, message):
-        if done == 4:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        infer(toy, recordings, options_of("importance"), 0, None, stop, run)
-    done = []
-    resumed = infer(
-        toy, recordings, options_of("importance"), 0, None, lambda *told: done.append(told[1]), run
-    )
-    assert done == [4, 6]  # part by part
-    whole = infer(toy, recordings, options_of("importance"), 0)
-    for name, value in whole.draws.items():
-        assert torch.equal(resumed.draws[name], value)
-    assert torch.equal(resumed.pareto_k, whole.pareto_k)
-    # What another run has kept is not for this one.
-    done.clear()
-    another = (run[0], "another")
-    infer(
-        toy,
-        recordings,
-        options_of("importance"),
-        0,
-        report=lambda *told: done.append(told[1]),
-        checkpoint=another,
-    )
-    assert done == [0, 2, 4, 6]
-
-
-class Other(ToyHuman):
-    """Of this file, too."""
-
-
-class Peeking(ToyHuman):
-    """Acts on what is within reach without believing in it."""
-
-    def act(self, implants, belief, values):
-        far = (implants["reach"] > 3)[..., None]
-        seen = torch.where(far, 1.0, belief)
-        return super().act(implants, seen, values)
-
-
-def test_models_whose_views_are_not_enough_are_refused(self_model, recordings):
-    human = Peeking(self_model)
-    some = recordings.select_people([0]).select_rounds([0])
-    table = build_view_table(human, some)
-    assert not acts_on_beliefs(human, table.sites)
-    assert acts_on_beliefs(ToyHuman(self_model), table.sites)
-    with pytest.raises(HumanModelError, match="only the engines svi and nuts"):
-        infer(human, some, InferenceOptions("importance"), 0)
-    for engine, few in (("svi", SVIOptions(steps=2)), ("nuts", NUTSOptions(warmup=5))):
-        draws = infer(human, some, InferenceOptions(engine, 50, few), 0).draws
-        assert draws["reach"].shape == (50, 1, 1)
-
-
-def test_guides_that_are_not_there(toy, recordings):
-    with pytest.raises(UnknownNameError, match=r'unknown engine "magic"; known: .*importance'):
-        InferenceOptions("magic")
-    with pytest.raises(ValueError, match="draws must be from 1 to 100000, not 0"):
-        InferenceOptions(draws=0)
-    with pytest.raises(ValueError, match="needs its network"):
-        infer(toy, recordings, InferenceOptions("amortized"), 0)
-
-
-def test_the_package_s_own_model_and_its_prior(self_model):
-    human = HumanModel(self_model)
-    some = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    some = some.select_people([0]).select_rounds([0, 1])
-    found = infer(
-        human, some, InferenceOptions("importance", 50, settings=ImportanceOptions(128, 10.0)), 0
-    )
-    assert list(found.draws)[:4] == [f"sight_{name}" for name in human.domain.directions]
-    assert found.draws["residual_in"].shape[:3] == (50, 1, 1)
-    guide = AmortizedGuide(reference_places(human))
-    assert guide.ways.shape == (64, 2)
-    untrained = sample_amortized(human, guide, sightings_of(human, some, 0, [0, 1]))
-    assert untrained.effective > 10  # weights make up for what it has not learned
 
 
 # --- files ------------------------------------------------------------------------------------
@@ -558,20 +369,3 @@ def test_guides_are_trained_with_the_rules_learned_first(tmp_path, monkeypatch):
 def test_impossible_trainings(args, message, tmp_path, capsys):
     assert command(train, "--out", tmp_path / "x", *args) == 2
     assert message in " ".join(capsys.readouterr().err.replace("│", " ").split())
-
-
-def test_people_whose_weights_cannot_be_relied_on_are_named(tmp_path, monkeypatch, capsys):
-    def doubtful(*args):
-        found = infer(*args)
-        return replace(found, pareto_k=torch.tensor([0.9, 0.2]))
-
-    monkeypatch.setattr(fitting, "infer", doubtful)
-    (tmp_path / "toy.py").write_text(
-        "from mirror_ppl.models.toy import ToyHuman\n\n\nclass Toy(ToyHuman):\n    pass\n"
-    )
-    demos = tmp_path / "some.nc"
-    assert command(simulate, "--people", 2, "--rounds", 2, "--out", demos) == 0
-    human = ("--human-model", f"{tmp_path / 'toy.py'}:Toy")
-    assert command(fit, "--demos", demos, *human, "--draws", 9, "--out", tmp_path / "f") == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "not to be relied on for person-01 (Pareto k above 0.7)" in out

@@ -9,9 +9,9 @@ import pyro.distributions as dist
 import pytest
 import torch
 from exact import log_joint, log_prior, marginals
+from example_views import Few, Sure, log_likelihoods_by_hand, policies, ragged
 from pyro.infer import TraceEnum_ELBO, config_enumerate
 from scipy.stats import chi2
-from test_views import Few, Sure, log_likelihoods_by_hand, policies, ragged
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains import get_domain

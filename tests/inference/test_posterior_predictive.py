@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import pytest
 import torch
-from test_views import ragged
+from example_views import ragged
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results import posterior_predictive

@@ -4,8 +4,8 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from example_views import Few
 from scipy.stats import chisquare
-from test_views import Few
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.engines import InferenceOptions, infer

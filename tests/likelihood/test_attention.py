@@ -1,4 +1,4 @@
-"""What differs from round to round: sampled by the program, summed out by inference."""
+"""What differs from round to round: summed out by likelihoods, posteriors and predictions."""
 
 import itertools
 import math
@@ -7,29 +7,27 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from example_course import gone_through, perceived
-from paths import EXAMPLES
-from test_views import ragged
-
-from mirror_ppl.communication import (
-    Communicator,
-    ExpectedUtility,
-    Person,
-    PlanningContext,
-    RoundSoFar,
+from example_attention import (
+    NOTICED,
+    NOTICES,
+    STEPS,
+    Fixed,
+    OneItem,
+    by_hand,
+    drawn,
+    example,
+    geometric,
 )
-from mirror_ppl.communication.rollouts import SelfModelWorld
+from example_views import ragged
+
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
-from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.inference.svi import SVIOptions
-from mirror_ppl.likelihood.attention import KEPT, VALUES, choose_values, site_probabilities
+from mirror_ppl.likelihood.attention import KEPT, VALUES
 from mirror_ppl.likelihood.contract import check_contract
-from mirror_ppl.likelihood.densities import log_weighted_latents
 from mirror_ppl.likelihood.enumeration import log_joints
 from mirror_ppl.likelihood.predictive import predict_actions
 from mirror_ppl.likelihood.screening import Screening
@@ -43,42 +41,9 @@ from mirror_ppl.likelihood.tables import (
 )
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.implants import first_success, noticed_sites, policy_implants
-from mirror_ppl.models.loading import load_human_model
-from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.variants import OneRadius, PerItem
 from mirror_ppl.models.weights import load_self_model, shipped_weights
-
-DRIVING = get_domain("driving")
-STEPS = DRIVING.horizon
-NOTICED = noticed_sites(DRIVING)
-NOTICES = tuple(site.replace("noticed_", "notices_") for site in NOTICED)
-
-
-class OneItem(PerItem):
-    """Notices the first car at some time, and never the others: attention can be enumerated."""
-
-    def prior(self):
-        like = next(self.self_model.parameters())
-        known = {NOTICES[0]: pyro.sample(NOTICES[0], dist.Beta(1.0, 1.0))}
-        return known | policy_implants(self.domain, self.self_model.latent, like)
-
-    def round_latents(self, implants):
-        first = NOTICED[0]
-        return {first: pyro.sample(first, first_success(implants[NOTICES[0]], STEPS))}
-
-    def sees(self, implants, observation, step):
-        never = dict.fromkeys(NOTICED, torch.tensor(STEPS))
-        return super().sees({**never, NOTICED[0]: implants[NOTICED[0]]}, observation, step)
-
-
-class Fixed(OneItem):
-    """The same, all else known."""
-
-    def prior(self):
-        known = {"consistency": torch.tensor(4.0), "lapse": torch.tensor(0.02)}
-        return known | {NOTICES[0]: pyro.sample(NOTICES[0], dist.Beta(1.0, 1.0))}
 
 
 @pytest.fixture(scope="module")
@@ -94,181 +59,6 @@ def per_item(self_model):
 @pytest.fixture(scope="module")
 def recordings():
     return load_demonstrations(asset_path("driving_fog_paper.nc"))
-
-
-def drawn(human, number, people=1, seed=0):
-    """Draws ``[S, P, 1, ...]`` of all sites."""
-    return draw_prior(human, people, number, seed)
-
-
-def geometric(probability):
-    """Probabilities of each number of failures, by hand."""
-    probabilities = [probability * (1 - probability) ** n for n in range(STEPS)]
-    return torch.tensor([*probabilities, (1 - probability) ** STEPS])
-
-
-def by_hand(human, implants, recordings, person, number):
-    """Log-probabilities ``[16, T, A]`` of actions for each time at which the car is noticed."""
-    observation, told, actions, _ = vars(
-        rounds_of(recordings, person).at(number, number + 1)
-    ).values()
-    when = {NOTICED[0]: torch.arange(STEPS + 1)}
-    belief = gone_through(human, when, observation, told, actions)
-    values = human.self_model.action_values(belief)
-    own = {name: value[person : person + 1] for name, value in implants.items()}
-    each = human.act(own, belief.flatten(0, 1)[None], values.flatten(0, 1)[None])
-    return each[0].unflatten(0, belief.shape[:2])
-
-
-# --- the program
-
-
-def test_the_first_success_is_geometric():
-    for probability in (0.05, 0.5, 0.9):
-        found = first_success(torch.tensor(probability), STEPS).probs
-        torch.testing.assert_close(found, geometric(probability), rtol=1e-4, atol=1e-7)
-    for sure, when in ((1.0, 0), (0.0, STEPS)):
-        assert first_success(torch.tensor(sure), STEPS).probs[when] > 0.9999
-
-
-def test_the_probability_of_attention_is_that_of_the_program(per_item):
-    implants = {site: torch.rand(3, 1) for site in NOTICES}
-    values = {site: torch.randint(STEPS + 1, (3, 2, 7)) for site in NOTICED}
-    weights = torch.randn(3, 2, 7)
-    with pyro.plate("person", 3, dim=-2):
-        found = log_weighted_latents(per_item, implants, values, weights)
-    expected = weights.clone()
-    for person, number, value in itertools.product(range(3), range(2), range(7)):
-        for notices, noticed in zip(NOTICES, NOTICED, strict=True):
-            probabilities = geometric(float(implants[notices][person, 0]))
-            expected[person, number, value] += probabilities[
-                values[noticed][person, number, value]
-            ].log()
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
-    assert pyro.get_param_store().keys() == {}.keys()
-
-
-def test_an_item_is_seen_from_when_it_is_noticed(per_item, recordings):
-    observation, told, _, _ = vars(rounds_of(recordings, 0).at(0, 1)).values()
-    nothing = {name: torch.zeros_like(mask) for name, mask in told.items()}
-    when = dict(zip(NOTICED, torch.tensor([[0], [4], [14], [15]]), strict=True))
-    open_ = {"assumes_clear": torch.tensor([0]), "assumes_closing": torch.tensor([0])}
-    seen = perceived(per_item, when | open_, observation, nothing).visible["visual"][0]
-    steps = torch.arange(STEPS)
-    for place, first in enumerate((0, 4, 14, 15)):
-        assert torch.equal(seen[:, place], steps >= first)
-
-
-def test_attention_differs_between_rounds_and_people_and_follows_its_seed(per_item):
-    def play(seed):
-        generator = torch.Generator().manual_seed(seed)
-        people = prior_people(per_item, 2, torch.Generator().manual_seed(0))
-        people |= {site: torch.full((2, 1), 0.3) for site in NOTICES}
-        return play_rounds(per_item, people, 3, "fog", generator).actions
-
-    torch.manual_seed(5)
-    first = play(1)
-    torch.manual_seed(6)
-    state = torch.random.get_rng_state()
-    assert torch.equal(play(1), first)
-    assert torch.equal(torch.random.get_rng_state(), state)
-    assert not torch.equal(play(2), first)
-
-
-def test_attention_of_two_people_is_drawn_with_their_own_probabilities(per_item):
-    implants = {site: torch.tensor([[0.9], [0.05]]) for site in NOTICES}
-    torch.manual_seed(0)
-    with pyro.plate("person", 2, dim=-2), pyro.plate("round", 1000, dim=-1):
-        drawn = per_item.round_latents(implants)
-    for site in NOTICED:
-        assert drawn[site].shape == (2, 1000)
-        for person, probability in enumerate((0.9, 0.05)):
-            at_once = (drawn[site][person] == 0).double().mean()
-            error = math.sqrt(probability * (1 - probability) / 1000)
-            assert abs(at_once - probability) < 5 * error
-
-
-# --- values that stand for all
-
-
-SUPPORTS = {"a": torch.arange(4), "b": torch.tensor([1, 3]), "c": torch.arange(5)}
-CHANCES = {
-    "a": torch.tensor([0.7, 0.2, 0.05, 0.05]),
-    "b": torch.tensor([0.9, 0.1]),
-    "c": torch.tensor([0.5, 0.3, 0.1, 0.05, 0.05]),
-}
-
-
-def chosen(number, seed=0):
-    return choose_values(SUPPORTS, CHANCES, number, torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.parametrize("number", [40, 100])
-def test_few_combinations_are_all_there(number):
-    found = chosen(number)
-    assert len(found) == 40
-    rows = set(zip(*(found.values[site].tolist() for site in SUPPORTS), strict=True))
-    assert rows == set(itertools.product(*(support.tolist() for support in SUPPORTS.values())))
-    assert (found.log_weights == 0).all()
-
-
-@pytest.mark.parametrize("number", [1, 3, 12, 39])
-def test_of_many_there_are_as_many_as_asked_for_without_repetition(number):
-    for seed in range(20):
-        found = chosen(number, seed)
-        assert abs(len(found) - number) <= 1
-        rows = list(zip(*(found.values[site].tolist() for site in SUPPORTS), strict=True))
-        assert len(set(rows)) == len(rows)
-        assert (found.log_weights >= 0).all()
-        if number >= 12:  # the most probable one, of .315, is there for certain
-            place = rows.index((0, 1, 0))
-            assert found.log_weights[place] == 0
-
-
-@pytest.mark.parametrize("number", [6, 20])
-def test_weighted_sums_are_right_on_average(number):
-    """Whatever is summed; the standard error comes from the repetitions themselves."""
-    axes = torch.meshgrid(*(support.double() for support in SUPPORTS.values()), indexing="ij")
-    functions = [
-        lambda a, b, c: torch.ones_like(a),
-        lambda a, b, c: (a == 3).double() * (c == 4).double() * 100,
-        lambda a, b, c: a * b - c,
-    ]
-    exact = torch.stack([function(*axes).sum() for function in functions])
-    totals = []
-    for seed in range(3000):
-        found = chosen(number, seed)
-        rows = [found.values[site].double() for site in SUPPORTS]
-        weights = found.log_weights.double().exp()
-        totals.append(torch.stack([(weights * function(*rows)).sum() for function in functions]))
-    found = torch.stack(totals)
-    error = found.std(0) / math.sqrt(len(found))
-    assert ((found.mean(0) - exact).abs() < 5 * error).all()
-
-
-def test_what_is_kept_stands_for_what_is_not():
-    found = chosen(30)
-    useful = torch.softmax(torch.arange(30.0) / 4, 0)
-    something = torch.arange(30.0).double()
-    totals = []
-    for seed in range(2000):
-        kept = found.thinned(useful, 8, seed)
-        assert abs(len(kept.kept) - 8) <= 1
-        totals.append((something[kept.kept] / kept.log_kept.double().exp()).sum())
-    totals = torch.stack(totals)
-    error = totals.std() / math.sqrt(len(totals))
-    assert abs(totals.mean() - something.sum()) < 5 * error
-
-
-def test_sites_are_proposed_by_probable_people(per_item):
-    ways = drawn(per_item, 2)
-    ways |= {site: torch.tensor([0.2, 0.8]).view(2, 1, 1) for site in NOTICES}
-    found = site_probabilities(per_item, ways)
-    for site in NOTICED:
-        expected = (geometric(0.2) + geometric(0.8)) / 2
-        torch.testing.assert_close(found[site], expected, rtol=1e-4, atol=1e-6)
-    found = site_probabilities(per_item, ways, torch.tensor([0.0, 1.0]))
-    torch.testing.assert_close(found[NOTICED[0]], geometric(0.8), rtol=1e-4, atol=1e-6)
 
 
 # --- likelihoods, posteriors, predictions
@@ -425,11 +215,6 @@ def test_rounds_that_come_in_are_those_that_were_there(self_model, recordings):
         assert torch.equal(value, one_by_one.draws(20)[site])
 
 
-def example(self_model):
-    path = EXAMPLES / "distracted.py"
-    return load_human_model(f"{path}:DistractedPerson", self_model)
-
-
 def test_the_example_is_a_mixture_of_seeing_and_not(self_model, recordings):
     """Rounds of a person who is away with some probability; by the package's own model."""
     human = example(self_model)
@@ -455,83 +240,6 @@ class Blind(HumanModel):
     def sees(self, implants, observation, step):
         seen = super().sees(implants, observation, step)
         return {name: torch.zeros_like(mask) for name, mask in seen.items()}
-
-
-# --- in communication
-
-
-def past_of(recordings, time):
-    observation, _, actions, _ = vars(rounds_of(recordings, 0).at(0, 1)).values()
-    whole = recordings.observation()
-    return RoundSoFar(
-        {name: value[0, 0, : time + 1] for name, value in whole.items()},
-        actions[0, :time],
-        {name: torch.zeros(time, 4, dtype=torch.bool) for name in observation if name != "ego"},
-    )
-
-
-def test_who_acts_as_if_they_saw_has_noticed(self_model, recordings):
-    """Weights of attention are likelihoods of what was done so far."""
-    human = OneItem(self_model)
-    draws = drawn(human, 300) | {NOTICES[0]: torch.full((300, 1, 1), 0.3)}
-    draws["consistency"], draws["lapse"] = draws["lapse"] * 0 + 4, draws["lapse"] * 0 + 0.02
-    for site in ("residual_in", "residual_out"):
-        draws[site] = draws[site] * 0
-    someone = Person(human, draws)
-    assert someone.percept_count == 1
-    for time in (0, 9):
-        past = past_of(recordings, time)
-        there = someone.in_round(past)
-        when = there.percepts[NOTICED[0]][there.percept]
-        log_weights = geometric(0.3).log()
-        if time:
-            each = by_hand(human, {n: v[0] for n, v in draws.items()}, recordings, 0, 0)
-            log_weights = log_weights + each[:, torch.arange(time), past.actions].sum(-1)
-        expected = torch.softmax(log_weights, 0)
-        found = torch.bincount(when, minlength=STEPS + 1) / 300
-        error = 5 * (expected * (1 - expected) / 300).sqrt() + 1e-3
-        assert ((found - expected).abs() < error).all()
-        assert there.in_round(past).percepts.keys() == there.percepts.keys()
-    assert someone.percept_count == 1  # untouched
-    bare = HumanModel(self_model)
-    unchanged = Person(bare, drawn(bare, 2))
-    assert unchanged.in_round(past_of(recordings, 3)) is unchanged
-
-
-def test_rare_attention_is_found_out(self_model, recordings):
-    """A person who is hardly ever away does what only a person who is away would do."""
-    human = example(self_model)
-    draws = drawn(human, 200)
-    draws |= {"distracted": torch.full((200, 1, 1), 0.02)}
-    for site in ("sight_front_own", "sight_front_other", "sight_back_own", "sight_back_other"):
-        draws[site] = torch.full((200, 1, 1), 6)
-    draws["consistency"], draws["lapse"] = draws["lapse"] * 0 + 5, draws["lapse"] * 0 + 0.001
-    for site in ("residual_in", "residual_out"):
-        draws[site] = draws[site] * 0
-    someone, told = Person(human, draws), 0
-    for number in range(10):
-        past = past_of(recordings.select_rounds([number]), 12)
-        there = someone.in_round(past)
-        away = (there.percepts["away"][there.percept] == 1).double().mean()
-        values = torch.tensor([0.0, 1.0])
-        alike = {n: value[:1] for n, value in draws.items()}
-        log_probabilities = Person(human, alike)._log_probabilities({"away": values}, past)[0]
-        expected = torch.softmax(log_probabilities + torch.tensor([0.98, 0.02]).log(), 0)[1]
-        # Assumptions differ between draws, the first of which is held against all.
-        if expected > 0.9:
-            told += 1
-            assert away > 0.5
-    assert told > 0
-
-
-def test_a_communicator_plans_for_a_person_who_attends(per_item, recordings):
-    someone = Person(per_item, drawn(per_item, 8))
-    communicator = Communicator(someone, ExpectedUtility(SelfModelWorld(per_item.self_model), 3))
-    for time in (0, 5):
-        past = past_of(recordings, time)
-        assert communicator.plan(past).message == communicator.plan(past).message
-        context = PlanningContext.of(someone, past)
-        assert context.person.percept_count > someone.percept_count
 
 
 # --- what a user may get wrong

@@ -1,0 +1,104 @@
+"""People of whom little is unknown, rounds of several lengths, and their likelihoods by hand."""
+
+import pyro
+import pyro.distributions as dist
+import torch
+from example_course import gone_through
+
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.domains import get_domain
+from mirror_ppl.models import HumanModel, View
+from mirror_ppl.models.implants import policy_implants
+
+DRIVING = get_domain("driving")
+
+
+class Few(HumanModel):
+    """A person with unknown sight ahead in their lane, and unknown assumptions.
+
+    Of cars that they saw once, they assume that these come closer; of others it is open.
+    """
+
+    KNOWN = {
+        "sight_front_other": 2,
+        "sight_back_own": 0,
+        "sight_back_other": 0,
+        "assumes_closing": 1,
+    }
+
+    def prior(self):
+        bins = torch.arange(1.0, len(self.domain.reach_bins) + 1)
+        own = {
+            "sight_front_own": pyro.sample("sight_front_own", dist.Categorical(bins / bins.sum())),
+            "assumes_clear": pyro.sample(
+                "assumes_clear", dist.Categorical(torch.tensor([0.3, 0.7]))
+            ),
+        }
+        like = next(self.self_model.parameters())
+        return own | policy_implants(self.domain, self.self_model.latent, like)
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        known = {
+            site: torch.full_like(implants["sight_front_own"], value)
+            for site, value in self.KNOWN.items()
+        }
+        own = {site: implants[site] for site in ("sight_front_own", "assumes_clear")}
+        return super().perceive(known | own, knowledge, observation, told, step)
+
+
+class Sure(Few):
+    """A person of whom only the policy is unknown."""
+
+    def prior(self):
+        like = next(self.self_model.parameters())
+        return policy_implants(self.domain, self.self_model.latent, like)
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        return View(self.domain.visibility("fog", observation)), knowledge
+
+
+def ragged(recordings, lengths):
+    """Rounds of these lengths, ``lengths[person][round]``, in which now and then something is told.
+
+    What stands in the padding of the arrays is what was recorded there.
+    """
+    most = max(1, *map(len, lengths))
+    some = recordings.select_people(range(len(lengths))).select_rounds(range(most))
+    variables = some.variables()
+    generator = torch.Generator().manual_seed(2)
+    for name in ("told_visual", "told_verbal"):
+        shape = variables[name].shape
+        variables[name] = torch.rand(shape, generator=generator) < 0.1
+    variables["round_count"] = torch.tensor([len(rounds) for rounds in lengths])
+    padded = [[*rounds, *[0] * (most - len(rounds))] for rounds in lengths]
+    variables["length"] = torch.tensor(padded)
+    return Demonstrations.from_variables(some.domain, some.setting, some.people, variables)
+
+
+def policies(human, number, people):
+    """Draws ``[S, P, 1, ...]`` of the policy implants from the prior."""
+    plates = pyro.plate("draw", number, dim=-3), pyro.plate("person", people, dim=-2)
+    with plates[0], plates[1]:
+        return policy_implants(DRIVING, human.self_model.latent, torch.zeros(()))
+
+
+def log_likelihoods_by_hand(human, rounds, person, number, values, policy):
+    """Of one round ``[M]``: each combination by itself, one step after the other.
+
+    Args:
+        values: the discrete implants ``[M]`` by name.
+        policy: the others, ``[1, 1, ...]``.
+    """
+    steps = int(rounds.lengths[person, number])
+    observation = {
+        name: value[person, number, :steps][None] for name, value in rounds.observation().items()
+    }
+    told = {name: value[person, number, :steps][None] for name, value in rounds.told.items()}
+    actions = rounds.actions[person, number, :steps][None]
+    result = []
+    for one in range(len(next(iter(values.values())))):
+        implants = {site: value[one : one + 1] for site, value in values.items()}
+        belief = gone_through(human, implants, observation, told, actions)
+        chosen = human.act(policy, belief, human.action_values(belief))
+        result.append(chosen[0].gather(-1, actions[0, :, None]).sum())
+    return torch.stack(result)
