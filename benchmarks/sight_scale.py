@@ -6,6 +6,8 @@ r"""How strongly the prior should tie drivers' reaches to the sides to those str
         --out runs/highway_100
     python -m benchmarks.sight_scale runs/highway_100
 
+The last command writes docs/results/sight_scale.csv; without a folder it prints what is there.
+
 Log Bayes factors of other values of `Record.sight_scale` against the highway's, for all drivers of
 a fit together: ``log mean_s p(reach_s | other scale) / p(reach_s | scale)`` over draws. Those of
 larger scales, and of none, are too low if draws leave out what only they make probable.
@@ -14,6 +16,7 @@ larger scales, and of none, are too low if draws leave out what only they make p
 from __future__ import annotations
 
 import argparse
+import csv
 import math
 from pathlib import Path
 
@@ -24,6 +27,7 @@ import torch
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.models.implants import alike, sight_sites
 
+ROWS = Path(__file__).parents[1] / "docs/results/sight_scale.csv"
 SCALES = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0, math.inf)
 
 
@@ -54,15 +58,27 @@ def log_bayes_factors(path: Path, scale: float) -> np.ndarray:
 
 
 def main() -> None:
-    """Print a row for each scale."""
+    """Write the rows of a fit, if one is given, and print a row for each scale."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path, help="folder of a fit")
-    path = parser.parse_args().folder / "posterior.nc"
-    for scale in SCALES:
-        factors = log_bayes_factors(path, scale)
-        print(f"scale {scale:4g}: {factors.sum():6.2f}  (lowest {factors.min():.2f})")
+    parser.add_argument("folder", nargs="?", type=Path, help="folder of a fit")
+    folder = parser.parse_args().folder
+    if folder:
+        with ROWS.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["scale", "person", "log_bayes_factor"])
+            for scale in SCALES:
+                factors = log_bayes_factors(folder / "posterior.nc", scale)
+                for person, factor in enumerate(factors, 1):
+                    writer.writerow([f"{scale:g}", person, f"{factor:.4f}"])
+    with ROWS.open(newline="") as file:
+        rows = [
+            (float(row["scale"]), float(row["log_bayes_factor"])) for row in csv.DictReader(file)
+        ]
+    for scale in dict.fromkeys(scale for scale, _ in rows):
+        own = [factor for other, factor in rows if other == scale]
+        print(f"scale {scale:4g}: {sum(own):6.2f}  (lowest {min(own):.2f})")
 
 
 if __name__ == "__main__":
