@@ -520,8 +520,8 @@ def test_summary_by_hand():
         "weights": torch.zeros(20, 2, 3),
     }
     # Two draws: of the actions 1 and 0, probabilities 0.9 and 0.2, or 0.5 and 0.6.
-    given = torch.tensor([[[0.1, 0.9], [0.2, 0.8]], [[0.5, 0.5], [0.6, 0.4]]])
-    log_probabilities = given.log()[:, None, None].expand(2, 2, 1, 2, 2)
+    exact = torch.tensor([[[0.1, 0.9], [0.2, 0.8]], [[0.5, 0.5], [0.6, 0.4]]])
+    log_probabilities = exact.log()[:, None, None].expand(2, 2, 1, 2, 2)
     first, second = summarize(draws, train, score(log_probabilities, test))
     assert first["id"] == "a"
     assert (first["rounds"], second["rounds"]) == (1, 1)

@@ -22,7 +22,7 @@ def rounds_of(task, cost, items=0, relevant=0, milliseconds=1.0):
         mishaps=[1] + [0] * (number - 1),
         items={"visual": nothing, "verbal": spoken},
         relevant={"course": {"visual": nothing, "verbal": right}},
-        probabilities={"visual": 10, "verbal": 10},
+        communicable={"visual": 10, "verbal": 10},
         steps=5 * number,
         milliseconds=milliseconds,
     )
