@@ -65,6 +65,8 @@ ACTIONS = {
     "all": CHOICE | RESIDUAL | {"late", "notices", "forgets", "kind"},
 }
 KNOWING = ("mirror", "policy-only", "late", "preferring", "hard-of-hearing", "all")
+TIED = {"sight_ahead_aside": {"sight_ahead"}, "sight_behind": {"sight_behind_aside"}}
+"""On the highway, in models with a reach in each direction."""
 BELIEVED = {("bomb_defusal", name): RULES for name in KNOWING}
 
 
@@ -82,7 +84,8 @@ def test_shipped_models_depend_on_what_is_written_in_them(world, name, robots):
         items = next(m.items for m in human.domain.modalities if m.name == "visual")
         latents = {f"noticed_{item}": {f"notices_{item}"} for item in items}
     found = dependencies(human)
-    assert with_parents(found.prior) == prior
+    tied = TIED if world == "highway" and "sight_ahead_aside" in found.prior else {}
+    assert with_parents(found.prior) == prior | tied
     assert with_parents(found.round_latents) == latents
     preferred = {"shares_goal", *human.preferences} if isinstance(human, Preferring) else set()
     expected = ACTIONS[name] | BELIEVED.get((world, name), set()) | preferred
