@@ -113,7 +113,7 @@ class HearingPerson(Person):
         }
         self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
         self.percept_count = int(self.percept.max()) + 1
-        self._probabilities = RunningSum()
+        self._log_likelihood = RunningSum()
 
 
 def hearing(person: Person, hears: float) -> Person:

@@ -74,7 +74,7 @@ class Person:
         self.percepts, self.percept = self._distinct_percepts(self._discrete, self.number)
         self.percept_count = int(self.percept.max()) + 1
         self._tracks = Tracks()
-        self._probabilities = RunningSum()
+        self._log_likelihood = RunningSum()
 
     def _distinct_percepts(
         self, values: Mapping[str, Tensor], number: int
@@ -146,7 +146,7 @@ class Person:
     def _log_probabilities(self, attention: Mapping[str, Tensor], past: RoundSoFar) -> Tensor:
         """Return log-probabilities ``[S, G]`` of actions so far, given attention ``[G]``."""
         number = len(next(iter(attention.values())))
-        known, total = self._probabilities.before(attention, past)
+        known, total = self._log_likelihood.before(attention, past)
         if total is None:
             total = torch.zeros(self.number, number, device=self.device)
         everybody = copy(self)
@@ -167,7 +167,7 @@ class Person:
                 )
             found = found.expand(self.number, *found.shape[-2:])[:, 0]
             total = total + found.gather(-1, state.belief[percept])
-        self._probabilities.keep(attention, past, total)
+        self._log_likelihood.keep(attention, past, total)
         return total
 
     def _conditioned(self) -> ExitStack:

@@ -121,7 +121,7 @@ class Chain:
         """
         after = None
         for number, level in reversed(list(enumerate(self.levels))):
-            score = _taken(likelihoods, level.view) + self.probabilities(log_probabilities, number)
+            score = _taken(likelihoods, level.view) + self.of_level(log_probabilities, number)
             if after is not None:
                 score = score + _taken(after, level.following)
             score = torch.where(level.value == NO_VALUE, NEVER, score)
@@ -129,7 +129,7 @@ class Chain:
         assert after is not None
         return after
 
-    def probabilities(self, log_probabilities: Tensor, number: int) -> Tensor:
+    def of_level(self, log_probabilities: Tensor, number: int) -> Tensor:
         """Return log-probabilities ``[..., P, S, K]`` of one level's values.
 
         Args:

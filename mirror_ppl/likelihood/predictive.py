@@ -127,7 +127,7 @@ def _chained(
     for person in range(table.people):
         alone = chain.of_person(person)
         own = probabilities[:, person : person + 1]
-        by_level = [alone.probabilities(own, level)[:, 0] for level in range(len(alone.levels))]
+        by_level = [alone.of_level(own, level)[:, 0] for level in range(len(alone.levels))]
         for place in table.real[person].nonzero().flatten().tolist():
             so_far = each.new_full((number, chain.sights), NEVER)
             so_far.scatter_(1, sight[:, person, place, None], 0.0)

@@ -147,7 +147,7 @@ OTHERWISE = np.where((ACTIONS >= 0) & (np.arange(4) == 0), 1, ACTIONS).astype("i
         ({"recorded_seed": "7"}, "recorded_seed is 7, expected 0"),
         ({"recorded_seed": None}, "recorded_seed is None, expected 0"),
         ({"recorded_by": "me"}, "recorded_by is me, expected None"),
-        # What says it in a word is told before the command that says it in many.
+        # The short name comes before the long command.
         (
             {"recorded_command": "x", "recorded_population": "diverse"},
             "recorded_population is diverse, expected paper",

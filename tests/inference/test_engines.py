@@ -200,7 +200,7 @@ def test_inference_goes_on_from_its_checkpoint(toy, recordings, tmp_path):
 
 
 class Other(ToyHuman):
-    """Of this file, too."""
+    """Has the toy person's program, and another name."""
 
 
 class Peeking(ToyHuman):

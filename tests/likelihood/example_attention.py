@@ -37,7 +37,7 @@ class OneItem(PerItem):
 
 
 class Fixed(OneItem):
-    """The same, all else known."""
+    """Notices the first car at some time, and chooses with a known consistency and lapse."""
 
     def prior(self):
         known = {"consistency": torch.tensor(4.0), "lapse": torch.tensor(0.02)}

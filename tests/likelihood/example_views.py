@@ -58,7 +58,7 @@ class Sure(Few):
 
 
 def ragged(recordings, lengths):
-    """Rounds of these lengths, ``lengths[person][round]``, in which now and then something is told.
+    """Rounds of these lengths, ``lengths[person][round]``, with some messages.
 
     What stands in the padding of the arrays is what was recorded there.
     """

@@ -20,7 +20,6 @@ from example_attention import (
 )
 from example_views import ragged
 
-from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.engines import InferenceOptions, infer
@@ -43,23 +42,6 @@ from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.variants import OneRadius, PerItem
-from mirror_ppl.models.weights import load_self_model, shipped_weights
-
-
-@pytest.fixture(scope="module")
-def self_model():
-    return load_self_model(shipped_weights("driving"))[0]
-
-
-@pytest.fixture(scope="module")
-def per_item(self_model):
-    return PerItem(self_model)
-
-
-@pytest.fixture(scope="module")
-def recordings():
-    return load_demonstrations(asset_path("driving_fog_paper.nc"))
-
 
 # --- likelihoods, posteriors, predictions
 

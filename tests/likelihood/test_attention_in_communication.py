@@ -1,6 +1,5 @@
 """What differs from round to round: found out by who communicates with a person."""
 
-import pytest
 import torch
 from example_attention import NOTICED, NOTICES, STEPS, OneItem, by_hand, drawn, example, geometric
 
@@ -12,26 +11,8 @@ from mirror_ppl.communication import (
     RoundSoFar,
 )
 from mirror_ppl.communication.rollouts import SelfModelWorld
-from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.variants import PerItem
-from mirror_ppl.models.weights import load_self_model, shipped_weights
-
-
-@pytest.fixture(scope="module")
-def self_model():
-    return load_self_model(shipped_weights("driving"))[0]
-
-
-@pytest.fixture(scope="module")
-def per_item(self_model):
-    return PerItem(self_model)
-
-
-@pytest.fixture(scope="module")
-def recordings():
-    return load_demonstrations(asset_path("driving_fog_paper.nc"))
 
 
 def past_of(recordings, time):

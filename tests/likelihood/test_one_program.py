@@ -79,7 +79,7 @@ def test_a_power_of_the_likelihood_counts_in_the_density_alone(recordings):
 
 
 class StepByStep(PerItem):
-    """The same, run step by step, as it overrides the program."""
+    """A model that is run step by step, as it overrides the program."""
 
     spans = PerItem.spans
 

@@ -9,31 +9,12 @@ import torch
 from example_attention import NOTICED, NOTICES, STEPS, drawn, geometric
 from example_course import perceived
 
-from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.likelihood.attention import choose_values, site_probabilities
 from mirror_ppl.likelihood.densities import log_weighted_latents
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.models.implants import first_success
 from mirror_ppl.models.simulation import play_rounds
-from mirror_ppl.models.variants import PerItem
-from mirror_ppl.models.weights import load_self_model, shipped_weights
-
-
-@pytest.fixture(scope="module")
-def self_model():
-    return load_self_model(shipped_weights("driving"))[0]
-
-
-@pytest.fixture(scope="module")
-def per_item(self_model):
-    return PerItem(self_model)
-
-
-@pytest.fixture(scope="module")
-def recordings():
-    return load_demonstrations(asset_path("driving_fog_paper.nc"))
-
 
 # --- the program
 

@@ -5,6 +5,7 @@ import csv
 import pytest
 
 from benchmarks.reach import ROWS, table
+from benchmarks.sight_scale import ROWS as SCALES
 from benchmarks.tables import DOCS, RESULTS, results_page, studies, study_page
 
 STUDIES = studies()
@@ -27,6 +28,19 @@ def test_a_number_that_is_not_in_the_rows_is_found():
     before, end, after = page.partition("<!-- end -->")
     wrong = f"{before}| made up |\n{end}{after}"
     assert results_page(wrong) == page
+
+
+def test_the_choice_of_the_prior_over_directions_is_what_its_rows_say():
+    with SCALES.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    total = {
+        scale: sum(float(row["log_bayes_factor"]) for row in rows if row["scale"] == scale)
+        for scale in ("0.5", "2", "inf")
+    }
+    words = " ".join((DOCS / "decisions.md").read_text().split())
+    assert f"the data are {-total['inf']:.1f} nats more probable under it" in words
+    gained, lost = f"{total['0.5']:.1f}".lstrip("0"), f"{-total['2']:.1f}"
+    assert f"another {gained}, one of two bins loses {lost}" in words
 
 
 def test_the_table_of_reaches_is_what_its_rows_say():
