@@ -119,9 +119,9 @@ def _wrong(
     With a shift, the action that many steps before is tested instead, where there is one.
     """
     domain, mask = get_domain(demonstrations.domain), demonstrations.mask[person]
-    actions = demonstrations.actions[person].clamp(min=0)
+    actions = _executed(demonstrations, person)
     if shift:
-        actions, mask = torch.roll(actions, shift, -1), mask & _has_neighbour(mask, shift)
+        actions, mask = torch.roll(actions, shift, 1), mask & _has_neighbour(mask, shift)
     now = {name: value[:, :-1] for name, value in observation.items()}
     expected = domain.next_observation(now, actions)
     differs = [
@@ -129,6 +129,13 @@ def _wrong(
         for name, value in observation.items()
     ]
     return torch.stack(differs).any(0) & mask
+
+
+def _executed(demonstrations: Demonstrations, person: int) -> Tensor:
+    """Executed controls ``[B, T, C]``, if recorded, else actions ``[B, T]``; 0 in padding."""
+    if demonstrations.controls is not None:
+        return demonstrations.controls[person].nan_to_num(0.0)
+    return demonstrations.actions[person].clamp(min=0)
 
 
 def _has_neighbour(mask: Tensor, shift: int) -> Tensor:
@@ -151,7 +158,8 @@ def _first(demonstrations: Demonstrations, wrong: Sequence[Tensor]) -> str:
     action = demonstrations.actions[person, number, step]
     now = {name: value[number, step] for name, value in observation.items()}
     labels = dimension_labels(domain)
-    for name, expected in domain.next_observation(now, action).items():
+    executed = _executed(demonstrations, person)[number, step]
+    for name, expected in domain.next_observation(now, executed).items():
         found = observation[name][number, step + 1]
         places = _differs(expected, found).nonzero()
         if len(places):

@@ -17,7 +17,12 @@ from mirror_ppl.data.schema import MEASURED, NO_INDEX, TOLD, TRUTH
 from mirror_ppl.domains import Observation, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, is_name, shown
 
-OPTIONAL = {"reward": "rewards", "scenario": "scenarios", "action_entropy": "action_entropy"}
+OPTIONAL = {
+    "reward": "rewards",
+    "scenario": "scenarios",
+    "action_entropy": "action_entropy",
+    "control": "controls",
+}
 """Variables that may be absent, and the fields that hold them."""
 
 
@@ -50,6 +55,8 @@ class Demonstrations:
             logarithm of the number of actions; NaN in padding and where unknown.
         measurements: values ``[P]`` of sites of the human model's prior that were measured, such as
             answers to a questionnaire, by name; NaN where unknown. Fits observe them.
+        controls: what was executed where actions are continuous, ``[P, B, T, C]``, within the
+            bounds of the domain's controls; NaN in padding. ``actions`` are those nearest to it.
         provenance: where the recordings come from: command, seed, population, version.
 
     Raises:
@@ -72,6 +79,7 @@ class Demonstrations:
     truth: Mapping[str, Tensor] = field(default_factory=dict)
     action_entropy: Tensor | None = None
     measurements: Mapping[str, Tensor] = field(default_factory=dict)
+    controls: Tensor | None = None
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -117,7 +125,8 @@ class Demonstrations:
     ) -> Demonstrations:
         """Make demonstrations of arrays named as in files, the inverse of `variables`.
 
-        Without ``round_count`` each person has all rounds, without ``length`` each round all steps.
+        Without ``round_count`` each person has all rounds, without ``length`` each round all steps,
+        and without ``action`` the actions are those nearest to ``control``.
         Variables of other names are ignored.
 
         Raises:
@@ -127,6 +136,7 @@ class Demonstrations:
         modalities = [modality.name for modality in get_domain(domain).modalities]
         if not isinstance(variables, Mapping):
             raise DemonstrationsError(f"variables must be a dict of arrays, not {shown(variables)}")
+        variables = schema.with_actions(get_domain(domain), variables)
         for name in schema.required_variables(get_domain(domain)):
             if name not in variables:
                 raise DemonstrationsError(f"the variable {name} is missing")
@@ -318,8 +328,8 @@ class Demonstrations:
 def concatenate(parts: Iterable[Demonstrations]) -> Demonstrations:
     """Join the people of all parts, in order, on the first part's device.
 
-    Scenarios, truths, measurements and entropies that a part lacks become unknown. Rewards are kept
-    if every part has them, provenance where all parts agree.
+    Scenarios, truths, measurements and entropies that a part lacks become unknown. Rewards and
+    controls are kept if every part has them, provenance where all parts agree.
 
     Raises:
         DemonstrationsError: there are no parts, or some are not demonstrations; the parts are of
@@ -342,8 +352,9 @@ def concatenate(parts: Iterable[Demonstrations]) -> Demonstrations:
     sizes = {"round": rounds, "step": steps, "time": steps + 1}
     arrays = [part.variables() for part in parts]
     names = dict.fromkeys(name for part in arrays for name in part)
-    if any(part.rewards is None for part in parts):
-        names.pop("reward", None)
+    for name, key in (("reward", "rewards"), ("control", "controls")):
+        if any(getattr(part, key) is None for part in parts):
+            names.pop(name, None)
     dimensions = schema.variable_dimensions(get_domain(first.domain))
     variables = {}
     for name in names:

@@ -35,6 +35,10 @@ _LONG_NAMES = {
     "length": ("number of actions of the round, 0 for padding", "steps"),
     "ego": ("the ego's features, always known", "as in the domain's description"),
     "action": ("action taken, -1 for padding", "index"),
+    "control": (
+        "executed control; action is the one nearest to it, nan for padding",
+        "those of the control",
+    ),
     "reward": ("task reward of the action, nan for padding", "units of reward"),
     "scenario": ("scenario of the round, -1 for padding or if unknown", "index"),
     "action_entropy": (

@@ -11,7 +11,7 @@ import torch
 
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, require_known
-from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
+from mirror_ppl.domains.environment_world import EnvironmentWorld
 from mirror_ppl.errors import InputError
 
 
@@ -32,7 +32,8 @@ class Recorder(gym.Wrapper):
         setting: one of the world's settings; the last unless given.
 
     Raises:
-        InputError: the world is no :class:`~mirror_ppl.domains.gymnasium_world.GymnasiumWorld`.
+        InputError: the world is no
+            :class:`~mirror_ppl.domains.environment_world.EnvironmentWorld`.
         UnknownNameError: there is no such setting.
     """
 
@@ -40,13 +41,14 @@ class Recorder(gym.Wrapper):
         self, env: gym.Env, world: Domain, person: str = "person-01", setting: str | None = None
     ) -> None:
         super().__init__(env)
-        if not isinstance(world, GymnasiumWorld):
-            raise InputError("the world has to be one of a Gymnasium environment (GymnasiumWorld)")
+        if not isinstance(world, EnvironmentWorld):
+            raise InputError(
+                "the world has to be one of a Gymnasium environment (GymnasiumWorld, SteppedWorld)"
+            )
         self.world, self.person = world, person
         self.setting = require_known(
             setting or world.settings[-1], "setting", world.settings, world.name
         )
-        self._moves = world.moves or tuple(range(len(world.actions)))
         self._rounds: list[_Round] = []
         self._told: list[tuple[str, int]] = []
         self._chooser = np.random.default_rng()
@@ -93,11 +95,10 @@ class Recorder(gym.Wrapper):
         """
         if not self._rounds or self._rounds[-1].over:
             raise InputError("the round is over or has not begun; call reset()")
-        if action not in self._moves:
-            raise InputError(f"action has to be one of {self._moves} (moves), not {action!r}")
+        number, control = self.world.action_of(action)
         found, reward, terminated, truncated, info = self.env.step(action)
         now = self._rounds[-1]
-        now.add(self._moves.index(action), self._told, self.world.look(self.env.unwrapped))
+        now.add(number, control, self._told, self.world.look(self.env.unwrapped))
         self._told = []
         truncated = truncated or len(now.actions) == self.world.horizon
         now.over = terminated or truncated
@@ -118,6 +119,7 @@ class Recorder(gym.Wrapper):
         shape = (len(people), number)
         actions = np.full((*shape, steps), -1)
         lengths = np.zeros(shape, int)
+        controls = np.full((*shape, steps, len(self.world.controls)), np.nan)
         first = rounds[0].seen[0]
         seen = {
             name: np.full((*shape, steps + 1, *np.shape(part)), np.nan)
@@ -130,6 +132,8 @@ class Recorder(gym.Wrapper):
             for place, one in enumerate(own[name]):
                 lengths[person, place] = length = len(one.actions)
                 actions[person, place, :length] = one.actions
+                if self.world.controls:
+                    controls[person, place, :length] = one.controls
                 for key, values in seen.items():
                     values[person, place, : length + 1] = [part[key] for part in one.seen]
                 for step, said in enumerate(one.told):
@@ -142,6 +146,7 @@ class Recorder(gym.Wrapper):
             ego=torch.from_numpy(seen.pop("ego")),
             observations={name: torch.from_numpy(part) for name, part in seen.items()},
             actions=torch.from_numpy(actions),
+            controls=torch.from_numpy(controls) if self.world.controls else None,
             round_counts=torch.tensor([len(own[name]) for name in people]),
             lengths=torch.from_numpy(lengths),
             told={name: torch.from_numpy(part) for name, part in told.items()},
@@ -155,10 +160,18 @@ class _Round:
         self.person, self.over = person, False
         self.seen = [_copied(first)]
         self.actions: list[int] = []
+        self.controls: list[np.ndarray | None] = []
         self.told: list[Sequence[tuple[str, int]]] = []
 
-    def add(self, action: int, told: Sequence[tuple[str, int]], now: Mapping[str, Any]) -> None:
+    def add(
+        self,
+        action: int,
+        control: np.ndarray | None,
+        told: Sequence[tuple[str, int]],
+        now: Mapping[str, Any],
+    ) -> None:
         self.actions.append(action)
+        self.controls.append(control)
         self.told.append(told)
         self.seen.append(_copied(now))
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mirror_ppl.checks import as_tensor
 from mirror_ppl.domains import Domain
+from mirror_ppl.domains.controls import bounds_in_words, nearest_action
 from mirror_ppl.errors import MOST_CHARACTERS, DemonstrationsError, is_name, shown
 
 TOLD = "told_"
@@ -26,6 +27,8 @@ MEASURED = "measured_"
 """Prefix of a measurement of a person, such as an answer to a questionnaire."""
 OF_PERSON = (TRUTH, MEASURED)
 """Prefixes of variables that have one number a person."""
+CONTROL = "control"
+"""What was executed where actions are continuous; ``action`` is the one nearest to it."""
 NO_INDEX = -1
 """Stands for the actions and scenarios of padding, and for scenarios that are unknown."""
 ROUNDING = 1e-3
@@ -47,6 +50,8 @@ def variable_dimensions(domain: Domain) -> dict[str, tuple[str, ...]]:
         "scenario": rounds,
         "action_entropy": steps,
     }
+    if domain.controls:
+        dimensions[CONTROL] = (*steps, "control_name")
     for modality in domain.modalities:
         item, feature = f"{modality.name}_item", f"{modality.name}_feature"
         dimensions[modality.name] = (*times, item, feature)
@@ -55,13 +60,30 @@ def variable_dimensions(domain: Domain) -> dict[str, tuple[str, ...]]:
 
 
 def required_variables(domain: Domain) -> tuple[str, ...]:
-    """Names of the variables that every file has."""
+    """Names of the variables that every file has; ``control`` can replace ``action``."""
     return ("ego", *(modality.name for modality in domain.modalities), "action")
+
+
+def with_actions(domain: Domain, variables: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Add ``action``, if it is missing, from ``control``; -1 in padding."""
+    if "action" in variables or not domain.controls or CONTROL not in variables:
+        return variables
+    control = as_tensor(variables[CONTROL], CONTROL, DemonstrationsError)
+    if control.dim() != 4 or control.shape[-1] != len(domain.controls):  # noqa: PLR2004
+        raise DemonstrationsError(
+            f"{CONTROL} has shape {tuple(control.shape)}, expected people, rounds, steps and "
+            f"{len(domain.controls)} controls"
+        )
+    known = ~control.double().isnan().any(-1)
+    nearest = nearest_action(domain.controls, control.double().nan_to_num(0.0))
+    return {**variables, "action": nearest.masked_fill(~known, NO_INDEX)}
 
 
 def dimension_labels(domain: Domain) -> dict[str, tuple[str, ...]]:
     """Names along each dimension whose entries the domain names."""
     labels = {"ego_feature": domain.ego_features}
+    if domain.controls:
+        labels["control_name"] = tuple(one.name for one in domain.controls)
     for modality in domain.modalities:
         labels[f"{modality.name}_item"] = modality.items
         labels[f"{modality.name}_feature"] = modality.features
@@ -136,10 +158,17 @@ def checked(
             result[name] = scenarios.masked_fill(~inside, NO_INDEX)
         elif name.startswith(TOLD):
             result[name] = places.whole(name, given, inside, 0, 1).bool()
+        elif name == CONTROL:
+            result[name] = places.controls(name, value.to(dtype), inside, domain)
         elif name == "action_entropy":
             result[name] = places.entropies(name, value.to(dtype), inside, len(domain.actions))
         else:
             result[name] = places.numbers(name, value.to(dtype), inside)
+    if CONTROL in result:
+        nearest = nearest_action(domain.controls, result[CONTROL].nan_to_num(0.0))
+        differs = real["step"] & (nearest != result["action"])
+        expected = "the action nearest to the control; leave action out, and it is computed"
+        places.refuse("action", differs, result["action"], expected)
     return result
 
 
@@ -240,6 +269,19 @@ class _Places:
         inside = _over_items(inside, value)
         self.refuse(name, inside & ~value.isfinite(), value, "a finite number", inside)
         return value.masked_fill(~inside, torch.nan)
+
+    def controls(self, name: str, value: Tensor, inside: Tensor, domain: Domain) -> Tensor:
+        """Finite numbers within the bounds of each control; NaN in padding."""
+        result = self.numbers(name, value, inside)
+        low, high = (
+            result.new_tensor([getattr(one, end) for one in domain.controls])
+            for end in ("low", "high")
+        )
+        outside = (result < low - ROUNDING) | (result > high + ROUNDING)
+        self.refuse(
+            name, outside, result, f"within its bounds ({bounds_in_words(domain.controls)})"
+        )
+        return result
 
     def entropies(self, name: str, value: Tensor, inside: Tensor, actions: int) -> Tensor:
         """Entropies in nats of a choice among ``actions`` actions, or NaN; NaN in padding."""

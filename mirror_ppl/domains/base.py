@@ -29,6 +29,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from mirror_ppl.domains.controls import Control
 from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import UnknownNameError
 
@@ -178,6 +179,9 @@ class Domain(Protocol):
     of its name. ``counterparts`` has for each visual item the verbal item about the same thing, if
     that is more informative. ``record`` holds settings of other parts of the package. In a world
     that is ``partly_observed``, observations do not determine states, and `state_behind` estimates.
+    ``controls`` are what people set where actions are continuous; ``actions`` are then a grid of
+    their values. `transition`, `rewards` and `next_observation` also take what was executed:
+    control values ``[..., C]`` of numbers with a point.
     """
 
     name: str
@@ -187,6 +191,7 @@ class Domain(Protocol):
     ego_features: tuple[str, ...]
     symbol_sizes: Mapping[str, int]
     actions: tuple[str, ...]
+    controls: tuple[Control, ...]
     horizon: int
     over_at_horizon: bool
     settings: tuple[str, ...]

@@ -39,6 +39,9 @@ CAPABILITIES = (
     Capability("visibility", "everything is seen", "settings: what unaided people see"),
     Capability("positions", "all items at distance 1", "thresholds of sight by distance"),
     Capability("levels", "numbers in units of scales", "networks that read whole numbers exactly"),
+    Capability(
+        "controls", "numbered actions", "continuous actions, and how precisely they are set"
+    ),
     Capability("over", "rounds last to the horizon", "rounds that end"),
     Capability("learn", "what was last seen", "memory: what people know without looking"),
     Capability("assume", "nothing", "what people take for granted"),

@@ -12,7 +12,6 @@ import hashlib
 import inspect
 import os
 import pickle
-from abc import abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -21,28 +20,25 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch
 from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Observation, Visibility
 from mirror_ppl.domains.counterfactual import decisive_items
-from mirror_ppl.domains.world import World
+from mirror_ppl.domains.environment_world import CLOSE, UNSEEN, EnvironmentWorld, as_tensors
 from mirror_ppl.errors import CheckpointError, DomainError, OutputError
 from mirror_ppl.progress import Progress
 from mirror_ppl.row_hashing import as_whole_numbers, row_numbers
 
 SWEEPS = 1000
 """Maximum number of sweeps of value iteration."""
-CLOSE = 1e-6
 SOONER, LITTLE = 0.95, 1e-4
 """A discount to break ties between undiscounted values, and the weight of these values."""
 CACHED = ("tables", "_names", "_path", "_values", "_decisive")
 """Attributes that are computed once."""
 TRIED_TWICE = 200
 """Number of states tried again when reached on another way, to detect unobserved state."""
-UNSEEN = "something that matters cannot be observed"
 
 
 @dataclass(frozen=True)
@@ -71,35 +67,17 @@ class Tables:
     begins: Tensor
 
 
-class GymnasiumWorld(World):
-    """Base class of a world from a Gymnasium environment; derive from it.
+class GymnasiumWorld(EnvironmentWorld):
+    """Base class of a world from a small Gymnasium environment; derive from it.
 
-    Implement :meth:`make` and :meth:`look`. The environment has to be deterministic between resets,
-    and unobserved parts of its state must not matter.
+    Implement ``make()`` and ``look(env)``. The environment is copied by pickling. Those with more
+    states, or continuous actions, are for :class:`~mirror_ppl.domains.stepped_world.SteppedWorld`.
 
     Attributes:
-        moves: the environment's actions that people may take, in the order of ``actions``; the
-            first ones unless given.
-        layouts: number of resets, with the seeds 0, 1 and so on.
         most_states: maximum number of states.
     """
 
-    moves: tuple[int, ...] = ()
-    layouts: int = 20
     most_states: int = 100_000
-
-    @abstractmethod
-    def make(self) -> gym.Env:
-        """Make the environment; it is reset and stepped, and copied by pickling."""
-
-    @abstractmethod
-    def look(self, env: Any) -> Mapping[str, Any]:
-        """Return the full observation: ``ego`` ``[E]``, each modality ``[K, F]``."""
-
-    def terms(self, env: Any, action: int, reward: float, terminated: bool) -> dict[str, float]:
-        """Return reward terms of a step by name; the environment is in the state after it."""
-        del env, action, terminated
-        return {self.reward_terms[0]: reward}
 
     def begins(self, env: Any) -> bool:
         """True if rounds may also begin in this state, which need not follow a reset."""
@@ -192,7 +170,7 @@ class GymnasiumWorld(World):
 
     def knows(self, observation: Mapping[str, Any]) -> bool:
         """True if an observation from `look` is that of a visited state."""
-        one = _tensors(observation)
+        one = as_tensors(observation)
         behind = self.tables.observation
         number = self.state_behind(one).number
         return all(bool((behind[name][number] == value).all()) for name, value in one.items())
@@ -269,14 +247,6 @@ class GymnasiumWorld(World):
         return values
 
 
-def _tensors(observation: Mapping[str, Any]) -> dict[str, Tensor]:
-    dtype = torch.get_default_dtype()
-    return {
-        name: torch.tensor(np.array(part, float), dtype=dtype)
-        for name, part in sorted(observation.items())
-    }
-
-
 def _rows(observation: Observation) -> Tensor:
     """Return observations ``[...]`` as whole numbers ``[..., N]``, in the order of names."""
     dimensions = observation["ego"].dim() - 1
@@ -302,18 +272,9 @@ def _file(world: GymnasiumWorld) -> Path | None:
 def _visited(world: GymnasiumWorld) -> Tables:
     """Visit every state that can be reached."""
     env = world.make()
-    if not isinstance(env.action_space, gym.spaces.Discrete):
-        raise DomainError(
-            f"{world.name}: expected actions that are numbered (Discrete), found {env.action_space}"
-        )
-    moves = world.moves or tuple(range(len(world.actions)))
-    if len(moves) != len(world.actions):
-        raise DomainError(f"{world.name}: {len(world.actions)} actions, but {len(moves)} moves")
-    if max(moves) >= env.action_space.n:
-        raise DomainError(
-            f"{world.name}: the environment has {env.action_space.n} actions, from 0 on, and no "
-            f"{max(moves)} (actions, moves)"
-        )
+    if world.controls:
+        raise DomainError(f"{world.name}: a world with controls has to be a SteppedWorld")
+    moves = world.commands(env)
     numbers: dict[bytes, int] = {}
     seen: list[dict[str, Tensor]] = []
     waiting: list[bytes] = []
@@ -322,7 +283,7 @@ def _visited(world: GymnasiumWorld) -> Tables:
     most = 0
 
     def visit(end: bool, begin: bool = False) -> int:
-        own = _tensors(world.look(env.unwrapped))
+        own = as_tensors(world.look(env.unwrapped))
         key = pickle.dumps([part.tolist() for part in own.values()])
         number = numbers.get(key)
         if number is None:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.controls import Control, action_names, grid
 from mirror_ppl.domains.memory import LastSeen
 from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import DomainError
@@ -40,7 +41,9 @@ class World(ABC):
         version: raise it when recordings and self-models of the world no longer fit.
         modalities: channels; items of ``visual`` can be seen, those of others can be said.
         ego_features: names of features that people always know of themselves, at least one.
-        actions: names of the actions.
+        actions: names of the actions; derived from ``controls`` where there are some.
+        controls: what people set where actions are continuous, none by default. The robot plans
+            with a grid of their values, which are the ``actions``; see :meth:`control_values`.
         horizon: steps of a round.
         settings: names of the settings, such as ``("clear", "fog")``.
         reward_terms: names of the terms that `rewards` returns.
@@ -71,6 +74,7 @@ class World(ABC):
     positions: tuple[str, ...] = ()
     reach_bins: tuple[float, ...]
     levels: Mapping[str, range] = {}
+    controls: tuple[Control, ...] = ()
     lasting: tuple[str, ...] = ()
     record: Record = Record()
     mishap: tuple[str, str]
@@ -108,8 +112,12 @@ class World(ABC):
     def _complete(cls) -> None:
         if "_derived" in vars(cls):
             return
+        if cls.controls and cls._given("actions"):
+            raise DomainError(
+                f"{cls.__name__}: actions are derived from controls; give one of them"
+            )
         for name in ("modalities", "ego_features", "actions", "horizon"):
-            if not hasattr(cls, name):
+            if not (hasattr(cls, name) or (name == "actions" and cls.controls)):
                 raise DomainError(f"{cls.__name__} needs {name}; see docs/adding_a_world.md")
         visual = [m for m in cls.modalities if m.name == VISUAL]
         if len(visual) != 1:
@@ -132,6 +140,8 @@ class World(ABC):
                 for name, each in cls._levels().items()
             },
         }
+        if cls.controls:
+            made["actions"] = action_names(cls.controls)
         derived = [name for name in made if not cls._given(name)]
         for name in derived:
             setattr(cls, name, made[name])
@@ -187,6 +197,16 @@ class World(ABC):
         Unobserved parts must not matter: states with equal observations lead to equal observations
         and rewards. In a world that is ``partly_observed`` this is an estimate.
         """
+
+    def control_values(self, action: Tensor) -> Tensor:
+        """Return the values of the controls ``[..., C]`` of an action, for `transition`.
+
+        Args:
+            action: index ``[...]``, or the values themselves, ``[..., C]`` of numbers with a point.
+        """
+        if action.is_floating_point():
+            return action
+        return grid(self.controls).to(action.device)[action]
 
     def visibility(self, setting: str, observation: Observation) -> Visibility:
         """Return what an unaided person perceives ``[..., K]``: all visual items, no others."""

@@ -306,7 +306,8 @@ class HumanModel(nn.Module):
         logits = logits + implant_priors.residual(implants, belief)
         lapse = implants["lapse"][..., None]
         aware = torch.log1p(-lapse) + log_softmax_of_few(logits)
-        return torch.logaddexp(aware, torch.log(lapse / logits.shape[-1]).expand_as(aware))
+        lapsed = torch.log(lapse / logits.shape[-1]).expand_as(aware)
+        return implant_priors.executed(self.domain, implants, torch.logaddexp(aware, lapsed))
 
     def choose(
         self, implants: Implants, belief: Tensor, values: Tensor, action: Tensor | None = None

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Domain
+from mirror_ppl.domains.controls import execution
 
 SIGHT = "sight_"
 """Prefix of the sites of directional sight thresholds, one for each direction of the domain."""
@@ -27,6 +28,10 @@ LEAST_PROBABILITY = 1e-6
 CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 3.0, 0.5
 """Prior median of the inverse temperature per unit of reward; prior SD of its logarithm."""
 RESIDUAL_HIDDEN = 8
+MOTOR_NOISE = "motor_noise"
+"""Site of the standard deviation of executed controls, in distances between levels of the grid."""
+MOTOR_NOISE_MEDIAN, MOTOR_NOISE_SPREAD = 0.3, 0.7
+"""Prior median of the motor noise; prior SD of its logarithm."""
 
 
 def sight_sites(domain: Domain) -> tuple[str, ...]:
@@ -160,8 +165,9 @@ def assumption_implants(
 def policy_implants(
     domain: Domain, latent: int, like: Tensor, lapse: float = 1 / 31
 ) -> dict[str, Tensor]:
-    """Sample how a person decides: choice parameters and the residual of the policy."""
-    return choice_implants(like, lapse) | residual_implants(domain, latent, like)
+    """Sample how a person decides and acts: choice parameters, residual, noise of controls."""
+    sampled = choice_implants(like, lapse) | residual_implants(domain, latent, like)
+    return sampled | motor_implants(domain, like)
 
 
 def choice_implants(like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
@@ -182,6 +188,30 @@ def choice_implants(like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
         ),
         "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(1 / lapse - 1))),
     }
+
+
+def motor_implants(domain: Domain, like: Tensor) -> dict[str, Tensor]:
+    """Sample how precisely a person sets continuous controls; nothing where actions are numbered.
+
+    ``motor_noise`` is the standard deviation of what they execute around what they intend, in
+    distances between levels of the grid (:mod:`mirror_ppl.domains.controls`).
+    """
+    if not domain.controls:
+        return {}
+    median = torch.tensor(math.log(MOTOR_NOISE_MEDIAN), dtype=like.dtype, device=like.device)
+    noise = dist.LogNormal(median, median.new_tensor(MOTOR_NOISE_SPREAD))
+    return {MOTOR_NOISE: pyro.sample(MOTOR_NOISE, noise)}
+
+
+def executed(domain: Domain, implants: Mapping[str, Tensor], intended: Tensor) -> Tensor:
+    """Return log-probabilities of executed actions ``[..., P, B, A]`` from those of intended ones.
+
+    They are equal where actions are numbered, or ``motor_noise`` is not sampled.
+    """
+    if MOTOR_NOISE not in implants:
+        return intended
+    slips = execution(domain.controls, implants[MOTOR_NOISE])  # [..., P, 1, A, A]
+    return torch.log((intended.exp()[..., None, :] @ slips).squeeze(-2))
 
 
 def residual_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tensor]:

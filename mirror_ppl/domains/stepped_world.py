@@ -1,0 +1,248 @@
+"""Worlds from Gymnasium environments that are put into a state and stepped whenever it is needed.
+
+Inference and planning need pure functions of states. Here a state is the full observation of it:
+the environment is put there, stepped once, and looked at. Outcomes are kept, as the same ones are
+asked for again and again. This takes environments with any number of states and with continuous
+actions, and a few hundredths of a millisecond more than a step of the environment.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from mirror_ppl.domains.base import Observation
+from mirror_ppl.domains.environment_world import CLOSE, UNSEEN, EnvironmentWorld, as_tensors
+from mirror_ppl.errors import DomainError
+
+CACHED = ("_env", "_commands", "_sizes", "_outcomes", "_starts", "_done", "_left_to_try", "_dtype")
+"""Attributes that are of one process: the environment, and what was seen of it."""
+MOST_OUTCOMES = 500_000
+"""Number of outcomes that are kept."""
+TRIED_TWICE = 100
+"""Number of outcomes that are computed twice, to detect what cannot be observed."""
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Full observations, which are the states.
+
+    Attributes:
+        values: flattened and joined in the order of names, ``[..., N]``.
+        done: where the task is done, ``[...]``.
+    """
+
+    values: Tensor
+    done: Tensor
+
+
+class SteppedWorld(EnvironmentWorld):
+    """Base class of a world from a Gymnasium environment of any size; derive from it.
+
+    Implement ``make()``, ``look(env)`` and :meth:`restore`; also :meth:`done` where rounds can end
+    before the horizon.
+    """
+
+    layouts = 1000
+
+    @abstractmethod
+    def restore(self, env: Any, observation: Mapping[str, np.ndarray]) -> None:
+        """Put the environment, after some reset, into the state with this full observation."""
+
+    def done(self, env: Any) -> bool:
+        """True if the task is done in the environment's state: where it terminates."""
+        del env
+        return False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle without the environment; other processes make their own."""
+        return {name: part for name, part in vars(self).items() if name not in CACHED}
+
+    def knows(self, observation: Mapping[str, Any]) -> bool:
+        """True: all observations are states."""
+        del observation
+        return True
+
+    def initial(
+        self, batch: int, generator: torch.Generator, scenario: Tensor | None = None
+    ) -> Moment:
+        """Draw resets of the environment, uniformly from its ``layouts``."""
+        del scenario
+        device = generator.device
+        seeds = torch.randint(self.layouts, (batch,), generator=generator, device=device).tolist()
+        for seed in set(seeds) - self._starts.keys():
+            self._env.reset(seed=seed)
+            self._starts[seed] = torch.from_numpy(self._look())
+        values = torch.stack([self._starts[seed] for seed in seeds]).to(device)
+        return Moment(values, torch.zeros(batch, dtype=torch.bool, device=device))
+
+    def transition(self, state: Moment, action: Tensor) -> Moment:
+        """Step the environment; a task that is done stays as it is."""
+        found, _ = self._stepped(state, action)
+        return found
+
+    def rewards(self, state: Moment, action: Tensor, following: Moment) -> dict[str, Tensor]:
+        """Step the environment; 0 where the task is done."""
+        del following
+        _, earned = self._stepped(state, action)
+        return dict(zip(self.reward_terms, earned.unbind(-1), strict=True))
+
+    def over(self, state: Moment) -> Tensor:
+        """Return where the environment has terminated."""
+        return state.done
+
+    def observe(self, state: Moment) -> Observation:
+        """Return the full observation, which the state is."""
+        shape = state.values.shape[:-1]
+        parts = state.values.split([size.numel() for size in self._sizes.values()], -1)
+        return {
+            name: part.reshape(*shape, *size)
+            for (name, size), part in zip(self._sizes.items(), parts, strict=True)
+        }
+
+    def state_behind(self, observation: Observation) -> Moment:
+        """Return the state, which the observation is."""
+        shape = observation["ego"].shape[:-1]
+        values = torch.cat([observation[name].reshape(*shape, -1) for name in self._sizes], -1)
+        if type(self).done is SteppedWorld.done:
+            return Moment(values, torch.zeros(shape, dtype=torch.bool, device=values.device))
+        rows = values.reshape(-1, values.shape[-1]).cpu()
+        done = torch.tensor([self._is_done(row) for row in rows], dtype=torch.bool)
+        return Moment(values, done.view(shape).to(values.device))
+
+    def _stepped(self, state: Moment, action: Tensor) -> tuple[Moment, Tensor]:
+        """Return the next states ``[...]`` and the reward terms ``[..., R]``."""
+        continuous = action.is_floating_point()
+        device, batch = state.values.device, action.shape[: action.dim() - continuous]
+        shape = torch.broadcast_shapes(state.done.shape, batch)
+        rows = state.values.expand((*shape, -1)).reshape(-1, state.values.shape[-1]).cpu()
+        ended = state.done.expand(shape).reshape(-1).tolist()
+        deeds = action.expand((*shape, *action.shape[len(batch) :])).reshape(len(rows), -1).cpu()
+        outcomes = self._outcomes
+        if len(outcomes) > MOST_OUTCOMES:
+            outcomes.clear()
+        found, own, stay = [], rows.numpy(), np.zeros(len(self.reward_terms))
+        for row, deed, end in zip(own, deeds.numpy(), ended, strict=True):
+            if end:
+                found.append((row, True, stay))
+                continue
+            key = row.tobytes() + deed.tobytes()
+            outcome = outcomes.get(key)
+            if outcome is None:
+                command = deed if continuous else self._commands[int(deed[0])]
+                outcome = outcomes[key] = self._tried(row, command)
+            found.append(outcome)
+        values = torch.from_numpy(np.array([one for one, _, _ in found])).to(device)
+        done = torch.tensor([one for _, one, _ in found], device=device)
+        earned = torch.from_numpy(np.array([one for _, _, one in found])).to(values)
+        return Moment(values.view(*shape, -1), done.view(shape)), earned.view(*shape, -1)
+
+    def _tried(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
+        """Return the observation after an action, whether the task is done, and reward terms."""
+        found = self._step(row, command)
+        if self._left_to_try:
+            self._left_to_try.pop()
+            again = self._step(row, command)
+            for one, other in zip(found, again, strict=True):
+                if np.abs(np.subtract(one, other, dtype=float)).max() > CLOSE:
+                    raise DomainError(
+                        f"{self.name}: outcomes of {command} in {row.tolist()} vary; {UNSEEN}"
+                    )
+        return found
+
+    def _step(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
+        self._restored(row)
+        _, reward, terminated, _, _ = self._env.step(command)
+        inner, end = self._env.unwrapped, bool(terminated)
+        if end != bool(self.done(inner)):
+            raise DomainError(
+                f"{self.name}: the environment {'is' if end else 'is not'} terminated after "
+                f"{command} in {row.tolist()}, but done() says otherwise"
+            )
+        own = self.terms(inner, command, float(reward), end)
+        earned = np.array([own[name] for name in self.reward_terms], float)
+        return self._look(), end, earned
+
+    def _restored(self, row: np.ndarray) -> None:
+        observation, begin = {}, 0
+        for name, size in self._sizes.items():
+            observation[name] = row[begin : begin + size.numel()].reshape(tuple(size))
+            begin += size.numel()
+        self.restore(self._env.unwrapped, observation)
+        if self._left_to_try:
+            off = np.abs(self._look() - row) > TOLERANCE * (1 + np.abs(row))
+            if off.any():
+                raise DomainError(
+                    f"{self.name}: restore() of the observation {row.tolist()} leads to "
+                    f"{self._look().tolist()}"
+                )
+
+    def _is_done(self, row: Tensor) -> bool:
+        key = row.numpy().tobytes()
+        if key not in self._done:
+            self._restored(row.numpy())
+            self._done[key] = bool(self.done(self._env.unwrapped))
+        return self._done[key]
+
+    def _look(self) -> np.ndarray:
+        seen = self.look(self._env.unwrapped)
+        flat = [np.asarray(seen[name], self._dtype).ravel() for name in self._sizes]
+        return np.concatenate(flat)
+
+    @cached_property
+    def _dtype(self) -> np.dtype:
+        return torch.empty(0).numpy().dtype  # torch's default
+
+    @cached_property
+    def _env(self) -> gym.Env:
+        env = self.make()
+        env.reset(seed=0)
+        return env
+
+    @cached_property
+    def _commands(self) -> list[Any]:
+        return self.commands(self._env)
+
+    @cached_property
+    def _sizes(self) -> dict[str, torch.Size]:
+        """Shapes of the parts of an observation, in the order of names."""
+        expected = {"ego": torch.Size((len(self.ego_features),))} | {
+            m.name: torch.Size((len(m.items), len(m.features))) for m in self.modalities
+        }
+        found = {
+            name: part.shape for name, part in as_tensors(self.look(self._env.unwrapped)).items()
+        }
+        if found != expected:
+            raise DomainError(
+                f"{self.name}: look() has {_listed(found)}, expected {_listed(expected)}"
+            )
+        return dict(sorted(expected.items()))
+
+    @cached_property
+    def _starts(self) -> dict[int, Tensor]:
+        return {}  # observations after resets, by seed
+
+    @cached_property
+    def _outcomes(self) -> dict[bytes, tuple[np.ndarray, bool, np.ndarray]]:
+        return {}  # by observation and action
+
+    @cached_property
+    def _done(self) -> dict[bytes, bool]:
+        return {}
+
+    @cached_property
+    def _left_to_try(self) -> list[None]:
+        return [None] * TRIED_TWICE
+
+
+def _listed(shapes: Mapping[str, torch.Size]) -> str:
+    return ", ".join(f"{name} {tuple(size)}" for name, size in sorted(shapes.items()))

@@ -1,0 +1,197 @@
+"""Gymnasium environments that are stepped when needed: equal to the environment, and refusals."""
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from mirror_ppl.data.contradictions import check_world
+from mirror_ppl.data.recorder import Recorder
+from mirror_ppl.domains import Control, Modality, add_domain
+from mirror_ppl.domains.checking import faults_of
+from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
+from mirror_ppl.domains.stepped_world import SteppedWorld
+from mirror_ppl.errors import DomainError, InputError
+
+
+class Swing(SteppedWorld):
+    """Gymnasium's pendulum; who looks sees where its end is."""
+
+    modalities = (Modality("visual", ("end",), ("up", "right"), ("m", "m"), (1.0, 1.0), 0.01),)
+    ego_features = ("speed",)
+    controls = (Control("torque", -2, 2, 5, "Nm"),)
+    horizon = 5
+    reach_bins = (0.0, 1.0)
+    positions = ("up", "right")
+
+    def make(self):
+        return gym.make("Pendulum-v1")
+
+    def look(self, env):
+        angle, speed = env.state
+        return {"ego": [speed], "visual": [[np.cos(angle), np.sin(angle)]]}
+
+    def restore(self, env, observation):
+        up, right = observation["visual"][0].astype(float)
+        env.state = np.array([np.arctan2(right, up), float(observation["ego"][0])])
+
+
+class Walk(gym.Env):
+    """Ten steps to the right, and the walk is over."""
+
+    observation_space = gym.spaces.Box(0, 20, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = int(self.np_random.integers(8))
+        self.drift = 0.0
+        return np.array([self.place]), {}
+
+    def step(self, action):
+        self.place += int(action)
+        return np.array([self.place]), float(action), self.place >= 10, False, {}
+
+
+class Way(SteppedWorld):
+    modalities = (Modality("visual", ("end",), ("offset",), ("m",), (10.0,), 0.01),)
+    ego_features = ("place",)
+    actions = ("stay", "go")
+    horizon = 6
+    positions = ("offset",)
+
+    def make(self):
+        return Walk()
+
+    def look(self, env):
+        return {"ego": [env.place], "visual": [[10 - env.place]]}
+
+    def restore(self, env, observation):
+        env.place = int(observation["ego"][0])
+
+    def done(self, env):
+        return env.place >= 10
+
+
+@pytest.mark.parametrize("kind", [Swing, Way])
+def test_such_worlds_keep_the_contract(kind):
+    assert faults_of(kind()) == []
+
+
+def test_pendulum_moves_as_when_it_is_stepped():
+    swing, chooser = Swing(), np.random.default_rng(0)
+    env = swing.make()
+    env.reset(seed=3)
+    begin = {n: torch.tensor(np.array(v)).float() for n, v in swing.look(env.unwrapped).items()}
+    state = swing.state_behind({n: v[None] for n, v in begin.items()})
+    for step in range(20):
+        torque = chooser.uniform(-2, 2, 1)
+        _, reward, _, _, _ = env.step(torque)
+        action = torch.tensor(torque[None]).float()
+        following = swing.transition(state, action)
+        assert float(swing.rewards(state, action, following)["reward"]) == pytest.approx(
+            float(reward), abs=1e-3
+        )
+        # The state is known to the rounding of 32 bits, which grows from step to step.
+        for name, value in swing.look(env.unwrapped).items():
+            assert np.allclose(swing.observe(following)[name][0], value, atol=1e-5 * (step + 1))
+        state = following
+
+
+def test_actions_are_the_controls_that_they_stand_for():
+    swing = Swing()
+    state = swing.initial(4, torch.Generator().manual_seed(0))
+    action = torch.tensor([0, 1, 3, 4])
+    values = torch.tensor([[-2.0], [-1.0], [1.0], [2.0]])
+    assert torch.equal(
+        swing.transition(state, action).values, swing.transition(state, values).values
+    )
+
+
+def test_what_is_done_stays_so_and_earns_nothing():
+    way = Way()
+    state = way.state_behind({"ego": torch.tensor([[9.0]]), "visual": torch.tensor([[[1.0]]])})
+    go = torch.tensor([1])
+    end = way.transition(state, go)
+    assert bool(way.over(end)) and not bool(way.over(state))
+    assert float(way.rewards(state, go, end)["reward"]) == 1
+    assert torch.equal(way.transition(end, go).values, end.values)
+    assert float(way.rewards(end, go, end)["reward"]) == 0
+    assert bool(way.over(way.state_behind(way.observe(end))))
+
+
+def test_other_processes_make_their_own_environment():
+    way = Way()
+    state = way.initial(3, torch.Generator().manual_seed(0))
+    again = pickle.loads(pickle.dumps(way))
+    assert "_env" not in vars(again)
+    go = torch.ones(3, dtype=torch.long)
+    assert torch.equal(again.transition(state, go).values, way.transition(state, go).values)
+
+
+class Forgetful(Way):
+    def restore(self, env, observation):
+        env.place = 0
+
+
+class Random(Walk):
+    def step(self, action):
+        self.place += int(self.np_random.integers(5))
+        return np.array([self.place]), 0.0, self.place >= 10, False, {}
+
+
+class Endless(Way):
+    def done(self, env):
+        return False
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "message"),
+    [
+        (Forgetful, {}, "restore.. of the observation"),
+        (Way, {"make": lambda self: Random()}, "something that matters cannot be observed"),
+        (Endless, {"horizon": 12}, "but done.. says otherwise"),
+        (Way, {"look": lambda self, env: {"ego": [0.0, 1.0], "visual": [[0.0]]}}, "look.. has ego"),
+        (Way, {"moves": (0, 2)}, "the environment has 2 actions, from 0 on, and no 2"),
+        (Swing, {"controls": (Control("torque", -3, 3),)}, "but the environment takes -2 to 2"),
+        (Swing, {"controls": (Control("a"), Control("b"))}, "expected a Box of 2 numbers"),
+    ],
+)
+def test_faults_of_environments_are_named(kind, changes, message):
+    with pytest.raises(DomainError, match=message):
+        world = type("Other", (kind,), changes)()
+        found = faults_of(world)
+        raise DomainError(found[0] if found else "nothing wrong")
+
+
+def test_tables_are_for_numbered_actions():
+    kind = type(
+        "Tabulated",
+        (GymnasiumWorld,),
+        {
+            name: part
+            for name, part in vars(Swing).items()
+            if name in ("modalities", "ego_features", "controls", "horizon", "make", "look")
+        },
+    )
+    (fault,) = faults_of(kind())
+    assert "has to be a SteppedWorld" in fault
+
+
+def test_played_controls_are_recorded():
+    swing = add_domain(Swing)
+    env = Recorder(swing.make(), swing, person="ada")
+    env.reset(seed=5)
+    for torque in (-2.0, 0.3, 1.6, 1.4, 0.0):
+        env.step(np.array([torque], np.float32))
+    with pytest.raises(InputError, match="over"):
+        env.step(np.zeros(1))
+    env.reset()
+    with pytest.raises(InputError, match=r"1 numbers \(torque -2 to 2\)"):
+        env.step(np.array([5.0]))
+    found = env.recordings()
+    assert found.controls.flatten().tolist() == pytest.approx([-2.0, 0.3, 1.6, 1.4, 0.0])
+    assert found.actions.flatten().tolist() == [0, 2, 4, 3, 2]
+    assert check_world(found, 0.0).share == 0
