@@ -46,9 +46,9 @@ class Delivery(SteppedWorld):
     record = Record(
         networks={"encoder": 128, "decoder": 64, "q_network": 200},
         training={
-            "phases": 40,
+            "phases": 80,
             "rounds": 200,
-            "steps": 50,
+            "steps": 80,
             "stride": 2,
             "learning_rate": 2e-3,
             "world_weight": 0.003,

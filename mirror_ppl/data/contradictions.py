@@ -81,9 +81,16 @@ def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contrad
 
 
 def _observation(demonstrations: Demonstrations, person: int) -> Observation:
-    """Observations in one person's rounds, ``[B, T+1, ...]``; 0 in padding."""
-    values = {"ego": demonstrations.ego, **demonstrations.observations}
-    return {name: value[person].nan_to_num(0.0) for name, value in values.items()}
+    """Observations in one person's rounds, ``[B, T+1, ...]``; their first one in padding.
+
+    Without rounds all are 0. Worlds may refuse observations that cannot be.
+    """
+    values = {"ego": demonstrations.ego[person]}
+    values |= {name: value[person] for name, value in demonstrations.observations.items()}
+    return {
+        name: torch.where(value.isnan(), value[:1, :1], value).nan_to_num(0.0)
+        for name, value in values.items()
+    }
 
 
 def check_observations(demonstrations: Demonstrations) -> None:

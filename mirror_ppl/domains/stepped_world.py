@@ -157,6 +157,14 @@ class SteppedWorld(EnvironmentWorld):
                     raise DomainError(
                         f"{self.name}: outcomes of {command} in {row.tolist()} vary; {UNSEEN}"
                     )
+            reached, _, _ = found
+            self._restored(reached)
+            off = np.abs(self._look() - reached) > TOLERANCE * (1 + np.abs(reached))
+            if off.any():
+                raise DomainError(
+                    f"{self.name}: restore() of the observation {reached.tolist()} leads to "
+                    f"{self._look().tolist()}"
+                )
         return found
 
     def _step(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
@@ -178,13 +186,6 @@ class SteppedWorld(EnvironmentWorld):
             observation[name] = row[begin : begin + size.numel()].reshape(tuple(size))
             begin += size.numel()
         self.restore(self._env.unwrapped, observation)
-        if self._left_to_try:
-            off = np.abs(self._look() - row) > TOLERANCE * (1 + np.abs(row))
-            if off.any():
-                raise DomainError(
-                    f"{self.name}: restore() of the observation {row.tolist()} leads to "
-                    f"{self._look().tolist()}"
-                )
 
     def _is_done(self, row: Tensor) -> bool:
         key = row.numpy().tobytes()

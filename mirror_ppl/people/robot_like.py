@@ -20,7 +20,11 @@ from mirror_ppl.models.implants import (
     CONSISTENCY_MEDIAN,
     CONSISTENCY_SPREAD,
     LEAST_PROBABILITY,
+    MOTOR_NOISE,
+    MOTOR_NOISE_MEDIAN,
+    MOTOR_NOISE_SPREAD,
     SIGHT,
+    executed,
     sight_sites,
 )
 from mirror_ppl.models.prior import draw_prior
@@ -57,12 +61,15 @@ class RobotLike(SimulatedPeople):
         setting: setting that limits the sight of people without thresholds.
         reach: threshold of sight for each direction ``[P, D]``, or ``None``.
         consistency: inverse temperature of their choices per unit of reward, ``[P]``.
+        motor_noise: standard deviation of executed controls, in distances between levels of the
+            grid, ``[P]``; ``None`` where actions are numbered.
     """
 
     self_model: SelfModel
     setting: str
     reach: Tensor | None
     consistency: Tensor
+    motor_noise: Tensor | None = None
 
     @property
     def domain(self) -> Domain:
@@ -107,7 +114,11 @@ class RobotLike(SimulatedPeople):
         values = self.self_model.action_values(belief)
         scale = self.consistency.view(-1, *(1,) * (values.dim() - 1))
         mind = Mind(belief, memory.action, _flat(knowledge, len(shape)))
-        return torch.softmax(scale * values, -1), mind
+        chosen = torch.softmax(scale * values, -1)
+        if self.motor_noise is not None:
+            own = {MOTOR_NOISE: self.motor_noise.view(scale.shape[:-1])}
+            chosen = executed(domain, own, chosen.log()).exp()
+        return chosen, mind
 
     def acted(self, memory: Mind, action: Tensor) -> Mind:
         """Return the memory with the chosen action."""
@@ -116,6 +127,8 @@ class RobotLike(SimulatedPeople):
     def truth(self) -> dict[str, Tensor]:
         """Return their consistency, and sight thresholds if they have them."""
         own = {"consistency": self.consistency}
+        if self.motor_noise is not None:
+            own[MOTOR_NOISE] = self.motor_noise
         if self.reach is not None:
             own |= {
                 SIGHT + name: self.reach[:, place]
@@ -135,6 +148,8 @@ class RobotLike(SimulatedPeople):
         drawn = draw_prior(human, len(self.consistency), 1, 0)
         own = {name: torch.zeros_like(value) for name, value in drawn.items()}
         own["consistency"] = self.consistency[None, :, None]
+        if self.motor_noise is not None:
+            own[MOTOR_NOISE] = self.motor_noise[None, :, None]
         own["lapse"] = torch.full_like(drawn["lapse"], LEAST_PROBABILITY)
         bins = torch.tensor(self.domain.reach_bins, device=self.reach.device)
         for place, site in enumerate(sight_sites(self.domain)):
@@ -154,17 +169,19 @@ def simulated_robot_like(
     require_known(setting, "setting", domain.settings, domain.name)
     require_known(population, "population", POPULATIONS, domain.name)
     bins = torch.tensor(domain.reach_bins)
-    reach, consistency = [], []
+    reach, consistency, noise = [], [], []
     for person in range(people):
         generator = derived_generator(seed, "robot-like", person)
         drawn = torch.randint(len(bins), (len(domain.directions),), generator=generator)
         reach.append(bins[drawn])
         consistency.append(CONSISTENCY_SPREAD * torch.randn((), generator=generator))
+        noise.append(MOTOR_NOISE_SPREAD * torch.randn((), generator=generator))
     return RobotLike(
         self_model,
         setting,
         torch.stack(reach) if population == "diverse" else None,
         CONSISTENCY_MEDIAN * torch.stack(consistency).exp(),
+        MOTOR_NOISE_MEDIAN * torch.stack(noise).exp() if domain.controls else None,
     )
 
 

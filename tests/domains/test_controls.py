@@ -1,7 +1,7 @@
 """Continuous actions: their grid, how noise executes them, and their way through recordings."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyro
@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch.special import ndtr
 
+import mirror_ppl
 from mirror_ppl.communication import (
     Communicator,
     Companion,
@@ -28,9 +29,12 @@ from mirror_ppl.domains.controls import (
     nearest_action,
 )
 from mirror_ppl.errors import DemonstrationsError, DomainError, InputError
+from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.models import HumanModel, SelfModel
 from mirror_ppl.models.implants import MOTOR_NOISE
 from mirror_ppl.models.prior import draw_prior, scalar_sites
+from mirror_ppl.people import recorded
+from mirror_ppl.people.robot_like import simulated_robot_like
 
 BOTH = (Control("steering"), Control("speed", 0, 4, 5, "m/s"))
 
@@ -226,3 +230,30 @@ def test_companions_are_told_what_was_executed(human):
     assert companion.decide().gain is not None
     with pytest.raises(InputError, match=r"1 numbers \(speed -1 to 1\)"):
         companion.observe(first, [3.0])
+
+
+def test_simulated_people_are_the_human_model(human):
+    """What they do has the probabilities that the program gives it, noise of controls included."""
+    people = simulated_robot_like(human.self_model, "everyday", "diverse", 3, 0)
+    rounds = recorded(people, "everyday", "diverse", 4, 0)
+    model, known = people.modelled()
+    found = predict_rounds(model, rounds, known)[0]
+    entropy = torch.special.entr(found.exp()).sum(-1)
+    assert torch.allclose(entropy[rounds.mask], rounds.action_entropy[rounds.mask], atol=1e-4)
+    assert torch.equal(rounds.truth[MOTOR_NOISE], people.motor_noise)
+    precise = replace(people, motor_noise=torch.full((3,), 1e-3))
+    other = recorded(precise, "everyday", "diverse", 4, 0)
+    assert not torch.allclose(other.action_entropy, rounds.action_entropy)
+
+
+def test_noise_of_controls_is_inferred(human):
+    """Half of the people are precise; their intervals are below those of the others."""
+    with torch.no_grad():  # values that differ between actions, as those of a trained network
+        human.self_model.q_network.value.weight *= 100
+    people = simulated_robot_like(human.self_model, "everyday", "diverse", 4, 0)
+    noise = torch.tensor([0.1, 0.1, 1.0, 1.0])
+    sure = replace(people, motor_noise=noise)
+    rounds = recorded(sure, "everyday", "diverse", 40, 0)
+    fit = mirror_ppl.infer(rounds, human=human, draws=100, explore=0)
+    drawn = fit.posterior.draws[MOTOR_NOISE][..., 0]
+    assert drawn[:, :2].quantile(0.95) < drawn[:, 2:].quantile(0.05)
