@@ -4,6 +4,7 @@ import csv
 
 import pytest
 
+from benchmarks import highway_messages
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
 from benchmarks.tables import DOCS, RESULTS, results_page, studies, study_page
@@ -41,6 +42,22 @@ def test_the_choice_of_the_prior_over_directions_is_what_its_rows_say():
     assert f"the data are {-total['inf']:.1f} nats more probable under it" in words
     gained, lost = f"{total['0.5']:.1f}".lstrip("0"), f"{-total['2']:.1f}"
     assert f"another {gained}, one of two bins loses {lost}" in words
+
+
+def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
+    page = (DOCS / "highway.md").read_text()
+    with highway_messages.ROWS.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = page.partition("<!-- messages -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == highway_messages.table(rows)
+    mirror = next(row for row in rows if row["communicator"] == "mirror")
+    silent = next(row for row in rows if row["communicator"] == "none")
+    words = " ".join(page.split())
+    assert f"worth {float(mirror['over_none_mean']):.1f} a round" in words
+    assert f"only {100 * float(mirror['way_to_oracle_mean']):.0f}% of the way" in words
+    rounds = int(silent["people"]) * int(silent["rounds"])
+    assert rounds == 80 and round(float(silent["mishaps"]) * rounds) == 1
+    assert "Of 80 rounds in silence one ended in an accident" in words
 
 
 def test_the_table_of_reaches_is_what_its_rows_say():
