@@ -9,10 +9,9 @@ import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mirror_ppl.checks import require_kind, seed_number, whole_number
 from mirror_ppl.communication.communicator import Communicator as PlannedCommunicator
@@ -26,12 +25,10 @@ from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.domains import DOMAINS as worlds
 from mirror_ppl.domains import World, add_domain, domain_of, get_domain, require_known
 from mirror_ppl.errors import InputError, UnreliableWeights
-from mirror_ppl.files import json_text, write_together
+from mirror_ppl.fitted import Fit, doubtful_people, one_of
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.results.criticism import FINE
-from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.results.posterior_file import load_posterior
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
@@ -48,13 +45,8 @@ from mirror_ppl.models.loading import (
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import populations_of
-from mirror_ppl.plots.fit import FILES, FitPlots
 from mirror_ppl.progress import Report, Stages, silent
-from mirror_ppl.timing import clocked, stage
 from mirror_ppl.training.guide_file import network_for
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 __all__ = [
     "Communicator",
@@ -74,158 +66,6 @@ KEPT = ("means", "draws")
 """Forms in which predictions may be kept."""
 SHIPPED = "the people that ship"
 """Recordings of :func:`infer` unless others are given."""
-RESULTS = ("summary.json", "posterior.nc", *FILES)
-"""Names of all files that a fit may write."""
-
-
-@dataclass(frozen=True, repr=False)
-class Fit(fitting.Fit):
-    """A fit of P people: the posterior, predictions and checks.
-
-    Attributes:
-        human: the human model.
-        train: the training rounds.
-        posterior: draws ``[S, P, 1, ...]`` by site, and how they were obtained.
-        data: posterior, predictions and recordings as ArviZ ``InferenceData``.
-        summary: the numbers that `summary.json` holds.
-        seconds: processor seconds by stage.
-    """
-
-    def __repr__(self) -> str:
-        told = self.summary
-        doubtful = _doubtful(told)
-        warning = f"; weights not to be relied on: {', '.join(doubtful)}" if doubtful else ""
-        wrong = [one["id"] for one in told["people"] if one["check"]["verdict"] not in FINE]
-        warning += f"; not explained by the model: {', '.join(wrong)}" if wrong else ""
-        return (
-            f"Fit({told['domain']}, {told['setting']}: {len(self.people)} people, "
-            f"{told['guide']}, {len(next(iter(self.posterior.draws.values())))} draws{warning})"
-        )
-
-    @property
-    def people(self) -> tuple[str, ...]:
-        """Ids of the P people."""
-        return self.train.people
-
-    @cached_property
-    def plot(self) -> FitPlots:
-        """Figures of this fit, such as ``fit.plot.sight()``."""
-        return FitPlots(self.data)
-
-    @property
-    def check(self) -> pd.DataFrame:
-        """Model check, one row per person: verdict, reasons, held-out NLLs, p-values.
-
-        ``nll`` (nats an action of held-out rounds) stands beside ``nll_base_rate`` (of the base
-        rate of each action) and ``nll_no_implants`` (if the person were the robot). p-values are
-        near 0 where there is more of something than the model predicts, near 1 where there is less.
-        With the human model ``all``, ``p(<model>)`` are the probabilities of its models.
-        """
-        import pandas as pd
-
-        rows = []
-        for person in self.summary["people"]:
-            told = dict(person["check"])
-            rows.append(
-                {"verdict": told.pop("verdict"), "reasons": "; ".join(told.pop("reasons"))}
-                | {"nll": (person["test"] or {}).get("nll")}
-                | {name: told[name] for name in ("nll_base_rate", "nll_no_implants")}
-                | {f"p({name})": value for name, value in told.get("models", {}).items()}
-                | told["p_values"]
-            )
-        return pd.DataFrame(rows, index=pd.Index(self.people, name="person"))
-
-    def person(self, name: str | None = None) -> FittedPerson:
-        """Select one of the people; the only one unless named.
-
-        Raises:
-            UnknownNameError: no person has that id.
-            InputError: there are several people, and none is named.
-        """
-        return FittedPerson(self, _one_of(self.people, name, "the fit"))
-
-    def save(self, folder: str | Path, **told: Any) -> dict[str, str]:
-        """Write ``posterior.nc``, ``summary.json`` and the pictures, all of them or none.
-
-        Args:
-            folder: the folder; files of an older fit are replaced.
-            told: additional entries of ``summary.json``.
-
-        Returns:
-            Descriptions of the pictures, by file name.
-
-        Raises:
-            OutputError: a file cannot be written.
-        """
-        folder = Path(folder)
-        with clocked() as seconds:
-            with stage("draw"):
-                pictures = self.plot.files()
-                drawn = {name: picture.content() for name, (picture, _) in pictures.items()}
-            with stage("write"):
-                posterior = netcdf_content(self.data)
-        spent = {name: round(each, 2) for name, each in (self.seconds | seconds).items()}
-        summary = self.summary | told | {"processor_seconds": spent}
-        contents = {
-            folder / "posterior.nc": posterior,
-            **{folder / name: content for name, content in drawn.items()},
-            folder / "summary.json": json_text(summary),
-        }
-        # Files of an older fit go first: it may have drawn pictures that this one does not, and
-        # without a summary the results of a fit that is killed here do not look complete.
-        write_together(contents, remove=[folder / name for name in RESULTS])
-        return {name: shows for name, (_, shows) in pictures.items()}
-
-
-@dataclass(frozen=True)
-class FittedPerson:
-    """One person of a fit.
-
-    Attributes:
-        fit: the fit.
-        name: id of the person.
-    """
-
-    fit: Fit
-    name: str
-
-    def __repr__(self) -> str:
-        doubtful = self.name in _doubtful(self.fit.summary)
-        warning = "; weights not to be relied on" if doubtful else ""
-        check = self.summary["check"]
-        if check["verdict"] not in FINE:
-            warning += f"; {check['verdict']}: {'; '.join(check['reasons'])}"
-        return f"FittedPerson({self.name}: {self.summary['rounds']} rounds{warning})"
-
-    @property
-    def number(self) -> int:
-        """Index of the person in the fit, from 0."""
-        return self.fit.people.index(self.name)
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """The person's part of the fit's summary."""
-        return self.fit.summary["people"][self.number]
-
-    @property
-    def implants(self) -> pd.DataFrame:
-        """Median, 90% interval and truth (if known) of each implant that is one number."""
-        import pandas as pd
-
-        return pd.DataFrame(self.summary["implants"]).T
-
-    @property
-    def draws(self) -> dict[str, Any]:
-        """Posterior draws ``[S, 1, 1, ...]`` by site, tensors."""
-        own = slice(self.number, self.number + 1)
-        return {name: value[:, own] for name, value in self.fit.posterior.draws.items()}
-
-    def listener(self, draws: int = 64) -> Person:
-        """Make the person to plan messages for, with ``draws`` evenly spaced posterior draws."""
-        held = len(next(iter(self.fit.posterior.draws.values())))
-        number = min(whole_number(draws, "draws", *LIMITS["draws"]), held)
-        chosen = [round(place * (held - 1) / max(number - 1, 1)) for place in range(number)]
-        return Person(self.fit.human, {name: value[chosen] for name, value in self.draws.items()})
 
 
 class Communicator(PlannedCommunicator):
@@ -443,7 +283,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         )
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)
-    if doubtful := _doubtful(found.summary):
+    if doubtful := doubtful_people(found.summary):
         warnings.warn(
             f"importance weights of {', '.join(doubtful)} are not to be relied on (Pareto k above "
             f"{HIGH_PARETO_K}): use more proposals, or another engine",
@@ -451,15 +291,6 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
             stacklevel=2,
         )
     return Fit(**vars(found))
-
-
-def _one_of(people: tuple[str, ...], name: str | None, where: str) -> str:
-    """Id of a person; that of the only one unless named."""
-    if name is None and len(people) > 1:
-        raise InputError(
-            f"{where} is of {len(people)} people: name one of them, such as {next(iter(people))!r}"
-        )
-    return require_known(next(iter(people)) if name is None else name, "person", people)
 
 
 def _saved_person(
@@ -471,7 +302,7 @@ def _saved_person(
 ) -> Person:
     """Make the person to plan messages for from a posterior file."""
     saved = load_posterior(path)
-    number = saved.people.index(_one_of(saved.people, person, str(path)))
+    number = saved.people.index(one_of(saved.people, person, str(path)))
     domain = saved.attributes["domain"]
     if human is None:
         human = model_name(saved.attributes.get("human_model", "unknown"))
@@ -481,15 +312,6 @@ def _saved_person(
     held = len(next(iter(saved.values.values())))
     chosen = saved.draws(model, min(whole_number(draws, "draws", *LIMITS["draws"]), held))
     return Person(model, {name: value[:, number : number + 1] for name, value in chosen.items()})
-
-
-def _doubtful(summary: Mapping[str, Any]) -> list[str]:
-    """Ids of people whose importance weights are not reliable."""
-    return [
-        person["id"]
-        for person in summary["people"]
-        if (person.get("pareto_k") or 0.0) > HIGH_PARETO_K
-    ]
 
 
 def _human(

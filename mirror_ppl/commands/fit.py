@@ -126,8 +126,9 @@ def main(options: Options) -> None:
     began = monotonic()
     from mirror_ppl.domains import get_domain
     from mirror_ppl.evaluation.fit_report import show_fit
-    from mirror_ppl.face import RESULTS, infer
+    from mirror_ppl.face import infer
     from mirror_ppl.files import output_folder
+    from mirror_ppl.fitted import RESULTS
     from mirror_ppl.inference.svi import SVIOptions
     from mirror_ppl.inference.workers import Workers, parts_of
 
