@@ -166,41 +166,34 @@ def policy_implants(
     domain: Domain, latent: int, like: Tensor, lapse: float = 1 / 31
 ) -> dict[str, Tensor]:
     """Sample how a person decides and acts: choice parameters, residual, noise of controls."""
-    sampled = choice_implants(like, lapse) | residual_implants(domain, latent, like)
-    return sampled | motor_implants(domain, like)
+    return choice_implants(domain, like, lapse) | residual_implants(domain, latent, like)
 
 
-def choice_implants(like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
+def choice_implants(domain: Domain, like: Tensor, lapse: float = 1 / 31) -> dict[str, Tensor]:
     """Sample the parameters of a person's choices.
 
     - ``consistency``: inverse temperature of the choice between action values, per unit of reward;
     - ``lapse``: probability that an action is independent of the belief; the argument ``lapse``
-      is its prior mean.
+      is its prior mean;
+    - ``motor_noise``, only where actions are continuous: standard deviation of what a person
+      executes around what they intend, in distances between levels of the grid
+      (:mod:`mirror_ppl.domains.controls`).
     """
 
     def number(value: float) -> Tensor:
         return torch.tensor(value, dtype=like.dtype, device=like.device)
 
-    return {
+    sampled = {
         "consistency": pyro.sample(
             "consistency",
             dist.LogNormal(number(math.log(CONSISTENCY_MEDIAN)), number(CONSISTENCY_SPREAD)),
         ),
         "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(1 / lapse - 1))),
     }
-
-
-def motor_implants(domain: Domain, like: Tensor) -> dict[str, Tensor]:
-    """Sample how precisely a person sets continuous controls; nothing where actions are numbered.
-
-    ``motor_noise`` is the standard deviation of what they execute around what they intend, in
-    distances between levels of the grid (:mod:`mirror_ppl.domains.controls`).
-    """
-    if not domain.controls:
-        return {}
-    median = torch.tensor(math.log(MOTOR_NOISE_MEDIAN), dtype=like.dtype, device=like.device)
-    noise = dist.LogNormal(median, median.new_tensor(MOTOR_NOISE_SPREAD))
-    return {MOTOR_NOISE: pyro.sample(MOTOR_NOISE, noise)}
+    if domain.controls:
+        noise = dist.LogNormal(number(math.log(MOTOR_NOISE_MEDIAN)), number(MOTOR_NOISE_SPREAD))
+        sampled[MOTOR_NOISE] = pyro.sample(MOTOR_NOISE, noise)
+    return sampled
 
 
 def executed(domain: Domain, implants: Mapping[str, Tensor], intended: Tensor) -> Tensor:

@@ -93,7 +93,7 @@ class PerceptualOnly(HumanModel):
         like = next(self.self_model.parameters())
         return implant_priors.perceptual_implants(
             self.domain, like
-        ) | implant_priors.choice_implants(like)
+        ) | implant_priors.choice_implants(self.domain, like)
 
 
 class NoImplants(HumanModel):
@@ -101,7 +101,7 @@ class NoImplants(HumanModel):
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the parameters of choices."""
-        return implant_priors.choice_implants(next(self.self_model.parameters()))
+        return implant_priors.choice_implants(self.domain, next(self.self_model.parameters()))
 
     def sees(self, implants: Implants, observation: Observation, step: int) -> Visibility:
         """Return everything that could be seen."""

@@ -33,6 +33,7 @@ from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.models import HumanModel, SelfModel
 from mirror_ppl.models.implants import MOTOR_NOISE
 from mirror_ppl.models.prior import draw_prior, scalar_sites
+from mirror_ppl.models.variants import NoImplants, OneRadius, PerceptualOnly, PolicyOnly
 from mirror_ppl.people import recorded
 from mirror_ppl.people.robot_like import simulated_robot_like
 
@@ -163,9 +164,10 @@ def test_people_execute_what_they_intend_with_noise(human):
         assert torch.allclose(found[person], intended[person] @ slips, atol=1e-5)
 
 
-def test_only_people_with_controls_have_motor_noise(human):
-    assert MOTOR_NOISE in scalar_sites(human)
-    assert MOTOR_NOISE not in scalar_sites(HumanModel(SelfModel(get_domain("driving"))))
+@pytest.mark.parametrize("kind", [HumanModel, OneRadius, PerceptualOnly, NoImplants, PolicyOnly])
+def test_only_people_with_controls_have_motor_noise(human, kind):
+    assert MOTOR_NOISE in scalar_sites(kind(human.self_model))
+    assert MOTOR_NOISE not in scalar_sites(kind(SelfModel(get_domain("driving"))))
 
 
 # --- recordings -------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ class BombDefusalPerceptualOnly(BombDefusalHuman):
     def prior(self) -> dict[str, Tensor]:
         """Sample the perceptual implants and the parameters of choices."""
         like = next(self.self_model.parameters())
-        return self.perceptual_implants() | implant_priors.choice_implants(like)
+        return self.perceptual_implants() | implant_priors.choice_implants(self.domain, like)
 
     def act(self, implants: Implants, belief: Tensor, values: Tensor) -> Tensor:
         """Return log-probabilities of actions by the robot's values."""
