@@ -282,7 +282,7 @@ def test_nothing_is_no_recordings():
 
 
 def test_unreliable_weights_are_reported(fit, recordings, monkeypatch):
-    monkeypatch.setattr("mirror_ppl.face.HIGH_PARETO_K", -9.0)
+    monkeypatch.setattr("mirror_ppl.fitted.HIGH_PARETO_K", -9.0)
     with pytest.warns(UnreliableWeights, match="weights of person-01 are not to be relied on"):
         found = mirror_ppl.infer(
             recordings.select_people(["person-01"]), draws=5, train_rounds=3, explore=0
