@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mirror_ppl.checks import as_tensor
 from mirror_ppl.domains import Domain
-from mirror_ppl.domains.controls import bounds_in_words, nearest_action
+from mirror_ppl.domains.controls import bounds_in_words, nearest_action, within_bounds
 from mirror_ppl.errors import MOST_CHARACTERS, DemonstrationsError, is_name, shown
 
 TOLD = "told_"
@@ -111,6 +111,8 @@ def checked(
             was expected and what was given.
     """
     _check_people(people)
+    if CONTROL in variables and not domain.controls:
+        raise DemonstrationsError(f"{CONTROL} is given, but actions of {domain.name} are numbered")
     dimensions = variable_dimensions(domain)
     dimensions |= {name: ("person",) for name in variables if name.startswith(OF_PERSON)}
     places = _Places(tuple(people), dimensions, dimension_labels(domain))
@@ -273,11 +275,7 @@ class _Places:
     def controls(self, name: str, value: Tensor, inside: Tensor, domain: Domain) -> Tensor:
         """Finite numbers within the bounds of each control; NaN in padding."""
         result = self.numbers(name, value, inside)
-        low, high = (
-            result.new_tensor([getattr(one, end) for one in domain.controls])
-            for end in ("low", "high")
-        )
-        outside = (result < low - ROUNDING) | (result > high + ROUNDING)
+        outside = ~within_bounds(domain.controls, result) & ~result.isnan()
         self.refuse(
             name, outside, result, f"within its bounds ({bounds_in_words(domain.controls)})"
         )

@@ -19,6 +19,10 @@ from torch import Tensor
 
 from mirror_ppl.errors import DomainError, InputError, shown
 
+SLACK = 1e-3
+"""Distance from the bounds, in levels, by which values may be outside, as numbers are rounded."""
+SQRT_HALF = 0.5**0.5
+
 
 @dataclass(frozen=True)
 class Control:
@@ -64,7 +68,10 @@ class Control:
 def action_names(controls: Sequence[Control]) -> tuple[str, ...]:
     """Return names of the actions, such as ``steering -1 and speed 2 m/s``."""
     each = [
-        [f"{one.name} {value:g} {one.unit}".strip() for value in one.values.tolist()]
+        [
+            f"{one.name} {round(one.low + level * one.spacing, 9) + 0.0:.7g} {one.unit}".strip()
+            for level in range(one.levels)
+        ]
         for one in controls
     ]
     return tuple(" and ".join(names) for names in product(*each))
@@ -76,12 +83,25 @@ def grid(controls: Sequence[Control]) -> Tensor:
 
 
 def nearest_action(controls: Sequence[Control], values: Tensor) -> Tensor:
-    """Return the action ``[...]`` nearest to control values ``[..., C]``; half way, the higher."""
+    """Return the action ``[...]`` nearest to control values ``[..., C]``; half way, the higher.
+
+    Values are rounded as recordings are, to torch's default dtype, so that all agree on borders.
+    """
     number = torch.zeros(values.shape[:-1], dtype=torch.long, device=values.device)
+    values = values.to(torch.get_default_dtype()).double()
     for place, one in enumerate(controls):
         level = torch.floor((values[..., place] - one.low) / one.spacing + 0.5).long()
         number = number * one.levels + level.clamp(0, one.levels - 1)
     return number
+
+
+def within_bounds(controls: Sequence[Control], values: Tensor) -> Tensor:
+    """Return where values ``[..., C]`` are within the bounds, to a thousandth of a level."""
+    low, high, slack = (
+        values.new_tensor([own(one) for one in controls])
+        for own in (lambda c: c.low, lambda c: c.high, lambda c: SLACK * c.spacing)
+    )
+    return (values >= low - slack) & (values <= high + slack)
 
 
 def bounds_in_words(controls: Sequence[Control]) -> str:
@@ -96,16 +116,16 @@ def action_at(controls: Sequence[Control], given: Any) -> int:
         InputError: it is something else.
     """
     try:
-        values = np.asarray(given, float)
+        values = torch.from_numpy(np.asarray(given, float))
     except (TypeError, ValueError):
-        values = np.empty(0)
-    low, high = (np.array([getattr(one, end) for one in controls]) for end in ("low", "high"))
-    if values.shape != low.shape or not ((low <= values) & (values <= high)).all():
+        values = torch.empty(0)
+    if values.shape != (len(controls),) or not bool(within_bounds(controls, values).all()):
+        own = given if not hasattr(given, "tolist") else given.tolist()
         raise InputError(
-            f"the action has to be {len(low)} numbers ({bounds_in_words(controls)}), not "
-            f"{shown(given)}"
+            f"the action has to be {len(controls)} numbers ({bounds_in_words(controls)}), not "
+            f"{shown(own)}"
         )
-    return int(nearest_action(controls, torch.from_numpy(values)))
+    return int(nearest_action(controls, values))
 
 
 def execution(controls: Sequence[Control], noise: Tensor) -> Tensor:
@@ -122,7 +142,8 @@ def execution(controls: Sequence[Control], noise: Tensor) -> Tensor:
     for one in controls:
         level = torch.arange(one.levels, dtype=noise.dtype, device=noise.device)
         edges = level[1:] - 0.5 - level[:, None]  # [intended, edge]
-        below = torch.special.ndtr(edges / noise[..., None, None])
+        # ndtr has no tail with 32 bits.
+        below = 0.5 * torch.erfc(-edges / noise[..., None, None] * SQRT_HALF)
         zero, all_ = below.new_zeros(*below.shape[:-1], 1), below.new_ones(*below.shape[:-1], 1)
         own = torch.cat([below, all_], -1) - torch.cat([zero, below], -1)
         both = total[..., :, None, :, None] * own[..., None, :, None, :]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -56,7 +57,10 @@ class SteppedWorld(EnvironmentWorld):
 
     @abstractmethod
     def restore(self, env: Any, observation: Mapping[str, np.ndarray]) -> None:
-        """Put the environment, after some reset, into the state with this full observation."""
+        """Put the environment, after some reset, into the state with this full observation.
+
+        Everything that ``step`` reads has to be set, counters of terminated steps included.
+        """
 
     def done(self, env: Any) -> bool:
         """True if the task is done in the environment's state: where it terminates."""
@@ -112,10 +116,11 @@ class SteppedWorld(EnvironmentWorld):
     def state_behind(self, observation: Observation) -> Moment:
         """Return the state, which the observation is."""
         shape = observation["ego"].shape[:-1]
-        values = torch.cat([observation[name].reshape(*shape, -1) for name in self._sizes], -1)
+        parts = [observation[n].reshape(*shape, size.numel()) for n, size in self._sizes.items()]
+        values = torch.cat(parts, -1)
         if type(self).done is SteppedWorld.done:
             return Moment(values, torch.zeros(shape, dtype=torch.bool, device=values.device))
-        rows = values.reshape(-1, values.shape[-1]).cpu()
+        rows = values.reshape(shape.numel(), values.shape[-1]).cpu()
         done = torch.tensor([self._is_done(row) for row in rows], dtype=torch.bool)
         return Moment(values, done.view(shape).to(values.device))
 
@@ -124,27 +129,31 @@ class SteppedWorld(EnvironmentWorld):
         continuous = action.is_floating_point()
         device, batch = state.values.device, action.shape[: action.dim() - continuous]
         shape = torch.broadcast_shapes(state.done.shape, batch)
-        rows = state.values.expand((*shape, -1)).reshape(-1, state.values.shape[-1]).cpu()
+        width, number = state.values.shape[-1], shape.numel()
+        rows = state.values.expand((*shape, -1)).reshape(number, width).cpu()
         ended = state.done.expand(shape).reshape(-1).tolist()
-        deeds = action.expand((*shape, *action.shape[len(batch) :])).reshape(len(rows), -1).cpu()
+        deeds = action.expand((*shape, *action.shape[len(batch) :]))
+        deeds = deeds.reshape(number, action.shape[-1] if continuous else 1).cpu()
         outcomes = self._outcomes
         if len(outcomes) > MOST_OUTCOMES:
             outcomes.clear()
+        kind = bytes([continuous])  # an index and control values may have the same bytes
         found, own, stay = [], rows.numpy(), np.zeros(len(self.reward_terms))
         for row, deed, end in zip(own, deeds.numpy(), ended, strict=True):
             if end:
                 found.append((row, True, stay))
                 continue
-            key = row.tobytes() + deed.tobytes()
+            key = kind + row.tobytes() + deed.tobytes()
             outcome = outcomes.get(key)
             if outcome is None:
                 command = deed if continuous else self._commands[int(deed[0])]
                 outcome = outcomes[key] = self._tried(row, command)
             found.append(outcome)
-        values = torch.from_numpy(np.array([one for one, _, _ in found])).to(device)
-        done = torch.tensor([one for _, one, _ in found], device=device)
-        earned = torch.from_numpy(np.array([one for _, _, one in found])).to(values)
-        return Moment(values.view(*shape, -1), done.view(shape)), earned.view(*shape, -1)
+        values = torch.from_numpy(np.array([one for one, _, _ in found], own.dtype)).to(device)
+        done = torch.tensor([one for _, one, _ in found], dtype=torch.bool, device=device)
+        earned = torch.from_numpy(np.array([one for _, _, one in found], float)).to(values)
+        moment = Moment(values.view(*shape, width), done.view(shape))
+        return moment, earned.view(*shape, len(self.reward_terms))
 
     def _tried(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
         """Return the observation after an action, whether the task is done, and reward terms."""
@@ -169,7 +178,7 @@ class SteppedWorld(EnvironmentWorld):
 
     def _step(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
         self._restored(row)
-        _, reward, terminated, _, _ = self._env.step(command)
+        _, reward, terminated, _, _ = self._env.step(copy(command))
         inner, end = self._env.unwrapped, bool(terminated)
         if end != bool(self.done(inner)):
             raise DomainError(
@@ -181,7 +190,7 @@ class SteppedWorld(EnvironmentWorld):
         return self._look(), end, earned
 
     def _restored(self, row: np.ndarray) -> None:
-        observation, begin = {}, 0
+        row, observation, begin = row.copy(), {}, 0  # an environment may change what it is given
         for name, size in self._sizes.items():
             observation[name] = row[begin : begin + size.numel()].reshape(tuple(size))
             begin += size.numel()
@@ -189,6 +198,8 @@ class SteppedWorld(EnvironmentWorld):
 
     def _is_done(self, row: Tensor) -> bool:
         key = row.numpy().tobytes()
+        if len(self._done) > MOST_OUTCOMES:
+            self._done.clear()
         if key not in self._done:
             self._restored(row.numpy())
             self._done[key] = bool(self.done(self._env.unwrapped))

@@ -24,6 +24,8 @@ from mirror_ppl.domains.memory import LastSeen
 from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import DomainError
 
+MOST_ACTIONS = 127
+"""Largest number of actions on the grid of controls; files store actions in one byte."""
 PIXELS = 24
 """Width and height of a number in the default picture."""
 VISUAL = "visual"
@@ -112,6 +114,12 @@ class World(ABC):
     def _complete(cls) -> None:
         if "_derived" in vars(cls):
             return
+        if not isinstance(cls.controls, tuple):
+            raise DomainError(f"{cls.__name__}: controls have to be a tuple of Control")
+        if math.prod(one.levels for one in cls.controls) > MOST_ACTIONS:
+            raise DomainError(
+                f"{cls.__name__}: controls have more than {MOST_ACTIONS} combinations of levels"
+            )
         if cls.controls and cls._given("actions"):
             raise DomainError(
                 f"{cls.__name__}: actions are derived from controls; give one of them"

@@ -204,7 +204,11 @@ def executed(domain: Domain, implants: Mapping[str, Tensor], intended: Tensor) -
     if MOTOR_NOISE not in implants:
         return intended
     slips = execution(domain.controls, implants[MOTOR_NOISE])  # [..., P, 1, A, A]
-    return torch.log((intended.exp()[..., None, :] @ slips).squeeze(-2))
+    if slips.shape[-3] == 1:  # the rounds of a person share it
+        found = intended.exp() @ slips.squeeze(-3)
+    else:
+        found = (intended.exp()[..., None, :] @ slips).squeeze(-2)
+    return torch.log(found.clamp(min=torch.finfo(found.dtype).tiny))
 
 
 def residual_implants(domain: Domain, latent: int, like: Tensor) -> dict[str, Tensor]:

@@ -17,7 +17,12 @@ from mirror_ppl.communication import (
     Person,
     SimulatorWorld,
 )
-from mirror_ppl.data import Demonstrations, load_demonstrations, save_demonstrations
+from mirror_ppl.data import (
+    Demonstrations,
+    asset_path,
+    load_demonstrations,
+    save_demonstrations,
+)
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.data.demonstrations import concatenate
 from mirror_ppl.domains import Control, Modality, World, add_domain, get_domain
@@ -31,6 +36,7 @@ from mirror_ppl.domains.controls import (
 from mirror_ppl.errors import DemonstrationsError, DomainError, InputError
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
 from mirror_ppl.models import HumanModel, SelfModel
+from mirror_ppl.models.family import Preferring
 from mirror_ppl.models.implants import MOTOR_NOISE
 from mirror_ppl.models.prior import draw_prior, scalar_sites
 from mirror_ppl.models.variants import NoImplants, OneRadius, PerceptualOnly, PolicyOnly
@@ -259,3 +265,45 @@ def test_noise_of_controls_is_inferred(human):
     fit = mirror_ppl.infer(rounds, human=human, draws=100, explore=0)
     drawn = fit.posterior.draws[MOTOR_NOISE][..., 0]
     assert drawn[:, :2].quantile(0.95) < drawn[:, 2:].quantile(0.05)
+
+
+def test_borders_are_the_same_for_recordings_and_recorders():
+    """0.4 lies between two levels, where 32 and 64 bits may round differently."""
+    controls = (Control("v", -1, 1, 6),)
+    assert action_at(controls, [0.4]) == int(nearest_action(controls, torch.tensor([0.4])))
+    full = (Control("v", -0.1, 0.1),)
+    assert action_at(full, np.array([0.1], np.float32)) == 2
+
+
+def test_controls_of_a_world_without_them_are_refused():
+    driving = load_demonstrations(asset_path("driving_fog_paper.nc")).select_people([0])
+    given = {**driving.variables(), "control": torch.zeros(*driving.shape, 1)}
+    with pytest.raises(DemonstrationsError, match="actions of driving are numbered"):
+        Demonstrations.from_variables("driving", "fog", driving.people, given)
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        (Control("v"), "have to be a tuple"),
+        ((Control("v", levels=12), Control("w", levels=11)), "more than 127 combinations"),
+    ],
+)
+def test_bad_grids_are_refused(controls, message):
+    with pytest.raises(DomainError, match=message):
+        type("Bad", (Slide,), {"controls": controls})()
+
+
+def test_preferences_are_of_what_is_intended(human):
+    """Liking one action hardly makes an imprecise hand precise."""
+    preferring = Preferring(human.self_model)
+    with pyro.plate("person", 1, dim=-2):
+        implants = preferring.prior()
+    for site in preferring.preferences:
+        implants[site] = torch.zeros(1, 1)
+    implants |= {preferring.preferences[0]: torch.full((1, 1), 30.0)}
+    implants |= {MOTOR_NOISE: torch.ones(1, 1)}
+    belief = torch.randn(1, 3, human.belief_size)
+    found = preferring.act(implants, belief, human.action_values(belief)).exp()
+    slips = execution(human.domain.controls, torch.tensor(1.0))[1]
+    assert torch.allclose(found, slips.expand_as(found), atol=1e-4)

@@ -195,3 +195,52 @@ def test_played_controls_are_recorded():
     assert found.controls.flatten().tolist() == pytest.approx([-2.0, 0.3, 1.6, 1.4, 0.0])
     assert found.actions.flatten().tolist() == [0, 2, 4, 3, 2]
     assert check_world(found, 0.0).share == 0
+
+
+class Pair(gym.Env):
+    """Two numbers; the second control of zeros has the bytes of the first action."""
+
+    observation_space = gym.spaces.Box(-9, 9, (2,))
+    action_space = gym.spaces.Box(-2, 2, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = np.ones(2, np.float32)
+        return self.place, {}
+
+    def step(self, action):
+        self.place += action  # in place: what the world gives must not be its own memory
+        return self.place, 0.0, False, False, {}
+
+
+class Two(SteppedWorld):
+    modalities = (Modality("visual", ("place",), ("x", "y"), ("m", "m"), (9.0, 9.0), 0.01),)
+    ego_features = ("nothing",)
+    controls = (Control("x", -2, 2), Control("y", -2, 2))
+    horizon = 2
+
+    def make(self):
+        return Pair()
+
+    def look(self, env):
+        return {"ego": [0.0], "visual": [env.place]}
+
+    def restore(self, env, observation):
+        env.place = observation["visual"][0]
+
+
+def test_an_action_and_control_values_of_the_same_bytes_are_told_apart():
+    two = Two()
+    assert faults_of(two) == []
+    state = two.initial(1, torch.Generator().manual_seed(0))
+    low = two.transition(state, torch.tensor([0]))
+    still = two.transition(state, torch.zeros(1, 2))
+    assert two.observe(low)["visual"].tolist() == [[[-1.0, -1.0]]]
+    assert two.observe(still)["visual"].tolist() == [[[1.0, 1.0]]]
+
+
+def test_no_states_lead_to_none():
+    way = Way()
+    none = way.state_behind({"ego": torch.zeros(0, 1), "visual": torch.zeros(0, 1, 1)})
+    following = way.transition(none, torch.zeros(0, dtype=torch.long))
+    assert following.values.shape == (0, 2) and following.done.dtype == torch.bool

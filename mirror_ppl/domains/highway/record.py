@@ -35,5 +35,5 @@ RECORD = Record(
     measured=100,
     people="mirror_ppl.domains.highway.participants:DRIVERS",
     pictures="mirror_ppl.domains.highway.sight:PICTURES",
-    planning={"predict_with": "values", "items": 2, "min_standard_errors": 0.0},
+    planning={"predict_with": "values", "items": 2},
 )

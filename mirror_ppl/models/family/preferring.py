@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
 
 from mirror_ppl.models.human import HumanModel, Implants
+from mirror_ppl.models.implants import MOTOR_NOISE, executed
 
 SHARES_GOAL = "shares_goal"
 """Site of the factor on the robot's action values."""
@@ -30,7 +33,8 @@ class Preferring(HumanModel):
     @property
     def preferences(self) -> tuple[str, ...]:
         """Names of the sites of preferences, one for each action but the first."""
-        return tuple(PREFERS + action.replace(" ", "_") for action in self.domain.actions[1:])
+        words = (re.sub(r"[^\w-]+", "_", action) for action in self.domain.actions[1:])
+        return tuple(PREFERS + word for word in words)
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person, with their preferences."""
@@ -46,4 +50,9 @@ class Preferring(HumanModel):
         shared = implants[SHARES_GOAL][..., None] * values
         others = [implants[site] for site in self.preferences]
         liked = torch.stack([torch.zeros_like(others[0]), *others], -1)
-        return torch.log_softmax(super().act(implants, belief, shared) + liked, -1)
+        if MOTOR_NOISE not in implants:
+            return torch.log_softmax(super().act(implants, belief, shared) + liked, -1)
+        # People prefer what they intend, and execute it with noise.
+        precise = {site: value for site, value in implants.items() if site != MOTOR_NOISE}
+        intended = torch.log_softmax(super().act(precise, belief, shared) + liked, -1)
+        return executed(self.domain, implants, intended)
