@@ -3,7 +3,7 @@ r"""What messages are worth to highway drivers: the table of docs/highway.md.
     python -m mirror_ppl.fit --domain highway --setting fog --population diverse \
         --train-rounds 20 --explore 0 --out runs/highway_0
     python -m mirror_ppl.assist --posterior runs/highway_0/posterior.nc --rounds 8 \
-        --communicator none nearest mirror oracle --json runs/highway_assist.json
+        --communicator none all nearest mirror oracle --json runs/highway_assist.json
     python -m benchmarks.highway_messages runs/highway_assist.json
 
 The last command writes a row for each communicator to docs/results/highway_messages.csv. Without a

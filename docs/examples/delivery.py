@@ -1,4 +1,4 @@
-"""A drone that somebody steers by joystick: Gymnasium with continuous actions."""
+"""A drone that a person flies by joystick: Gymnasium with continuous actions."""
 
 import gymnasium
 import numpy as np

@@ -53,6 +53,10 @@ class EnvironmentWorld(World):
         del env, action, terminated
         return {self.reward_terms[0]: reward}
 
+    @property
+    def _moves(self) -> tuple[int, ...]:
+        return self.moves or tuple(range(len(self.actions)))
+
     def commands(self, env: gym.Env) -> list[Any]:
         """Return the environment's action for each of the world's.
 
@@ -79,7 +83,7 @@ class EnvironmentWorld(World):
                 f"{self.name}: expected actions that are numbered (Discrete), found {space}; give "
                 "controls instead of actions"
             )
-        moves = self.moves or tuple(range(len(self.actions)))
+        moves = self._moves
         if len(moves) != len(self.actions):
             raise DomainError(f"{self.name}: {len(self.actions)} actions, but {len(moves)} moves")
         if max(moves) >= space.n:
@@ -96,7 +100,7 @@ class EnvironmentWorld(World):
             InputError: people have no such action.
         """
         if not self.controls:
-            moves = self.moves or tuple(range(len(self.actions)))
+            moves = self._moves
             if command not in moves:
                 raise InputError(f"action has to be one of {moves} (moves), not {command!r}")
             return moves.index(command), None

@@ -47,7 +47,6 @@ class Walk(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.place = int(self.np_random.integers(8))
-        self.drift = 0.0
         return np.array([self.place]), {}
 
     def step(self, action):
