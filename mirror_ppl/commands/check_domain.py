@@ -80,7 +80,8 @@ def _show(world: World) -> None:
     from rich.table import Table
 
     from mirror_ppl.console import console_for_tables
-    from mirror_ppl.domains.checking import capabilities
+    from mirror_ppl.domains.checking import capabilities, remarks_on
+    from mirror_ppl.domains.controls import bounds_in_words
 
     table = Table(title=f"{world.name}: nothing wrong", box=SIMPLE_HEAD, title_justify="left")
     for column in ("capability", "here", "what it gives"):
@@ -90,7 +91,11 @@ def _show(world: World) -> None:
     console_for_tables(100).print(table)
     items = ", ".join(f"{len(m.items)} {m.name}" for m in world.modalities)
     reach = ", ".join(f"{edge:g}" for edge in world.reach_bins)
-    print(f"items: {items}; actions: {', '.join(world.actions)}; {world.horizon} steps a round")
+    actions = f"actions: {', '.join(world.actions)}"
+    if world.controls:
+        actions = f"controls: {bounds_in_words(world.controls)}; {len(world.actions)} actions"
+    print(f"items: {items}; {actions}; {world.horizon} steps a round")
     print(
         f"settings: {', '.join(world.settings)}; thresholds of sight ({world.reach_unit}): {reach}"
     )
+    print(remarks_on(world))

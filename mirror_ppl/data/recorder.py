@@ -91,17 +91,26 @@ class Recorder(gym.Wrapper):
         """Play one step; see `gymnasium.Env.step`.
 
         Raises:
-            InputError: the round has not begun or is over, or the world has no such action.
+            InputError: the round has not begun or is over, the world has no such action, or the
+                environment terminates where the world does not, or not where it does.
         """
         if not self._rounds or self._rounds[-1].over:
             raise InputError("the round is over or has not begun; call reset()")
         number, control = self.world.action_of(action)
         found, reward, terminated, truncated, info = self.env.step(action)
         now = self._rounds[-1]
-        now.add(number, control, self._told, self.world.look(self.env.unwrapped))
+        seen = self.world.look(self.env.unwrapped)
+        terms = self.world.terms(self.env.unwrapped, action, float(reward), bool(terminated))
+        now.add(number, control, self._told, sum(terms.values()), seen)
         self._told = []
         truncated = truncated or len(now.actions) == self.world.horizon
         now.over = terminated or truncated
+        if self.world.terminates(seen) != terminated:
+            ended = "has terminated" if terminated else "has not terminated"
+            raise InputError(
+                f"the environment {ended} after step {len(now.actions) - 1}, but {self.world.name} "
+                "says otherwise (done); mend the world, as the recording contradicts it"
+            )
         return found, float(reward), terminated, truncated, info
 
     def recordings(self) -> Demonstrations:
@@ -118,6 +127,7 @@ class Recorder(gym.Wrapper):
         number, steps = max(map(len, own.values())), max(len(one.actions) for one in rounds)
         shape = (len(people), number)
         actions = np.full((*shape, steps), -1)
+        rewards = np.full((*shape, steps), np.nan)
         lengths = np.zeros(shape, int)
         controls = np.full((*shape, steps, len(self.world.controls)), np.nan)
         first = rounds[0].seen[0]
@@ -132,6 +142,7 @@ class Recorder(gym.Wrapper):
             for place, one in enumerate(own[name]):
                 lengths[person, place] = length = len(one.actions)
                 actions[person, place, :length] = one.actions
+                rewards[person, place, :length] = one.rewards
                 if self.world.controls:
                     controls[person, place, :length] = one.controls
                 for key, values in seen.items():
@@ -147,6 +158,7 @@ class Recorder(gym.Wrapper):
             observations={name: torch.from_numpy(part) for name, part in seen.items()},
             actions=torch.from_numpy(actions),
             controls=torch.from_numpy(controls) if self.world.controls else None,
+            rewards=torch.from_numpy(rewards),
             round_counts=torch.tensor([len(own[name]) for name in people]),
             lengths=torch.from_numpy(lengths),
             told={name: torch.from_numpy(part) for name, part in told.items()},
@@ -154,7 +166,7 @@ class Recorder(gym.Wrapper):
 
 
 class _Round:
-    """A round in progress: observations, messages and actions."""
+    """A round in progress: observations, messages, actions and rewards."""
 
     def __init__(self, person: str, first: Mapping[str, Any]) -> None:
         self.person, self.over = person, False
@@ -162,17 +174,20 @@ class _Round:
         self.actions: list[int] = []
         self.controls: list[np.ndarray | None] = []
         self.told: list[Sequence[tuple[str, int]]] = []
+        self.rewards: list[float] = []
 
     def add(
         self,
         action: int,
         control: np.ndarray | None,
         told: Sequence[tuple[str, int]],
+        reward: float,
         now: Mapping[str, Any],
     ) -> None:
         self.actions.append(action)
         self.controls.append(control)
         self.told.append(told)
+        self.rewards.append(reward)
         self.seen.append(_copied(now))
 
 

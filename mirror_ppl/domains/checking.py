@@ -17,6 +17,8 @@ from mirror_ppl.user_code import describe
 
 ROUNDS = 6
 """Number of rounds that a check plays."""
+REMARKED = 100
+"""Number of rounds on which remarks rest."""
 TOLERANCE = 1e-4
 
 
@@ -83,7 +85,7 @@ def faults_of(world: World) -> list[str]:
         return faults
     try:
         with torch.random.fork_rng(devices=[]):
-            for check in (_begins, _goes_on, _looks):
+            for check in (_begins, _goes_on, _of_its_own, _looks):
                 faults += check(world)
                 if faults:
                     return faults
@@ -265,6 +267,29 @@ def _looks(world: World) -> list[str]:
     if offers(world, "reflected"):
         found += _faults_of_reflection(world, along, observation)
     return [fault for fault in found if fault] or _of_one(world, along, observation)
+
+
+def _of_its_own(world: World) -> list[str]:
+    return _call(world, "own_faults")
+
+
+def remarks_on(world: World) -> str:
+    """Return what random rounds of a sound world are like: rewards a step, how many ended."""
+    generator = torch.Generator().manual_seed(1)
+    state = world.initial(REMARKED, generator)
+    ended, earned = world.over(state), []
+    for _ in range(world.horizon):
+        action = torch.randint(len(world.actions), (REMARKED,), generator=generator)
+        following = world.transition(state, action)
+        total = torch.stack([*world.rewards(state, action, following).values()]).sum(0)
+        earned += total[~ended].tolist()
+        state, ended = following, ended | world.over(following)
+    number = int(ended.sum())
+    remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
+    if not offers(world, "over"):
+        return remark
+    remark += f"; {number} of {REMARKED} rounds ended"
+    return remark if number else f"{remark}: what is so at an end was not checked"
 
 
 def _faults_of_reflection(

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ class Control:
     unit: str = ""
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.levels, int) and self.levels > 1):
+        if not (isinstance(self.levels, Integral) and self.levels > 1):
             raise DomainError(f"{self.name}: expected 2 or more levels, found {self.levels!r}")
         if not self.low < self.high < float("inf") or self.low == -float("inf"):
             raise DomainError(
@@ -119,12 +120,12 @@ def action_at(controls: Sequence[Control], given: Any) -> int:
         values = torch.from_numpy(np.asarray(given, float))
     except (TypeError, ValueError):
         values = torch.empty(0)
-    if values.shape != (len(controls),) or not bool(within_bounds(controls, values).all()):
-        own = given if not hasattr(given, "tolist") else given.tolist()
-        raise InputError(
-            f"the action has to be {len(controls)} numbers ({bounds_in_words(controls)}), not "
-            f"{shown(own)}"
-        )
+    expected = f"expected an action of shape ({len(controls)},), {bounds_in_words(controls)}"
+    own = given if not hasattr(given, "tolist") else given.tolist()
+    if values.shape != (len(controls),):
+        raise InputError(f"{expected}; found {shown(own)}")
+    if not bool(within_bounds(controls, values).all()):
+        raise InputError(f"{expected}; {shown(own)} is out of bounds")
     return int(nearest_action(controls, values))
 
 

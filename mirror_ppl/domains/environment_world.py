@@ -1,9 +1,10 @@
-"""What worlds of Gymnasium environments have in common: how one is made, looked at and stepped."""
+"""What worlds of Gymnasium environments share: one is made, looked at, stepped and checked."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from copy import copy
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +19,10 @@ from mirror_ppl.errors import DomainError, InputError
 CLOSE = 1e-6
 """Largest difference between rewards that count as equal."""
 UNSEEN = "something that matters cannot be observed"
+PLAYED = 6
+"""Number of rounds that a check plays."""
+TOLERANCE = 1e-4
+"""Differences up to this, and to this share of a value, are rounding."""
 
 
 class EnvironmentWorld(World):
@@ -31,10 +36,12 @@ class EnvironmentWorld(World):
         moves: the environment's actions that people may take, in the order of ``actions``; the
             first ones unless given. Without meaning where there are ``controls``.
         layouts: number of resets, with the seeds 0, 1 and so on.
+        likely_cause: what messages name where outcomes are not those of the environment.
     """
 
     moves: tuple[int, ...] = ()
     layouts: int = 20
+    likely_cause = UNSEEN
 
     @abstractmethod
     def make(self) -> gym.Env:
@@ -104,7 +111,59 @@ class EnvironmentWorld(World):
             if command not in moves:
                 raise InputError(f"action has to be one of {moves} (moves), not {command!r}")
             return moves.index(command), None
-        return action_at(self.controls, command), np.array(command, float)
+        low, high = np.transpose([(one.low, one.high) for one in self.controls])
+        return action_at(self.controls, command), np.array(command, float).clip(low, high)
+
+    def terminates(self, observation: Mapping[str, Any]) -> bool:
+        """True if the task is done where `look` returns this observation."""
+        return bool(self.over(self.state_behind(as_tensors(observation))))
+
+    def own_faults(self) -> list[str]:
+        """Return the first fault found in rounds of random actions, played from resets on.
+
+        The environment is not put anywhere: each step has to be the one that the world computes
+        from what was observed before it.
+        """
+        env, chooser = self.make(), np.random.default_rng(0)
+        for seed in range(min(PLAYED, self.layouts)):
+            env.reset(seed=seed)
+            if self.terminates(self.look(env.unwrapped)):
+                return [f"the task is done where rounds begin (seed {seed})"]
+            for step in range(self.horizon):
+                fault, end = self._fault_of_step(env, chooser)
+                if fault:
+                    return [f"step {step} after reset(seed={seed}): {fault}"]
+                if end:
+                    break
+        return []
+
+    def _fault_of_step(self, env: gym.Env, chooser: np.random.Generator) -> tuple[str, bool]:
+        """Take a random step; return what the world computes otherwise, and whether it ended."""
+        before = as_tensors(self.look(env.unwrapped))
+        number = int(chooser.integers(len(self.actions)))
+        command, action = self.commands(env)[number], torch.tensor(number)
+        if self.controls:
+            low, high = np.transpose([(one.low, one.high) for one in self.controls])
+            command = chooser.uniform(low, high).astype(command.dtype)
+            action = torch.from_numpy(command).to(before["ego"])
+        _, reward, end, cut, _ = env.step(copy(command))
+        own = self.terms(env.unwrapped, command, float(reward), bool(end))
+        found = as_tensors(self.look(env.unwrapped)) | as_tensors(own)
+        state = self.state_behind(before)
+        following = self.transition(state, action)
+        computed = {**self.observe(following), **self.rewards(state, action, following)}
+        for name, value in found.items():
+            if bool(((computed[name] - value).abs() > TOLERANCE * (1 + value.abs())).any()):
+                return (
+                    f"after {command}, {name} is {value.tolist()} in the environment, but computed "
+                    f"as {computed[name].tolist()}; {self.likely_cause}"
+                ), False
+        if bool(end) != bool(self.over(following)):
+            ended = "has terminated" if end else "has not terminated"
+            return f"after {command} the environment {ended}, but the world says otherwise", False
+        if cut and not end:
+            return "the environment ends the round here; horizon has to be that of it", False
+        return "", bool(end)
 
 
 def as_tensors(observation: Mapping[str, Any]) -> dict[str, Tensor]:

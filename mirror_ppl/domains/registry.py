@@ -54,6 +54,10 @@ def load_world(specification: str | type[World] | World) -> World:
             raise DomainError(f"{shown(world)} is not of the form path/to/file.py:Class")
         world = class_in_file(Path(path), kind, World, DomainError)
     if isinstance(world, type) and issubclass(world, World):
+        if missing := sorted(world.__abstractmethods__):
+            raise DomainError(
+                f"{world.__name__} needs {', '.join(missing)}; see docs/adding_a_world.md"
+            )
         try:
             world = world()
         except DomainError:

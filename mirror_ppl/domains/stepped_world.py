@@ -21,7 +21,14 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation
-from mirror_ppl.domains.environment_world import CLOSE, UNSEEN, EnvironmentWorld, as_tensors
+from mirror_ppl.domains.controls import bounds_in_words, within_bounds
+from mirror_ppl.domains.environment_world import (
+    CLOSE,
+    TOLERANCE,
+    UNSEEN,
+    EnvironmentWorld,
+    as_tensors,
+)
 from mirror_ppl.errors import DomainError
 
 CACHED = ("_env", "_commands", "_sizes", "_outcomes", "_starts", "_done", "_left_to_try", "_dtype")
@@ -30,7 +37,6 @@ MOST_OUTCOMES = 500_000
 """Number of outcomes that are kept."""
 TRIED_TWICE = 100
 """Number of outcomes that are computed twice, to detect what cannot be observed."""
-TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,7 @@ class SteppedWorld(EnvironmentWorld):
     """
 
     layouts = 1000
+    likely_cause = f"restore() does not set all that step() reads, or {UNSEEN}"
 
     @abstractmethod
     def restore(self, env: Any, observation: Mapping[str, np.ndarray]) -> None:
@@ -146,6 +153,11 @@ class SteppedWorld(EnvironmentWorld):
             key = kind + row.tobytes() + deed.tobytes()
             outcome = outcomes.get(key)
             if outcome is None:
+                if continuous and not bool(within_bounds(self.controls, torch.tensor(deed)).all()):
+                    raise DomainError(
+                        f"{self.name}: controls are {bounds_in_words(self.controls)}, not "
+                        f"{deed.tolist()}"
+                    )
                 command = deed if continuous else self._commands[int(deed[0])]
                 outcome = outcomes[key] = self._tried(row, command)
             found.append(outcome)
@@ -161,11 +173,6 @@ class SteppedWorld(EnvironmentWorld):
         if self._left_to_try:
             self._left_to_try.pop()
             again = self._step(row, command)
-            for one, other in zip(found, again, strict=True):
-                if np.abs(np.subtract(one, other, dtype=float)).max() > CLOSE:
-                    raise DomainError(
-                        f"{self.name}: outcomes of {command} in {row.tolist()} vary; {UNSEEN}"
-                    )
             reached, _, _ = found
             self._restored(reached)
             off = np.abs(self._look() - reached) > TOLERANCE * (1 + np.abs(reached))
@@ -174,6 +181,12 @@ class SteppedWorld(EnvironmentWorld):
                     f"{self.name}: restore() of the observation {reached.tolist()} leads to "
                     f"{self._look().tolist()}"
                 )
+            for one, other in zip(found, again, strict=True):
+                if np.abs(np.subtract(one, other, dtype=float)).max() > CLOSE:
+                    raise DomainError(
+                        f"{self.name}: outcomes of {command} in {row.tolist()} vary; "
+                        f"{self.likely_cause}"
+                    )
         return found
 
     def _step(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
@@ -186,6 +199,11 @@ class SteppedWorld(EnvironmentWorld):
                 f"{command} in {row.tolist()}, but done() says otherwise"
             )
         own = self.terms(inner, command, float(reward), end)
+        if set(own) != set(self.reward_terms):
+            raise DomainError(
+                f"{self.name}: terms() has {', '.join(own)}, expected "
+                f"{', '.join(self.reward_terms)} (reward_terms)"
+            )
         earned = np.array([own[name] for name in self.reward_terms], float)
         return self._look(), end, earned
 

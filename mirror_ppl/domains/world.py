@@ -9,7 +9,6 @@ step-by-step guide.
 from __future__ import annotations
 
 import math
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
@@ -19,16 +18,14 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
-from mirror_ppl.domains.controls import Control, action_names, grid
+from mirror_ppl.domains.controls import Control, grid
+from mirror_ppl.domains.derived import VISUAL, complete
 from mirror_ppl.domains.memory import LastSeen
 from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import DomainError
 
-MOST_ACTIONS = 127
-"""Largest number of actions on the grid of controls; files store actions in one byte."""
 PIXELS = 24
 """Width and height of a number in the default picture."""
-VISUAL = "visual"
 
 
 class World(ABC):
@@ -107,60 +104,12 @@ class World(ABC):
             DomainError: a required attribute is missing.
         """
         del args, kwargs
-        cls._complete()
+        if "_derived" not in vars(cls):
+            cls._derived = complete(cls)
         return super().__new__(cls)
 
     @classmethod
-    def _complete(cls) -> None:
-        if "_derived" in vars(cls):
-            return
-        if not isinstance(cls.controls, tuple):
-            raise DomainError(f"{cls.__name__}: controls have to be a tuple of Control")
-        if math.prod(one.levels for one in cls.controls) > MOST_ACTIONS:
-            raise DomainError(
-                f"{cls.__name__}: controls have more than {MOST_ACTIONS} combinations of levels"
-            )
-        if cls.controls and cls._given("actions"):
-            raise DomainError(
-                f"{cls.__name__}: actions are derived from controls; give one of them"
-            )
-        for name in ("modalities", "ego_features", "actions", "horizon"):
-            if not (hasattr(cls, name) or (name == "actions" and cls.controls)):
-                raise DomainError(f"{cls.__name__} needs {name}; see docs/adding_a_world.md")
-        visual = [m for m in cls.modalities if m.name == VISUAL]
-        if len(visual) != 1:
-            names = ", ".join(m.name for m in cls.modalities) or "none"
-            raise DomainError(f'{cls.__name__}: one modality has to be "{VISUAL}", found {names}')
-        features = visual[0].features
-        for name in cls.positions:
-            require_known(name, "position", features, cls.__name__)
-        sizes = [visual[0].scales[features.index(name)] for name in cls.positions]
-        units = {visual[0].units[features.index(name)] for name in cls.positions}
-        bins = tuple(float(number) for number in range(int(max(sizes, default=1)) + 1))
-        made: dict[str, Any] = {
-            "name": re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower(),
-            "reach_bins": bins,
-            "reach_unit": units.pop() if len(units) == 1 else "steps",
-            "mishap": (cls.reward_terms[0], f"steps with less {cls.reward_terms[0]} than 0"),
-            "counterparts": (None,) * len(visual[0].items),
-            "symbol_sizes": {
-                name: sum(len(levels or (0,)) for levels in each)
-                for name, each in cls._levels().items()
-            },
-        }
-        if cls.controls:
-            made["actions"] = action_names(cls.controls)
-        derived = [name for name in made if not cls._given(name)]
-        for name in derived:
-            setattr(cls, name, made[name])
-        if not cls._given("partial_views"):
-            middle = cls.reach_bins[len(cls.reach_bins) // 2]
-            cls.partial_views = {"half_the_reach": (middle,) * len(cls.directions)}
-            derived.append("partial_views")
-        cls._derived = frozenset(derived)
-
-    @classmethod
-    def _given(cls, name: str) -> bool:
+    def given(cls, name: str) -> bool:
         """True if an attribute was given, not derived, in this class or a base class."""
         return any(
             name in vars(each) and name not in vars(each).get("_derived", ())
@@ -168,7 +117,7 @@ class World(ABC):
         )
 
     @classmethod
-    def _levels(cls) -> Mapping[str, Sequence[range | None]]:
+    def levels_of_features(cls) -> Mapping[str, Sequence[range | None]]:
         """Return the levels of each feature by modality; for utterances, the sentence indices."""
         return {"ego": [cls.levels.get(name) for name in cls.ego_features]} | {
             m.name: [range(len(m.utterances[0]))]
@@ -247,11 +196,15 @@ class World(ABC):
         """Return items ``[..., K]`` that may be communicated: all."""
         return self._all(observation, lambda m: True)
 
+    def own_faults(self) -> list[str]:
+        """Return what is wrong with the world by checks of its own; `check_domain` prints it."""
+        return []
+
     def faults(self, observation: Observation) -> dict[str, Tensor]:
         """Return impossible observations ``[...]``: those with a feature outside its levels."""
         found = {}
         names = {"ego": self.ego_features} | {m.name: m.features for m in self.modalities}
-        for modality, levels in self._levels().items():
+        for modality, levels in self.levels_of_features().items():
             for place, (feature, known) in enumerate(zip(names[modality], levels, strict=True)):
                 if known is not None:
                     wrong = (observation[modality][..., place] - known[0]) / known.step
@@ -315,7 +268,7 @@ class World(ABC):
                 ],
                 -1,
             )
-            for modality, levels in self._levels().items()
+            for modality, levels in self.levels_of_features().items()
         }
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
@@ -348,7 +301,7 @@ class World(ABC):
             modality: torch.stack(
                 [possible(observation[modality][..., i], each) for i, each in enumerate(levels)], -1
             )
-            for modality, levels in self._levels().items()
+            for modality, levels in self.levels_of_features().items()
         }
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:

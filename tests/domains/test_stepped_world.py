@@ -1,6 +1,7 @@
 """Gymnasium environments that are stepped when needed: equal to the environment, and refusals."""
 
 import pickle
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -10,8 +11,9 @@ import torch
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.domains import Control, Modality, add_domain
-from mirror_ppl.domains.checking import faults_of
+from mirror_ppl.domains.checking import faults_of, remarks_on
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
+from mirror_ppl.domains.registry import load_world
 from mirror_ppl.domains.stepped_world import SteppedWorld
 from mirror_ppl.errors import DomainError, InputError
 
@@ -135,6 +137,45 @@ class Forgetful(Way):
         env.place = 0
 
 
+class Idle(Way):
+    def restore(self, env, observation):
+        pass
+
+
+class Sliding(Walk):
+    """Who goes slides on, faster from step to step."""
+
+    def reset(self, *, seed=None, options=None):
+        self.speed = 0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.speed += int(action)
+        return super().step(self.speed)
+
+
+class Unseen(Way):
+    """The speed is neither observed nor restored as it was."""
+
+    def make(self):
+        return Sliding()
+
+    def restore(self, env, observation):
+        super().restore(env, observation)
+        env.speed = 0
+
+
+class Arrived(Walk):
+    def reset(self, *, seed=None, options=None):
+        self.place = 10
+        return np.array([10]), {}
+
+
+class Named(Way):
+    def terms(self, env, action, reward, terminated):
+        return {"walked": reward}
+
+
 class Random(Walk):
     def step(self, action):
         self.place += int(self.np_random.integers(5))
@@ -150,7 +191,16 @@ class Endless(Way):
     ("kind", "changes", "message"),
     [
         (Forgetful, {}, "restore.. of the observation"),
-        (Way, {"make": lambda self: Random()}, "something that matters cannot be observed"),
+        (Idle, {}, "restore.. of the observation"),
+        (Way, {"make": lambda self: Random()}, "vary; restore.. does not set all"),
+        (
+            Unseen,
+            {},
+            r"step 1 after reset.seed=\d.: after \d, ego is .* but computed as .*restore..",
+        ),
+        (Way, {"make": lambda self: gym.wrappers.TimeLimit(Walk(), 4)}, "step 3 .*horizon has to"),
+        (Named, {}, "terms.. has walked, expected reward"),
+        (Way, {"make": lambda self: Arrived()}, "done where rounds begin .seed 0"),
         (Endless, {"horizon": 12}, "but done.. says otherwise"),
         (Way, {"look": lambda self, env: {"ego": [0.0, 1.0], "visual": [[0.0]]}}, "look.. has ego"),
         (Way, {"moves": (0, 2)}, "the environment has 2 actions, from 0 on, and no 2"),
@@ -163,6 +213,46 @@ def test_faults_of_environments_are_named(kind, changes, message):
         world = type("Other", (kind,), changes)()
         found = faults_of(world)
         raise DomainError(found[0] if found else "nothing wrong")
+
+
+def test_what_a_world_needs_is_named():
+    kind = type("Half", (Way,), {"restore": SteppedWorld.restore})
+    with pytest.raises(DomainError, match="Half needs restore; see docs"):
+        load_world(kind)
+
+
+def test_remarks_say_whether_ends_were_checked():
+    remark = remarks_on(Way())
+    assert remark.startswith("random actions: rewards 0 to 1 a step; ")
+    assert re.search(r"; [1-9]\d* of 100 rounds ended$", remark)
+    assert remarks_on(Swing()).endswith(
+        "0 of 100 rounds ended: what is so at an end was not checked"
+    )
+
+
+def test_recorded_rounds_end_where_the_world_says_so():
+    way = Endless()
+    env = Recorder(way.make(), way)
+    env.reset(seed=next(seed for seed in range(99) if _place(way, seed) == 7))
+    env.step(1)
+    env.step(1)
+    with pytest.raises(InputError, match=r"has terminated after step 2, but endless .*done"):
+        env.step(1)
+
+
+def _place(way, seed):
+    env = way.make()
+    env.reset(seed=seed)
+    return env.place
+
+
+def test_controls_outside_the_bounds_are_not_stepped():
+    swing = Swing()
+    state = swing.initial(1, torch.Generator().manual_seed(0))
+    with pytest.raises(DomainError, match=r"controls are torque -2 to 2, not \[3.0\]"):
+        swing.transition(state, torch.tensor([[3.0]]))
+    number, control = swing.action_of(np.array([2.0001]))
+    assert (number, control.tolist()) == (4, [2.0])  # within a thousandth of a level
 
 
 def test_tables_are_for_numbered_actions():
@@ -183,16 +273,17 @@ def test_played_controls_are_recorded():
     swing = add_domain(Swing)
     env = Recorder(swing.make(), swing, person="ada")
     env.reset(seed=5)
-    for torque in (-2.0, 0.3, 1.6, 1.4, 0.0):
-        env.step(np.array([torque], np.float32))
+    torques = (-2.0, 0.3, 1.6, 1.4, 0.0)
+    earned = [env.step(np.array([torque], np.float32))[1] for torque in torques]
     with pytest.raises(InputError, match="over"):
         env.step(np.zeros(1))
     env.reset()
-    with pytest.raises(InputError, match=r"1 numbers \(torque -2 to 2\)"):
+    with pytest.raises(InputError, match=r"shape \(1,\), torque -2 to 2; \[5.0\] is out of bounds"):
         env.step(np.array([5.0]))
     found = env.recordings()
     assert found.controls.flatten().tolist() == pytest.approx([-2.0, 0.3, 1.6, 1.4, 0.0])
     assert found.actions.flatten().tolist() == [0, 2, 4, 3, 2]
+    assert found.rewards.flatten().tolist() == pytest.approx(earned)
     assert check_world(found, 0.0).share == 0
 
 
