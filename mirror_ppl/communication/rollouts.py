@@ -25,6 +25,8 @@ from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
 
 NAMES = 2**62
+FUTURES = 8
+"""Number of futures that are predicted in worlds where something happens by chance."""
 """Maximum number of paths, so that names fit into integers."""
 
 
@@ -208,19 +210,23 @@ class SimulatorWorld:
     """The domain's own simulator, from the state behind the last observation.
 
     Args:
-        domain: the world; its transitions are deterministic, so there is one draw.
+        domain: the world; there is one draw unless it is ``random``.
     """
-
-    draws = 1
 
     def __init__(self, domain: Domain) -> None:
         require_methods(domain, ["transition", "state_behind"], "domain", "a domain")
         self.domain = domain
+        self.draws = FUTURES if domain.random else 1
 
     def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
-        """Return the rollouts; the generator is not used, see :class:`World`."""
-        now = {name: value[None, None] for name, value in past.now.items()}
+        """Return the rollouts, see :class:`World`."""
+        now = {
+            name: value[None, None].expand(self.draws, 1, *value.shape)
+            for name, value in past.now.items()
+        }
         state = self.domain.state_behind(now)
+        if self.domain.random:
+            state = self.domain.redrawn(state, generator)
         return RolloutTree(self, state, now, len(self.domain.actions), horizon)
 
     def observe(self, state: Any) -> Observation:

@@ -178,7 +178,8 @@ class Domain(Protocol):
     together determine every item. ``mishap`` is the reward term of a harmful event, and the plural
     of its name. ``counterparts`` has for each visual item the verbal item about the same thing, if
     that is more informative. ``record`` holds settings of other parts of the package. In a world
-    that is ``partly_observed``, observations do not determine states, and `state_behind` estimates.
+    that is ``partly_observed``, observations do not determine states, and `state_behind` estimates;
+    that is so in ``random`` worlds, whose states hold a seed of what will happen by chance.
     ``controls`` are what people set where actions are continuous; ``actions`` are then a grid of
     their values. `transition`, `rewards` and `next_observation` also take what was executed:
     control values ``[..., C]`` of numbers with a point.
@@ -211,6 +212,7 @@ class Domain(Protocol):
     assumptions: tuple[str, ...]
     settled: bool
     partly_observed: bool
+    random: bool
 
     @property
     def as_believed(self) -> Domain:
@@ -233,6 +235,10 @@ class Domain(Protocol):
 
     def rewards(self, state: Any, action: Tensor, following: Any) -> dict[str, Tensor]:
         """Return reward terms by name, each ``[...]``; the task reward is their sum."""
+        ...
+
+    def redrawn(self, state: Any, generator: torch.Generator) -> Any:
+        """Return states ``[...]`` that differ in what will happen by chance alone."""
         ...
 
     def over(self, state: Any) -> Tensor:

@@ -242,6 +242,8 @@ def _looks(world: World) -> list[str]:
     for name, value in symbols.items():
         size = world.symbol_sizes[name]
         found.append(_fault("symbols", name, value, (*expected[name][:-1], size), float))
+    if world.random:
+        found.append(_fault_of_chance(world, along, observation, torch.stack(actions, 1)))
     behind = _call(world, "state_behind", observation)
     if type(behind) is not type(along):
         return [f"state_behind: expected {_kind(along)}, found {_kind(behind)}"]
@@ -290,6 +292,22 @@ def remarks_on(world: World) -> str:
         return remark
     remark += f"; {number} of {REMARKED} rounds ended"
     return remark if number else f"{remark}: what is so at an end was not checked"
+
+
+def _fault_of_chance(
+    world: World, states: Any, observation: Mapping[str, Tensor], actions: Tensor
+) -> str:
+    """Return the fault of `World.redrawn`: it has to change what follows, and nothing else."""
+    others = _call(world, "redrawn", states, torch.Generator().manual_seed(3))
+    for name, value in _call(world, "observe", others).items():
+        if not torch.equal(value, observation[name]):
+            return f"redrawn: changes {name}, expected states that look alike"
+    following = _call(world, "transition", map_state(lambda part: part[:, :-1], others), actions)
+    same = [
+        torch.equal(value, observation[name][:, 1:])
+        for name, value in _call(world, "observe", following).items()
+    ]
+    return "random: what follows is the same in states of redrawn()" * all(same)
 
 
 def _faults_of_reflection(

@@ -29,8 +29,7 @@ class EnvironmentWorld(World):
     """Base class of :class:`~mirror_ppl.domains.gymnasium_world.GymnasiumWorld` and
     :class:`~mirror_ppl.domains.stepped_world.SteppedWorld`.
 
-    The environment has to be deterministic between resets, and unobserved parts of its state must
-    not matter.
+    Unobserved parts of the environment's state must not matter.
 
     Attributes:
         moves: the environment's actions that people may take, in the order of ``actions``; the
@@ -41,7 +40,7 @@ class EnvironmentWorld(World):
 
     moves: tuple[int, ...] = ()
     layouts: int = 20
-    likely_cause = UNSEEN
+    likely_cause: str = UNSEEN
 
     @abstractmethod
     def make(self) -> gym.Env:
@@ -114,6 +113,9 @@ class EnvironmentWorld(World):
         low, high = np.transpose([(one.low, one.high) for one in self.controls])
         return action_at(self.controls, command), np.array(command, float).clip(low, high)
 
+    def seed_chance(self, env: gym.Env, state: Any) -> None:
+        """Let an environment draw in its next step what the state holds; nothing is drawn here."""
+
     def terminates(self, observation: Mapping[str, Any]) -> bool:
         """True if the task is done where `look` returns this observation."""
         return bool(self.over(self.state_behind(as_tensors(observation))))
@@ -146,10 +148,11 @@ class EnvironmentWorld(World):
             low, high = np.transpose([(one.low, one.high) for one in self.controls])
             command = chooser.uniform(low, high).astype(command.dtype)
             action = torch.from_numpy(command).to(before["ego"])
+        state = self.state_behind(before)
+        self.seed_chance(env, state)
         _, reward, end, cut, _ = env.step(copy(command))
         own = self.terms(env.unwrapped, command, float(reward), bool(end))
         found = as_tensors(self.look(env.unwrapped)) | as_tensors(own)
-        state = self.state_behind(before)
         following = self.transition(state, action)
         computed = {**self.observe(following), **self.rewards(state, action, following)}
         for name, value in found.items():

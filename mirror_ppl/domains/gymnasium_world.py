@@ -274,6 +274,8 @@ def _visited(world: GymnasiumWorld) -> Tables:
     env = world.make()
     if world.controls:
         raise DomainError(f"{world.name}: a world with controls has to be a SteppedWorld")
+    if world.random:
+        raise DomainError(f"{world.name}: a random world has to be a SteppedWorld")
     moves = world.commands(env)
     numbers: dict[bytes, int] = {}
     seen: list[dict[str, Tensor]] = []

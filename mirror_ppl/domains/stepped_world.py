@@ -4,6 +4,8 @@ Inference and planning need pure functions of states. Here a state is the full o
 the environment is put there, stepped once, and looked at. Outcomes are kept, as the same ones are
 asked for again and again. This takes environments with any number of states and with continuous
 actions, and a few hundredths of a millisecond more than a step of the environment.
+
+Where steps draw from the environment's generator, a state also holds the seed of the next draw.
 """
 
 from __future__ import annotations
@@ -11,9 +13,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
+from zlib import crc32
 
 import gymnasium as gym
 import numpy as np
@@ -35,6 +38,8 @@ CACHED = ("_env", "_commands", "_sizes", "_outcomes", "_starts", "_done", "_left
 """Attributes that are of one process: the environment, and what was seen of it."""
 MOST_OUTCOMES = 500_000
 """Number of outcomes that are kept."""
+SEEDS = 2**31
+"""Number of seeds of what happens by chance."""
 TRIED_TWICE = 100
 """Number of outcomes that are computed twice, to detect what cannot be observed."""
 
@@ -46,21 +51,26 @@ class Moment:
     Attributes:
         values: flattened and joined in the order of names, ``[..., N]``.
         done: where the task is done, ``[...]``.
+        seed: of what the next step draws, ``[...]``; 0 in worlds that are not random.
     """
 
     values: Tensor
     done: Tensor
+    seed: Tensor
 
 
 class SteppedWorld(EnvironmentWorld):
     """Base class of a world from a Gymnasium environment of any size; derive from it.
 
     Implement ``make()``, ``look(env)`` and :meth:`restore`; also :meth:`done` where rounds can end
-    before the horizon.
+    before the horizon. ``random = True`` is for environments whose steps draw from ``np_random``.
     """
 
     layouts = 1000
-    likely_cause = f"restore() does not set all that step() reads, or {UNSEEN}"
+    likely_cause = (
+        "restore() does not set all that step() reads, steps draw random numbers (random), or "
+        f"{UNSEEN}"
+    )
 
     @abstractmethod
     def restore(self, env: Any, observation: Mapping[str, np.ndarray]) -> None:
@@ -94,7 +104,15 @@ class SteppedWorld(EnvironmentWorld):
             self._env.reset(seed=seed)
             self._starts[seed] = torch.from_numpy(self._look())
         values = torch.stack([self._starts[seed] for seed in seeds]).to(device)
-        return Moment(values, torch.zeros(batch, dtype=torch.bool, device=device))
+        begun = torch.zeros(batch, dtype=torch.bool, device=device)
+        return self.redrawn(Moment(values, begun, begun.long()), generator)
+
+    def redrawn(self, state: Moment, generator: torch.Generator) -> Moment:
+        """Draw seeds anew if the world is random."""
+        if not self.random:
+            return state
+        shape, device = state.seed.shape, generator.device
+        return replace(state, seed=torch.randint(SEEDS, shape, generator=generator, device=device))
 
     def transition(self, state: Moment, action: Tensor) -> Moment:
         """Step the environment; a task that is done stays as it is."""
@@ -125,11 +143,25 @@ class SteppedWorld(EnvironmentWorld):
         shape = observation["ego"].shape[:-1]
         parts = [observation[n].reshape(*shape, size.numel()) for n, size in self._sizes.items()]
         values = torch.cat(parts, -1)
-        if type(self).done is SteppedWorld.done:
-            return Moment(values, torch.zeros(shape, dtype=torch.bool, device=values.device))
-        rows = values.reshape(shape.numel(), values.shape[-1]).cpu()
-        done = torch.tensor([self._is_done(row) for row in rows], dtype=torch.bool)
-        return Moment(values, done.view(shape).to(values.device))
+        seed = torch.zeros(shape, dtype=torch.long, device=values.device)
+        done, rows = seed.bool(), values.reshape(shape.numel(), values.shape[-1]).cpu()
+        if type(self).done is not SteppedWorld.done:
+            done = torch.tensor([self._is_done(row) for row in rows], dtype=torch.bool)
+            done = done.view(shape).to(values.device)
+        if self.random:  # unknown, but the same whenever this is asked
+            seed = torch.tensor(
+                [crc32(row.numpy().tobytes()) % SEEDS for row in rows], dtype=torch.long
+            )
+            seed = seed.view(shape).to(values.device)
+        return Moment(values, done, seed)
+
+    def seed_chance(self, env: gym.Env, state: Moment) -> None:
+        """Let an environment draw what follows in the state ``[]``, if the world is random."""
+        self._seed(env, int(state.seed))
+
+    def _seed(self, env: gym.Env, seed: int) -> None:
+        if self.random:
+            env.unwrapped.np_random = np.random.default_rng(seed)
 
     def _stepped(self, state: Moment, action: Tensor) -> tuple[Moment, Tensor]:
         """Return the next states ``[...]`` and the reward terms ``[..., R]``."""
@@ -141,16 +173,18 @@ class SteppedWorld(EnvironmentWorld):
         ended = state.done.expand(shape).reshape(-1).tolist()
         deeds = action.expand((*shape, *action.shape[len(batch) :]))
         deeds = deeds.reshape(number, action.shape[-1] if continuous else 1).cpu()
+        seeds = state.seed.expand(shape)
         outcomes = self._outcomes
         if len(outcomes) > MOST_OUTCOMES:
             outcomes.clear()
         kind = bytes([continuous])  # an index and control values may have the same bytes
         found, own, stay = [], rows.numpy(), np.zeros(len(self.reward_terms))
-        for row, deed, end in zip(own, deeds.numpy(), ended, strict=True):
+        each = zip(own, deeds.numpy(), ended, seeds.flatten().tolist(), strict=True)
+        for row, deed, end, seed in each:
             if end:
                 found.append((row, True, stay))
                 continue
-            key = kind + row.tobytes() + deed.tobytes()
+            key = kind + row.tobytes() + deed.tobytes() + seed.to_bytes(4)
             outcome = outcomes.get(key)
             if outcome is None:
                 if continuous and not bool(within_bounds(self.controls, torch.tensor(deed)).all()):
@@ -159,20 +193,24 @@ class SteppedWorld(EnvironmentWorld):
                         f"{deed.tolist()}"
                     )
                 command = deed if continuous else self._commands[int(deed[0])]
-                outcome = outcomes[key] = self._tried(row, command)
+                outcome = outcomes[key] = self._tried(row, command, seed)
             found.append(outcome)
         values = torch.from_numpy(np.array([one for one, _, _ in found], own.dtype)).to(device)
         done = torch.tensor([one for _, one, _ in found], dtype=torch.bool, device=device)
         earned = torch.from_numpy(np.array([one for _, _, one in found], float)).to(values)
-        moment = Moment(values.view(*shape, width), done.view(shape))
+        if self.random:  # a full cycle of all seeds
+            seeds = (seeds * 1103515245 + 12345) % SEEDS
+        moment = Moment(values.view(*shape, width), done.view(shape), seeds)
         return moment, earned.view(*shape, len(self.reward_terms))
 
-    def _tried(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
+    def _tried(
+        self, row: np.ndarray, command: Any, seed: int
+    ) -> tuple[np.ndarray, bool, np.ndarray]:
         """Return the observation after an action, whether the task is done, and reward terms."""
-        found = self._step(row, command)
+        found = self._step(row, command, seed)
         if self._left_to_try:
             self._left_to_try.pop()
-            again = self._step(row, command)
+            again = self._step(row, command, seed)
             reached, _, _ = found
             self._restored(reached)
             off = np.abs(self._look() - reached) > TOLERANCE * (1 + np.abs(reached))
@@ -189,8 +227,11 @@ class SteppedWorld(EnvironmentWorld):
                     )
         return found
 
-    def _step(self, row: np.ndarray, command: Any) -> tuple[np.ndarray, bool, np.ndarray]:
+    def _step(
+        self, row: np.ndarray, command: Any, seed: int
+    ) -> tuple[np.ndarray, bool, np.ndarray]:
         self._restored(row)
+        self._seed(self._env, seed)
         _, reward, terminated, _, _ = self._env.step(copy(command))
         inner, end = self._env.unwrapped, bool(terminated)
         if end != bool(self.done(inner)):

@@ -59,7 +59,9 @@ class World(ABC):
             see :class:`~mirror_ppl.domains.record.Record`.
         mishap: reward term of a harmful event, and the plural of its name.
         partly_observed: True if full observations do not determine states; `state_behind` is then
-            an estimate.
+            an estimate. Always so in ``random`` worlds.
+        random: True if states hold a seed of what will happen by chance, which `transition` uses
+            and replaces, and `redrawn` draws anew.
     """
 
     name: str
@@ -78,6 +80,7 @@ class World(ABC):
     record: Record = Record()
     mishap: tuple[str, str]
     partly_observed: bool = False
+    random: bool = False
 
     scenarios: tuple[str, ...] = ("any",)
     over_at_horizon: bool = True
@@ -154,6 +157,14 @@ class World(ABC):
         Unobserved parts must not matter: states with equal observations lead to equal observations
         and rewards. In a world that is ``partly_observed`` this is an estimate.
         """
+
+    def redrawn(self, state: Any, generator: torch.Generator) -> Any:
+        """Return states ``[...]`` that differ in what will happen by chance alone: the same ones.
+
+        Planning averages over such states in ``random`` worlds, which have to implement this.
+        """
+        del generator
+        return state
 
     def control_values(self, action: Tensor) -> Tensor:
         """Return the values of the controls ``[..., C]`` of an action, for `transition`.

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from mirror_ppl.communication.rollouts import SimulatorWorld
+from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.domains import Control, Modality, add_domain
@@ -76,9 +78,9 @@ class Way(SteppedWorld):
         return env.place >= 10
 
 
-@pytest.mark.parametrize("kind", [Swing, Way])
+@pytest.mark.parametrize("kind", ["Swing", "Way", "Windy"])
 def test_such_worlds_keep_the_contract(kind):
-    assert faults_of(kind()) == []
+    assert faults_of(globals()[kind]()) == []
 
 
 def test_pendulum_moves_as_when_it_is_stepped():
@@ -171,6 +173,28 @@ class Arrived(Walk):
         return np.array([10]), {}
 
 
+class Wind(Walk):
+    """Who goes gets up to three steps farther."""
+
+    def step(self, action):
+        return super().step(int(action) * self.np_random.integers(1, 4))
+
+
+class Windy(Way):
+    random = True
+
+    def make(self):
+        return Wind()
+
+
+class Dice(Wind):
+    """Draws with a generator of its own."""
+
+    def step(self, action):
+        self.np_random = np.random.default_rng()
+        return super().step(action)
+
+
 class Named(Way):
     def terms(self, env, action, reward, terminated):
         return {"walked": reward}
@@ -193,6 +217,9 @@ class Endless(Way):
         (Forgetful, {}, "restore.. of the observation"),
         (Idle, {}, "restore.. of the observation"),
         (Way, {"make": lambda self: Random()}, "vary; restore.. does not set all"),
+        (Way, {"make": lambda self: Wind()}, r"vary; .*steps draw random numbers \(random\)"),
+        (Windy, {"make": lambda self: Dice()}, r"vary; .*steps draw random numbers \(random\)"),
+        (Windy, {"make": lambda self: Walk()}, "random: what follows is the same in states of red"),
         (
             Unseen,
             {},
@@ -253,6 +280,41 @@ def test_controls_outside_the_bounds_are_not_stepped():
         swing.transition(state, torch.tensor([[3.0]]))
     number, control = swing.action_of(np.array([2.0001]))
     assert (number, control.tolist()) == (4, [2.0])  # within a thousandth of a level
+
+
+def test_chance_is_drawn_from_the_seed_of_the_state():
+    windy, number = Windy(), 3000
+    state = windy.initial(number, torch.Generator().manual_seed(0))
+    state = windy.state_behind(
+        {n: p[:1].expand(number, *p.shape[1:]) for n, p in windy.observe(state).items()}
+    )
+    assert windy.partly_observed and not bool(state.seed.diff().any())
+    state = windy.redrawn(state, torch.Generator().manual_seed(0))
+    go = torch.ones(number, dtype=torch.long)
+    following = windy.transition(state, go)
+    farther = (windy.observe(following)["ego"] - windy.observe(state)["ego"]).squeeze(-1)
+    # Shares of 1, 2 and 3 steps are a third each, within four standard errors.
+    shares = torch.stack([(farther == steps).float().mean() for steps in (1, 2, 3)])
+    assert (shares - 1 / 3).abs().max() < 4 * (2 / 9 / number) ** 0.5
+    assert torch.equal(windy.transition(state, go).values, following.values)
+    # The second step is independent of the first: correlations are within four standard errors.
+    later = windy.transition(following, go)
+    again = (windy.observe(later)["ego"] - windy.observe(following)["ego"]).squeeze(-1)
+    goes_on = ~windy.over(following)
+    pair = torch.stack([farther[goes_on], again[goes_on]])
+    assert abs(float(torch.corrcoef(pair)[0, 1])) < 4 / int(goes_on.sum()) ** 0.5
+
+
+def test_what_happens_by_chance_is_predicted_in_several_futures():
+    windy = Windy()
+    start = windy.observe(windy.initial(1, torch.Generator().manual_seed(1)))
+    past = RoundSoFar(start, [], {"visual": torch.zeros(0, 1, dtype=torch.bool)})
+    simulator = SimulatorWorld(windy)
+    rollouts = simulator.rollouts(past, 2, torch.Generator().manual_seed(0))
+    path = rollouts.follow(0, torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long))
+    places = rollouts.observation(1)["ego"][:, path, 0]
+    assert simulator.draws == 8 and len(places.unique()) > 1
+    assert SimulatorWorld(Way()).draws == 1
 
 
 def test_tables_are_for_numbered_actions():
