@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
 import gymnasium as gym
 import torch
@@ -260,7 +260,7 @@ def _file(world: GymnasiumWorld) -> Path | None:
     content = f"{kind.version} {kind.layouts} {kind.horizon} {kind.moves} {given} {gym.__version__}"
     try:
         for each in (*kind.__mro__, *type(world.make().unwrapped).__mro__):
-            if each is not object:
+            if each not in (object, Generic):  # built in from Python 3.12 on
                 content += inspect.getsource(each) + Path(inspect.getfile(each)).read_text()
     except (OSError, TypeError):
         return None
