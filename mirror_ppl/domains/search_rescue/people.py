@@ -34,7 +34,8 @@ from torch import Tensor
 from mirror_ppl.domains.base import Observation, Visibility, by_eye
 from mirror_ppl.domains.search_rescue.house import CORRIDORS, ENTRANCE, ROOMS, SIDE, walkable
 from mirror_ppl.domains.search_rescue.knowledge import HouseKnowledge
-from mirror_ppl.domains.search_rescue.world import MOVES, SearchRescue
+from mirror_ppl.domains.search_rescue.moves import MOVES
+from mirror_ppl.domains.search_rescue.world import SearchRescue
 from mirror_ppl.people.base import SimulatedPeople, each
 
 SUBGOALS: dict[str, tuple[int, int]] = {

@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
 from mirror_ppl.domains.search_rescue.house import PORTION, SIDE, as_image
-from mirror_ppl.domains.search_rescue.world import RescueState, SearchRescue
+from mirror_ppl.domains.search_rescue.moves import RescueState
+from mirror_ppl.domains.search_rescue.world import SearchRescue
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture, SightPicture, label_of
 from mirror_ppl.plots.reading import (

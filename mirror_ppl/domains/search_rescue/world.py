@@ -53,8 +53,7 @@ Version history
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -81,13 +80,20 @@ from mirror_ppl.domains.search_rescue.knowledge import (
     ROOM_PORTIONS,
     HouseKnowledge,
 )
+from mirror_ppl.domains.search_rescue.moves import (
+    MOVES,
+    RescueState,
+    action_values,
+    at_victim,
+    earned,
+    moved,
+    obstructed,
+)
 from mirror_ppl.domains.search_rescue.record import RECORD
 from mirror_ppl.domains.world import World
 
-MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 SMOKE_REACH = 1.5
 """Sight of a firefighter in smoke, in cells to the centre of a portion."""
-FOUND, RETURNED, COLLISION, TIME = 1.0, 15.0, -10.0, -0.1
 BEGINNINGS = 0.25
 """Share of the robot's training rounds that begin in ordinary initial states."""
 
@@ -99,25 +105,6 @@ UTTERANCES: Mapping[str, tuple[str, str]] = {
     **{room: (f"victim not in {room}", f"victim in {room}") for room in ROOMS},
 }
 """Utterances about each verbal item, if it does not hold and if it does."""
-
-
-@dataclass(frozen=True)
-class RescueState:
-    """State of a batch of rounds.
-
-    Attributes:
-        place: row and column of the firefighter ``[..., 2]``, in cells.
-        found: whether the victim was found ``[...]``.
-        home: whether they are back at the entrance ``[...]``.
-        blocked: corridor that is blocked ``[...]``: 0 none, 1 left, 2 right.
-        victim: room of the victim ``[...]``, an index into ``ROOMS``.
-    """
-
-    place: Tensor
-    found: Tensor
-    home: Tensor
-    blocked: Tensor
-    victim: Tensor
 
 
 class SearchRescue(World):
@@ -209,9 +196,9 @@ class SearchRescue(World):
         cell = torch.randint(len(cells), (batch,), generator=generator, device=generator.device)
         place = cells[cell]
         # No firefighter stands on the obstacle.
-        place = torch.where(self._obstructed(state, place)[..., None], state.place, place)
+        place = torch.where(obstructed(state, place)[..., None], state.place, place)
         carried = torch.rand(batch, generator=generator, device=generator.device) < 0.5  # noqa: PLR2004
-        found = carried | self._at_victim(state, place)
+        found = carried | at_victim(state, place)
         begins = torch.rand(batch, generator=generator, device=generator.device) < BEGINNINGS
         place = torch.where(begins[..., None], state.place, place)
         found = found & ~begins
@@ -219,35 +206,13 @@ class SearchRescue(World):
 
     def transition(self, state: RescueState, action: Tensor) -> RescueState:
         """Return the state at t + 1; ``action`` ``[...]`` is an index into ``actions``."""
-        moves = torch.tensor(list(MOVES.values()), device=state.place.device)
-        target = state.place + moves[action]
-        stays = state.home | ~walkable(target) | self._obstructed(state, target)
-        place = torch.where(stays[..., None], state.place, target)
-        found = state.found | self._at_victim(state, place)
-        home = state.home | (found & at_entrance(place))
-        return replace(state, place=place, found=found, home=home)
+        return moved(state, action)
 
     def rewards(
         self, state: RescueState, action: Tensor, following: RescueState
     ) -> dict[str, Tensor]:
         """Return reward terms ``[...]`` by name, in units of reward."""
-        moves = torch.tensor(list(MOVES.values()), device=state.place.device)
-        into = self._obstructed(state, state.place + moves[action])
-        dtype = torch.get_default_dtype()
-        return {
-            "found": FOUND * (following.found & ~state.found).to(dtype),
-            "returned": RETURNED * (following.home & ~state.home).to(dtype),
-            "collision": COLLISION * into.to(dtype),
-            "time": TIME * (~state.home).to(dtype),
-        }
-
-    def _at_victim(self, state: RescueState, place: Tensor) -> Tensor:
-        rooms = torch.tensor(list(ROOMS.values()), device=place.device)
-        return (place == rooms[state.victim]).all(-1)
-
-    def _obstructed(self, state: RescueState, place: Tensor) -> Tensor:
-        corridors = torch.tensor([(-1, -1), *CORRIDORS.values()], device=place.device)
-        return (place == corridors[state.blocked]).all(-1)
+        return earned(state, action, following)
 
     def over(self, state: RescueState) -> Tensor:
         """Return where they are back at the entrance with the victim ``[...]``."""
@@ -447,7 +412,7 @@ class SearchRescue(World):
 
     def reference_values(self, state: RescueState, discount: float) -> Tensor:
         """Return exact action values ``[..., 4]`` of known states, without a horizon."""
-        table = _action_values(discount).to(state.place.device)
+        table = action_values(discount).to(state.place.device)
         row, column = state.place.unbind(-1)
         found, home = state.found.long(), state.home
         values = table[state.blocked, state.victim, found, row, column]
@@ -461,40 +426,3 @@ class SearchRescue(World):
         row, column = (int(part) * cell for part in state.place)
         picture[row + 2 : row + cell - 2, column + 2 : column + cell - 2] = (40, 90, 200)
         return picture
-
-
-@cache
-def _action_values(discount: float) -> Tensor:
-    """Compute ``[blocked 3, victim 3, found 2, row 9, column 9, action 4]`` by value iteration."""
-    world = SearchRescue()
-    shape = (1 + len(CORRIDORS), len(ROOMS), 2, SIDE, SIDE)
-    grid = torch.cartesian_prod(*(torch.arange(size) for size in shape))
-    blocked, victim, found, row, column = grid.unbind(-1)
-    number, actions = len(grid), len(MOVES)
-    state = RescueState(
-        torch.stack([row, column], -1), found.bool(), torch.zeros(number).bool(), blocked, victim
-    )
-    outcomes = []
-    for action in range(actions):
-        chosen = torch.full((number,), action)
-        after = world.transition(state, chosen)
-        reward = torch.stack(list(world.rewards(state, chosen, after).values())).sum(0)
-        strides = torch.tensor([shape[1] * 2 * SIDE**2, 2 * SIDE**2, SIDE**2, SIDE, 1])
-        parts = [after.blocked, after.victim, after.found.long(), *after.place.unbind(-1)]
-        outcomes.append((reward.double(), (torch.stack(parts, -1) * strides).sum(-1), after.home))
-    # Cells inside walls have no transitions.
-    floor = walkable(state.place)
-    values = torch.zeros(number, dtype=torch.double)
-    while True:
-        following = torch.stack(
-            [
-                reward + discount * torch.where(home, 0.0, values[index])
-                for reward, index, home in outcomes
-            ],
-            -1,
-        )
-        following = torch.where(floor[:, None], following, 0.0)
-        best = following.amax(-1)
-        if torch.equal(best, values):
-            return following.view(*shape, actions).to(torch.get_default_dtype())
-        values = best
