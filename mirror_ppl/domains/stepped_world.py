@@ -161,7 +161,7 @@ class SteppedWorld(EnvironmentWorld):
 
     def _seed(self, env: gym.Env, seed: int) -> None:
         if self.random:
-            env.unwrapped.np_random = np.random.default_rng(seed)
+            env.unwrapped.np_random = np.random.Generator(np.random.SFC64(seed))
 
     def _stepped(self, state: Moment, action: Tensor) -> tuple[Moment, Tensor]:
         """Return the next states ``[...]`` and the reward terms ``[..., R]``."""
