@@ -83,6 +83,7 @@ def _show(world: World) -> None:
     from mirror_ppl.domains.checking import capabilities, remarks_on
     from mirror_ppl.domains.controls import bounds_in_words
 
+    remark = remarks_on(world)  # before anything is printed, as a fault may be found
     table = Table(title=f"{world.name}: nothing wrong", box=SIMPLE_HEAD, title_justify="left")
     for column in ("capability", "here", "what it gives"):
         table.add_column(column)
@@ -98,4 +99,4 @@ def _show(world: World) -> None:
     print(
         f"settings: {', '.join(world.settings)}; thresholds of sight ({world.reach_unit}): {reach}"
     )
-    print(remarks_on(world))
+    print(remark)

@@ -219,7 +219,7 @@ class Decision:
         if self.over:
             return "the round is over"
         world, now = self.world, self.observation
-        if not offers(world, "reference_values") or world.partly_observed:
+        if not offers(world, "reference_values") or world.partly_observed or world.random:
             return f"none: the best action is not known exactly in {world.name}"
         values = world.reference_values(world.state_behind(now), ADVICE_DISCOUNT)
         notion = next(iter(world.relevance(now).values()))
@@ -366,7 +366,7 @@ def choose(valued: Valued, standard_errors: float) -> int:
 
     Returns silence, candidate 0, if no lower bound is positive; the first one among ties.
     """
-    least = _least(valued.utility - valued.utility[:1], standard_errors)
+    least = _least(valued, valued.utility - valued.utility[:1], standard_errors)
     best = int(least.argmax())
     return best if float(least[best]) > TIE else 0
 
@@ -389,23 +389,28 @@ def slimmed(value: Value, found: Found, chosen: int, standard_errors: float) -> 
         less = plan.repeat(len(places), 1, 1)
         less[torch.arange(len(places)), 0, places] = False
         found, place = joined(found, less, value)
-        least = _least(found.valued.utility[chosen] - found.valued.utility[place], standard_errors)
+        gain = found.valued.utility[chosen] - found.valued.utility[place]
+        least = _least(found.valued, gain, standard_errors)
         worst = int(least.argmin())
         if float(least[worst]) > TIE:
             return found, chosen
         chosen = int(place[worst])
 
 
-def _least(gain: Tensor, standard_errors: float) -> Tensor:
+def _least(valued: Valued, gain: Tensor, standard_errors: float) -> Tensor:
     """Return lower bounds ``[C]`` of mean gains ``[C, S]``: mean - ``standard_errors`` * SE."""
-    mean = gain.mean(-1)
-    if gain.shape[-1] == 1:
-        return mean
-    return mean - standard_errors * gain.std(-1) / gain.shape[-1] ** 0.5
+    return gain.mean(-1) - standard_errors * _standard_error(valued, gain)
+
+
+def _standard_error(valued: Valued, gain: Tensor) -> Tensor:
+    """Return the standard error of the mean of gains ``[..., S]``; 0 of a single draw."""
+    parts = valued.independent(gain)
+    number = parts.shape[-1]
+    return parts.std(-1) / number**0.5 if number > 1 else torch.zeros_like(gain[..., 0])
 
 
 def gain_over_silence(valued: Valued, index: int) -> Gain:
     """Return the gain of a candidate over silence."""
     gain = valued.utility[index] - valued.utility[0]
-    spread = float(gain.std()) if len(gain) > 1 else 0.0
-    return Gain(float(gain.mean()), spread / len(gain) ** 0.5, float((gain > TIE).float().mean()))
+    error = float(_standard_error(valued, gain))
+    return Gain(float(gain.mean()), error, float((gain > TIE).float().mean()))

@@ -35,10 +35,24 @@ class Valued:
         utility: of each candidate under each posterior draw, in units of reward, ``[C, S]``.
         actions: predicted probabilities of actions at each step ahead, ``[C, H, A]``; ``None``
             where the objective does not predict actions.
+        worlds: number of draws W of the world; posterior draw s was valued in draw s mod W.
     """
 
     utility: Tensor
     actions: Tensor | None
+    worlds: int = 1
+
+    def independent(self, gain: Tensor) -> Tensor:
+        """Return gains ``[..., S]`` whose spread is that of a mean: those of draws, or means by W.
+
+        Posterior draws that were valued in one draw of the world share its chance.
+        """
+        draws = gain.shape[-1]
+        if not 1 < self.worlds < draws:
+            return gain
+        share = torch.zeros(draws, self.worlds, dtype=gain.dtype, device=gain.device)
+        share[torch.arange(draws), torch.arange(draws) % self.worlds] = 1.0
+        return gain @ (share / share.sum(0))
 
 
 Value = Callable[[Tensor], Valued]
@@ -139,7 +153,8 @@ class ExpectedUtility:
                 utility -= tree.of_each((self.discount**horizon) * tree.weight * left)
             steps = min(candidates.shape[1], horizon)
             cost = (channels.cost(candidates)[:, :steps] * discounts[:steps]).sum(1)
-            return Valued(utility - cost[:, None], torch.stack(predicted, 1))
+            utility -= cost[:, None]
+            return Valued(utility, torch.stack(predicted, 1), self.world.draws)
 
         return value
 

@@ -20,13 +20,11 @@ from torch import Tensor
 
 from mirror_ppl.checks import require_kind, require_methods, whole_number
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains.base import Domain, Observation, map_state, total_reward
+from mirror_ppl.domains.base import FUTURES, Domain, Observation, map_state, total_reward
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
 
 NAMES = 2**62
-FUTURES = 8
-"""Number of futures that are predicted in worlds where something happens by chance."""
 """Maximum number of paths, so that names fit into integers."""
 
 

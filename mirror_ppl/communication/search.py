@@ -207,13 +207,13 @@ def joined(found: Found, more: Tensor, value: Value) -> tuple[Found, Tensor]:
     if found.valued.actions is not None and valued.actions is not None:
         actions = torch.cat([found.valued.actions, valued.actions])
     utility = torch.cat([found.valued.utility, valued.utility])
-    return Found(torch.cat([found.candidates, added]), Valued(utility, actions)), place
+    both = Valued(utility, actions, valued.worlds)
+    return Found(torch.cat([found.candidates, added]), both), place
 
 
 def in_chunks(value: Value, candidates: Tensor) -> Valued:
     """Value many candidates ``[C, L, N]``, a chunk at a time."""
     parts = [value(part) for part in candidates.split(CHUNK)]
     actions = [part.actions for part in parts if part.actions is not None]
-    return Valued(
-        torch.cat([part.utility for part in parts]), torch.cat(actions) if actions else None
-    )
+    utility = torch.cat([part.utility for part in parts])
+    return Valued(utility, torch.cat(actions) if actions else None, parts[0].worlds)

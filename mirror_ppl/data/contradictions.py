@@ -15,6 +15,7 @@ from torch import Tensor
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.data.schema import dimension_labels
 from mirror_ppl.domains import Observation, get_domain
+from mirror_ppl.domains.controls import grid
 from mirror_ppl.errors import DemonstrationsError
 
 TOLERANCE = 1e-3
@@ -139,10 +140,12 @@ def _wrong(
 
 
 def _executed(demonstrations: Demonstrations, person: int) -> Tensor:
-    """Executed controls ``[B, T, C]``, if recorded, else actions ``[B, T]``; 0 in padding."""
-    if demonstrations.controls is not None:
-        return demonstrations.controls[person].nan_to_num(0.0)
-    return demonstrations.actions[person].clamp(min=0)
+    """Executed controls ``[B, T, C]``, if recorded, or actions ``[B, T]``; padding is action 0."""
+    actions = demonstrations.actions[person].clamp(min=0)
+    if demonstrations.controls is None:
+        return actions
+    controls, domain = demonstrations.controls[person], get_domain(demonstrations.domain)
+    return torch.where(controls.isnan(), grid(domain.controls).to(controls)[actions], controls)
 
 
 def _has_neighbour(mask: Tensor, shift: int) -> Tensor:

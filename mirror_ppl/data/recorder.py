@@ -97,10 +97,12 @@ class Recorder(gym.Wrapper):
         if not self._rounds or self._rounds[-1].over:
             raise InputError("the round is over or has not begun; call reset()")
         number, control = self.world.action_of(action)
+        if control is not None:  # within the bounds, where the given one is by a rounding error
+            action = control.astype(np.asarray(action).dtype)
         found, reward, terminated, truncated, info = self.env.step(action)
         now = self._rounds[-1]
         seen = self.world.look(self.env.unwrapped)
-        terms = self.world.terms(self.env.unwrapped, action, float(reward), bool(terminated))
+        terms = self.world.named_terms(self.env, action, float(reward), bool(terminated))
         now.add(number, control, self._told, sum(terms.values()), seen)
         self._told = []
         truncated = truncated or len(now.actions) == self.world.horizon
@@ -109,7 +111,7 @@ class Recorder(gym.Wrapper):
             ended = "has terminated" if terminated else "has not terminated"
             raise InputError(
                 f"the environment {ended} after step {len(now.actions) - 1}, but {self.world.name} "
-                "says otherwise (done); mend the world, as the recording contradicts it"
+                "says otherwise; mend the world (done), as the recording contradicts it"
             )
         return found, float(reward), terminated, truncated, info
 

@@ -162,6 +162,10 @@ class Modality:
         return divmod(alike[heard], len(self.utterances[0]))
 
 
+FUTURES = 8
+"""Number of futures that are averaged over in random worlds."""
+
+
 class Domain(Protocol):
     """The interface of a world for models, people, inference and communication.
 
@@ -178,8 +182,8 @@ class Domain(Protocol):
     together determine every item. ``mishap`` is the reward term of a harmful event, and the plural
     of its name. ``counterparts`` has for each visual item the verbal item about the same thing, if
     that is more informative. ``record`` holds settings of other parts of the package. In a world
-    that is ``partly_observed``, observations do not determine states, and `state_behind` estimates;
-    that is so in ``random`` worlds, whose states hold a seed of what will happen by chance.
+    that is ``partly_observed``, observations do not determine states, and `state_behind` estimates.
+    States of ``random`` worlds hold a seed of what will happen by chance; `state_behind` takes any.
     ``controls`` are what people set where actions are continuous; ``actions`` are then a grid of
     their values. `transition`, `rewards` and `next_observation` also take what was executed:
     control values ``[..., C]`` of numbers with a point.

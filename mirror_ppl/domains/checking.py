@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.world import World, offers
 from mirror_ppl.errors import DomainError
 from mirror_ppl.user_code import describe
@@ -243,7 +243,7 @@ def _looks(world: World) -> list[str]:
         size = world.symbol_sizes[name]
         found.append(_fault("symbols", name, value, (*expected[name][:-1], size), float))
     if world.random:
-        found.append(_fault_of_chance(world, along, observation, torch.stack(actions, 1)))
+        found.append(_fault_of_chance(world, along, observation))
     behind = _call(world, "state_behind", observation)
     if type(behind) is not type(along):
         return [f"state_behind: expected {_kind(along)}, found {_kind(behind)}"]
@@ -254,7 +254,7 @@ def _looks(world: World) -> list[str]:
         {n: v[:, :-1] for n, v in observation.items()},
         torch.stack(actions, 1),
     )
-    for name, value in observation.items() if not world.partly_observed else ():
+    for name, value in observation.items() if not (world.partly_observed or world.random) else ():
         if bool(((again[name] - value).abs() > TOLERANCE).any()):
             found.append(f"state_behind: {name} of the state is not what was observed")
         elif bool(((following[name] - value[:, 1:]).abs() > TOLERANCE).any()):
@@ -283,31 +283,23 @@ def remarks_on(world: World) -> str:
     for _ in range(world.horizon):
         action = torch.randint(len(world.actions), (REMARKED,), generator=generator)
         following = world.transition(state, action)
-        total = torch.stack([*world.rewards(state, action, following).values()]).sum(0)
-        earned += total[~ended].tolist()
+        earned += total_reward(world.rewards(state, action, following))[~ended].tolist()
         state, ended = following, ended | world.over(following)
     number = int(ended.sum())
     remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
     if not offers(world, "over"):
         return remark
     remark += f"; {number} of {REMARKED} rounds ended"
-    return remark if number else f"{remark}: what is so at an end was not checked"
+    return remark if number else f"{remark}, so ends were not checked"
 
 
-def _fault_of_chance(
-    world: World, states: Any, observation: Mapping[str, Tensor], actions: Tensor
-) -> str:
-    """Return the fault of `World.redrawn`: it has to change what follows, and nothing else."""
+def _fault_of_chance(world: World, states: Any, observation: Mapping[str, Tensor]) -> str:
+    """Return the fault of `World.redrawn`: it has to change seeds, and nothing that is observed."""
     others = _call(world, "redrawn", states, torch.Generator().manual_seed(3))
     for name, value in _call(world, "observe", others).items():
         if not torch.equal(value, observation[name]):
             return f"redrawn: changes {name}, expected states that look alike"
-    following = _call(world, "transition", map_state(lambda part: part[:, :-1], others), actions)
-    same = [
-        torch.equal(value, observation[name][:, 1:])
-        for name, value in _call(world, "observe", following).items()
-    ]
-    return "random: what follows is the same in states of redrawn()" * all(same)
+    return "redrawn: returns the same states, expected other seeds" * _same(states, others)
 
 
 def _faults_of_reflection(

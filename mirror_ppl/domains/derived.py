@@ -61,8 +61,6 @@ def complete(kind: type[World]) -> frozenset[str]:
     }
     if kind.controls:
         made["actions"] = action_names(kind.controls)
-    if kind.random:
-        kind.partly_observed = True
     derived = [name for name in made if not kind.given(name)]
     for name in derived:
         setattr(kind, name, made[name])

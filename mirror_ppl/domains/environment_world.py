@@ -59,6 +59,22 @@ class EnvironmentWorld(World):
         del env, action, terminated
         return {self.reward_terms[0]: reward}
 
+    def named_terms(
+        self, env: gym.Env, action: Any, reward: float, terminated: bool
+    ) -> dict[str, float]:
+        """Return `terms` of a step that an environment has taken.
+
+        Raises:
+            DomainError: they are not the world's.
+        """
+        own = self.terms(env.unwrapped, action, float(reward), bool(terminated))
+        if set(own) != set(self.reward_terms):
+            raise DomainError(
+                f"{self.name}: terms() has {', '.join(own)}, expected "
+                f"{', '.join(self.reward_terms)} (reward_terms)"
+            )
+        return own
+
     @property
     def _moves(self) -> tuple[int, ...]:
         return self.moves or tuple(range(len(self.actions)))
@@ -132,14 +148,16 @@ class EnvironmentWorld(World):
             if self.terminates(self.look(env.unwrapped)):
                 return [f"the task is done where rounds begin (seed {seed})"]
             for step in range(self.horizon):
-                fault, end = self._fault_of_step(env, chooser)
+                fault, end = self._fault_of_step(env, chooser, step)
                 if fault:
                     return [f"step {step} after reset(seed={seed}): {fault}"]
                 if end:
                     break
         return []
 
-    def _fault_of_step(self, env: gym.Env, chooser: np.random.Generator) -> tuple[str, bool]:
+    def _fault_of_step(
+        self, env: gym.Env, chooser: np.random.Generator, step: int
+    ) -> tuple[str, bool]:
         """Take a random step; return what the world computes otherwise, and whether it ended."""
         before = as_tensors(self.look(env.unwrapped))
         number = int(chooser.integers(len(self.actions)))
@@ -151,21 +169,24 @@ class EnvironmentWorld(World):
         state = self.state_behind(before)
         self.seed_chance(env, state)
         _, reward, end, cut, _ = env.step(copy(command))
-        own = self.terms(env.unwrapped, command, float(reward), bool(end))
-        found = as_tensors(self.look(env.unwrapped)) | as_tensors(own)
+        own = as_tensors(self.named_terms(env, command, float(reward), bool(end)))
+        found = as_tensors(self.look(env.unwrapped))
         following = self.transition(state, action)
-        computed = {**self.observe(following), **self.rewards(state, action, following)}
-        for name, value in found.items():
-            if bool(((computed[name] - value).abs() > TOLERANCE * (1 + value.abs())).any()):
-                return (
-                    f"after {command}, {name} is {value.tolist()} in the environment, but computed "
-                    f"as {computed[name].tolist()}; {self.likely_cause}"
-                ), False
+        for values, computed in (
+            (found, self.observe(following)),
+            (own, self.rewards(state, action, following)),
+        ):
+            for name, value in values.items():
+                if bool(((computed[name] - value).abs() > TOLERANCE * (1 + value.abs())).any()):
+                    return (
+                        f"after {command}, {name} is {value.tolist()} in the environment, but "
+                        f"computed as {computed[name].tolist()}; {self.likely_cause}"
+                    ), False
         if bool(end) != bool(self.over(following)):
             ended = "has terminated" if end else "has not terminated"
             return f"after {command} the environment {ended}, but the world says otherwise", False
-        if cut and not end:
-            return "the environment ends the round here; horizon has to be that of it", False
+        if cut and not end and step + 1 < self.horizon:
+            return f"the environment truncates rounds; horizon may be {step + 1} at most", False
         return "", bool(end)
 
 

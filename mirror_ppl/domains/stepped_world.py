@@ -144,7 +144,9 @@ class SteppedWorld(EnvironmentWorld):
         parts = [observation[n].reshape(*shape, size.numel()) for n, size in self._sizes.items()]
         values = torch.cat(parts, -1)
         seed = torch.zeros(shape, dtype=torch.long, device=values.device)
-        done, rows = seed.bool(), values.reshape(shape.numel(), values.shape[-1]).cpu()
+        done, rows = seed.bool(), ()
+        if self.random or type(self).done is not SteppedWorld.done:
+            rows = values.reshape(shape.numel(), values.shape[-1]).cpu()
         if type(self).done is not SteppedWorld.done:
             done = torch.tensor([self._is_done(row) for row in rows], dtype=torch.bool)
             done = done.view(shape).to(values.device)
@@ -199,7 +201,7 @@ class SteppedWorld(EnvironmentWorld):
         done = torch.tensor([one for _, one, _ in found], dtype=torch.bool, device=device)
         earned = torch.from_numpy(np.array([one for _, _, one in found], float)).to(values)
         if self.random:  # a full cycle of all seeds
-            seeds = (seeds * 1103515245 + 12345) % SEEDS
+            seeds = torch.where(state.done, seeds, (seeds * 1103515245 + 12345) % SEEDS)
         moment = Moment(values.view(*shape, width), done.view(shape), seeds)
         return moment, earned.view(*shape, len(self.reward_terms))
 
@@ -239,12 +241,7 @@ class SteppedWorld(EnvironmentWorld):
                 f"{self.name}: the environment {'is' if end else 'is not'} terminated after "
                 f"{command} in {row.tolist()}, but done() says otherwise"
             )
-        own = self.terms(inner, command, float(reward), end)
-        if set(own) != set(self.reward_terms):
-            raise DomainError(
-                f"{self.name}: terms() has {', '.join(own)}, expected "
-                f"{', '.join(self.reward_terms)} (reward_terms)"
-            )
+        own = self.named_terms(self._env, command, float(reward), end)
         earned = np.array([own[name] for name in self.reward_terms], float)
         return self._look(), end, earned
 

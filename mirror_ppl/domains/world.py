@@ -59,7 +59,7 @@ class World(ABC):
             see :class:`~mirror_ppl.domains.record.Record`.
         mishap: reward term of a harmful event, and the plural of its name.
         partly_observed: True if full observations do not determine states; `state_behind` is then
-            an estimate. Always so in ``random`` worlds.
+            an estimate, as in ``random`` worlds.
         random: True if states hold a seed of what will happen by chance, which `transition` uses
             and replaces, and `redrawn` draws anew.
     """
@@ -294,8 +294,8 @@ class World(ABC):
         return torch.zeros_like(far, dtype=torch.long), far
 
     def next_observation(self, observation: Observation, action: Tensor) -> Observation:
-        """Return the full observation after an action ``[...]``; NaN if ``partly_observed``."""
-        if self.partly_observed:
+        """Return the full observation after an action ``[...]``; NaN where it is not determined."""
+        if self.partly_observed or self.random:
             return {name: torch.full_like(part, math.nan) for name, part in observation.items()}
         return self.observe(self.transition(self.state_behind(observation), action))
 

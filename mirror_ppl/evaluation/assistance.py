@@ -21,7 +21,7 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS, PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.domains.base import Domain, map_state
+from mirror_ppl.domains.base import FUTURES, Domain, map_state
 from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.evaluation.played import Played, Tally
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
@@ -185,7 +185,10 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
     For people who follow the human model, those of a planner with their true implants.
     """
     if (known := listener.driver.modelled()) is not None:
-        planner = planner_of("mirror", Person(*known), replace(options, hears=1.0), seed)
+        human, truth = known
+        if listener.domain.random:  # a draw for each future
+            truth = {name: value.expand(FUTURES, *value.shape[1:]) for name, value in truth.items()}
+        planner = planner_of("mirror", Person(human, truth), replace(options, hears=1.0), seed)
         return Planning(planner)
     own = people_of(listener.domain.name)
     if own is None:
@@ -197,6 +200,10 @@ def _oracle(listener: Listener, options: PlannerOptions, seed: int) -> Say:
     if (best_now := own.best_messages) is not None:
         person = listener.driver
         return lambda _, truth: (best_now(person, truth.state, truth.memory), None)
+    if listener.domain.random:
+        raise InputError(
+            f"{listener.domain.name} is random; its people need an oracle of their own"
+        )
     knows = ReachableOracle(listener.driver, start)
     return lambda _, truth: (knows.messages(truth.step, truth.state, truth.memory), None)
 

@@ -72,9 +72,13 @@ def populations_of(domain: str) -> tuple[str, ...]:
 def has_oracle(domain: str, population: str) -> bool:
     """True if the oracle can compute the best messages to such people.
 
-    It can for a world's own people, and for others unless a setting limits their sight.
+    It can for a world's own people, unless they need all of a random world's states to be listed,
+    and for others unless a setting limits their sight.
     """
-    return people_of(domain) is not None or population == "diverse"
+    own = people_of(domain)
+    if own is None:
+        return population == "diverse"
+    return own.oracle is not None or own.best_messages is not None or not get_domain(domain).random
 
 
 def simulate(  # noqa: PLR0913 - everything recordings can depend on

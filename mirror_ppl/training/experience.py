@@ -1,8 +1,8 @@
 """Experience of the robot: rounds that it drove, and the outcomes of every action.
 
 Only the initial states and the actions of rounds are stored, unless a `Course` is kept, which
-worlds with slow transitions need. The world is deterministic, so observations, views and rewards
-are recomputed whenever a round is used for training.
+worlds with slow transitions need. Transitions are functions of state and action, so observations,
+views and rewards are recomputed whenever a round is used for training.
 """
 
 from __future__ import annotations

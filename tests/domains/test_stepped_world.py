@@ -2,12 +2,17 @@
 
 import pickle
 import re
+from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
+from mirror_ppl.communication import Communicator, ExpectedUtility, Person
+from mirror_ppl.communication.objectives import Valued
+from mirror_ppl.communication.planners import PlannerOptions
 from mirror_ppl.communication.rollouts import SimulatorWorld
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.data.contradictions import check_world
@@ -18,6 +23,10 @@ from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
 from mirror_ppl.domains.registry import load_world
 from mirror_ppl.domains.stepped_world import SteppedWorld
 from mirror_ppl.errors import DomainError, InputError
+from mirror_ppl.evaluation.assistance import Listener, speaker
+from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import Sizes
+from mirror_ppl.models.variants import PerceptualOnly
 
 
 class Swing(SteppedWorld):
@@ -211,6 +220,10 @@ class Endless(Way):
         return False
 
 
+def moved(state):
+    return replace(state, values=state.values - torch.tensor([0.0, 1.0]))
+
+
 @pytest.mark.parametrize(
     ("kind", "changes", "message"),
     [
@@ -219,13 +232,18 @@ class Endless(Way):
         (Way, {"make": lambda self: Random()}, "vary; restore.. does not set all"),
         (Way, {"make": lambda self: Wind()}, r"vary; .*steps draw random numbers \(random\)"),
         (Windy, {"make": lambda self: Dice()}, r"vary; .*steps draw random numbers \(random\)"),
-        (Windy, {"make": lambda self: Walk()}, "random: what follows is the same in states of red"),
+        (Windy, {"redrawn": lambda self, state, generator: state}, "expected other seeds"),
+        (
+            Windy,
+            {"redrawn": lambda self, state, generator: moved(state)},
+            "redrawn: changes visual",
+        ),
         (
             Unseen,
             {},
             r"step 1 after reset.seed=\d.: after \d, ego is .* but computed as .*restore..",
         ),
-        (Way, {"make": lambda self: gym.wrappers.TimeLimit(Walk(), 4)}, "step 3 .*horizon has to"),
+        (Way, {"make": lambda self: gym.wrappers.TimeLimit(Walk(), 4)}, "may be 4 at most"),
         (Named, {}, "terms.. has walked, expected reward"),
         (Way, {"make": lambda self: Arrived()}, "done where rounds begin .seed 0"),
         (Endless, {"horizon": 12}, "but done.. says otherwise"),
@@ -242,6 +260,37 @@ def test_faults_of_environments_are_named(kind, changes, message):
         raise DomainError(found[0] if found else "nothing wrong")
 
 
+def test_a_time_limit_may_be_the_horizon():
+    kind = type("Limited", (Way,), {"make": lambda self: gym.wrappers.TimeLimit(Walk(), 6)})
+    assert faults_of(kind()) == []
+
+
+def test_steps_of_different_worlds_are_compared_in_tables_too():
+    kind = type("Tabled", (GymnasiumWorld,), {**vars(Way), "random": False, "layouts": 8})
+    assert faults_of(kind()) == []
+    kind.terms = lambda self, env, action, reward, terminated: {"reward": reward, "more": 0.0}
+    assert "terms() has reward, more, expected reward" in faults_of(kind())[0]
+
+
+def test_rounds_of_different_lengths_do_not_contradict_controls_without_0():
+    drive = add_domain(type("Drive", (Fast,), {}))
+    env = Recorder(drive.make(), drive)
+    for steps in (2, 4):
+        env.reset(seed=0)
+        for _ in range(steps):
+            env.step(np.array([3.0]))
+    assert check_world(env.recordings(), 0.0).share == 0
+
+
+def test_controls_are_executed_as_they_are_recorded():
+    drive = add_domain(Fast)
+    env = Recorder(drive.make(), drive)
+    env.reset(seed=0)
+    env.step(np.array([5.001]))  # within a thousandth of a level
+    assert env.recordings().controls.tolist() == [[[[5.0]]]]
+    assert env.unwrapped.place == 5.0
+
+
 def test_what_a_world_needs_is_named():
     kind = type("Half", (Way,), {"restore": SteppedWorld.restore})
     with pytest.raises(DomainError, match="Half needs restore; see docs"):
@@ -252,9 +301,7 @@ def test_remarks_say_whether_ends_were_checked():
     remark = remarks_on(Way())
     assert remark.startswith("random actions: rewards 0 to 1 a step; ")
     assert re.search(r"; [1-9]\d* of 100 rounds ended$", remark)
-    assert remarks_on(Swing()).endswith(
-        "0 of 100 rounds ended: what is so at an end was not checked"
-    )
+    assert remarks_on(Swing()).endswith("0 of 100 rounds ended, so ends were not checked")
 
 
 def test_recorded_rounds_end_where_the_world_says_so():
@@ -288,7 +335,8 @@ def test_chance_is_drawn_from_the_seed_of_the_state():
     state = windy.state_behind(
         {n: p[:1].expand(number, *p.shape[1:]) for n, p in windy.observe(state).items()}
     )
-    assert windy.partly_observed and not bool(state.seed.diff().any())
+    assert not bool(state.seed.diff().any())
+    assert bool(windy.next_observation(windy.observe(state), state.seed * 0)["ego"].isnan().all())
     state = windy.redrawn(state, torch.Generator().manual_seed(0))
     go = torch.ones(number, dtype=torch.long)
     following = windy.transition(state, go)
@@ -315,6 +363,77 @@ def test_what_happens_by_chance_is_predicted_in_several_futures():
     places = rollouts.observation(1)["ego"][:, path, 0]
     assert simulator.draws == 8 and len(places.unique()) > 1
     assert SimulatorWorld(Way()).draws == 1
+
+
+class Coin(gym.Env):
+    """Who goes wins or loses a thousand."""
+
+    observation_space = gym.spaces.Box(0, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.bright = int(self.np_random.integers(2))
+        return np.array([self.bright]), {}
+
+    def step(self, action):
+        won = 1000 * (2 * self.np_random.integers(2) - 1)
+        return np.array([self.bright]), float(action * won), False, False, {}
+
+
+class Toss(SteppedWorld):
+    random = True
+    modalities = (Modality("visual", ("lamp",), ("bright",), ("",), (1.0,), 0.01),)
+    ego_features = ("nothing",)
+    actions = ("stay", "go")
+    horizon = 2
+
+    def make(self):
+        return Coin()
+
+    def look(self, env):
+        return {"ego": [0.0], "visual": [[env.bright]]}
+
+    def restore(self, env, observation):
+        env.bright = int(observation["visual"][0, 0])
+
+
+def test_chance_that_draws_share_counts_once_in_standard_errors(seed):
+    """Of 100 plans with two standard errors of eight futures, some 4% gain by chance."""
+    toss = add_domain(Toss)
+    torch.manual_seed(seed)
+    human = PerceptualOnly(SelfModel(toss, Sizes()).eval())
+    values = {"sight_around": 0, "consistency": 5.0, "lapse": 0.01}
+    draws = {name: torch.full((200, 1, 1), value) for name, value in values.items()}
+    person = Person(human, draws)
+    start = toss.observe(toss.initial(1, torch.Generator().manual_seed(0)))
+    past = RoundSoFar(start, [], {"visual": torch.zeros(0, 1, dtype=torch.bool)})
+    objective, errors, gains = ExpectedUtility(SimulatorWorld(toss), 1), [], []
+    for number in range(100):
+        found = Communicator(person, objective, seed=number).plan(past).alternatives
+        errors.append(found["standard_error"].max())
+        gains.append(found["gain"][found["message"] != "silence"].iloc[0])
+    # The mean squared error of gains is the mean squared standard error, within 4 errors of 100.
+    claimed, actual = np.square(errors).mean(), np.square(gains).mean()
+    assert abs(actual / claimed - 1) < 4 * (2 / 100 + 2 / 7 / 100) ** 0.5
+
+
+def test_the_oracle_of_a_random_world_has_a_draw_for_each_future():
+    toss = add_domain(Toss)
+    human = PerceptualOnly(SelfModel(toss, Sizes()).eval())
+    values = {"sight_around": 0, "consistency": 5.0, "lapse": 0.01}
+    truth = {name: torch.full((1, 1, 1), value) for name, value in values.items()}
+    driver = SimpleNamespace(modelled=lambda: (human, truth))
+    say = speaker("oracle", Listener(toss, "everyday", driver, None), PlannerOptions(), 0)
+    assert say.planner.person.number == SimulatorWorld(toss).draws == 8
+
+
+def test_means_by_draw_of_the_world_are_independent():
+    valued = Valued(torch.zeros(1, 5), None, worlds=2)
+    gain = torch.tensor([1.0, 10.0, 3.0, 20.0, 5.0])
+    assert valued.independent(gain).tolist() == [3.0, 15.0]
+    assert Valued(torch.zeros(1, 5), None, worlds=5).independent(gain) is gain
+    assert Valued(torch.zeros(1, 5), None).independent(gain) is gain
 
 
 def test_tables_are_for_numbered_actions():
@@ -347,6 +466,36 @@ def test_played_controls_are_recorded():
     assert found.actions.flatten().tolist() == [0, 2, 4, 3, 2]
     assert found.rewards.flatten().tolist() == pytest.approx(earned)
     assert check_world(found, 0.0).share == 0
+
+
+class Track(gym.Env):
+    observation_space = gym.spaces.Box(0, 99, (1,))
+    action_space = gym.spaces.Box(1, 5, (1,), dtype=np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = 0.0
+        return np.array([0.0]), {}
+
+    def step(self, action):
+        self.place += float(action[0])
+        return np.array([self.place]), 0.0, False, False, {}
+
+
+class Fast(SteppedWorld):
+    modalities = (Modality("visual", ("end",), ("offset",), ("m",), (40.0,), 0.01),)
+    ego_features = ("nothing",)
+    controls = (Control("speed", 1, 5),)
+    horizon = 4
+
+    def make(self):
+        return Track()
+
+    def look(self, env):
+        return {"ego": [0.0], "visual": [[40.0 - env.place]]}
+
+    def restore(self, env, observation):
+        env.place = 40.0 - float(observation["visual"][0, 0])
 
 
 class Pair(gym.Env):

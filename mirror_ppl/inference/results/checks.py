@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
-from mirror_ppl.domains.base import Domain, map_state, total_reward
+from mirror_ppl.domains.base import FUTURES, Domain, map_state, total_reward
 from mirror_ppl.inference.results.summary import predictive
 
 REPLICATES = 2000
@@ -146,7 +146,13 @@ def steps_of(domain: Domain, rounds: Demonstrations, log_probability: Tensor) ->
     state, actions = domain.state_behind(now), len(domain.actions)
     each = map_state(lambda part: part.repeat_interleave(actions, 0), state)
     action = torch.arange(actions, device=real.device).repeat(int(real.sum()))
-    earned = total_reward(domain.rewards(each, action, domain.transition(each, action)))
+    chance = torch.Generator(real.device).manual_seed(0)
+    futures = FUTURES if domain.random else 1
+    earned = torch.zeros(len(action), device=real.device)
+    for _ in range(futures):
+        each = domain.redrawn(each, chance)
+        following = domain.transition(each, action)
+        earned += total_reward(domain.rewards(each, action, following)) / futures
     return Steps(
         rounds.actions[0][real],
         log_probability[:, 0][:, real],
