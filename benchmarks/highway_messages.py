@@ -13,10 +13,11 @@ file it prints the table of the rows that are there.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
+
+from benchmarks._rows import rows_in
 
 ROWS = Path(__file__).parents[1] / "docs/results/highway_messages.csv"
 NAMES = {"none": "silence", "all": "everything", "nearest": "nearest hidden car"}
@@ -81,14 +82,7 @@ def main() -> None:
     )
     parser.add_argument("file", nargs="?", type=Path, help="what `assist --json` wrote")
     given = parser.parse_args().file
-    if given:
-        rows = rows_of(given)
-        with ROWS.open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
-    with ROWS.open(newline="") as file:
-        print(table(list(csv.DictReader(file))))
+    print(table(rows_in(ROWS, rows_of(given) if given else ())))
 
 
 if __name__ == "__main__":

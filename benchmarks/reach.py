@@ -15,13 +15,14 @@ the summaries of these fits. Without folders it prints the table of the rows tha
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean
 
 from scipy.stats import beta
+
+from benchmarks._rows import rows_in
 
 ROWS = Path(__file__).parents[1] / "docs/results/highway_reach.csv"
 SIGHT = "sight_"
@@ -80,14 +81,7 @@ def main() -> None:
     )
     parser.add_argument("folders", nargs="*", type=Path, help="folders of fits")
     given = parser.parse_args().folders
-    if given:
-        rows = [row for folder in given for row in rows_of(folder)]
-        with ROWS.open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
-    with ROWS.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(ROWS, [row for folder in given for row in rows_of(folder)])
     print(table(rows))
     people = list({(row["fit"], row["person"]): row for row in rows}.values())
     for name in ("nll", "floor", "nll_base_rate", "nll_no_implants"):

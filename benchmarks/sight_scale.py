@@ -16,7 +16,6 @@ larger scales, and of none, are too low if draws leave out what only they make p
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 from pathlib import Path
 
@@ -24,6 +23,7 @@ import arviz as az
 import numpy as np
 import torch
 
+from benchmarks._rows import rows_in
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.models.implants import alike, sight_sites
 
@@ -64,18 +64,12 @@ def main() -> None:
     )
     parser.add_argument("folder", nargs="?", type=Path, help="folder of a fit")
     folder = parser.parse_args().folder
-    if folder:
-        with ROWS.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(["scale", "person", "log_bayes_factor"])
-            for scale in SCALES:
-                factors = log_bayes_factors(folder / "posterior.nc", scale)
-                for person, factor in enumerate(factors, 1):
-                    writer.writerow([f"{scale:g}", person, f"{factor:.4f}"])
-    with ROWS.open(newline="") as file:
-        rows = [
-            (float(row["scale"]), float(row["log_bayes_factor"])) for row in csv.DictReader(file)
-        ]
+    new = [
+        {"scale": f"{scale:g}", "person": str(person), "log_bayes_factor": f"{factor:.4f}"}
+        for scale in SCALES * bool(folder)
+        for person, factor in enumerate(log_bayes_factors(folder / "posterior.nc", scale), 1)
+    ]
+    rows = [(float(row["scale"]), float(row["log_bayes_factor"])) for row in rows_in(ROWS, new)]
     for scale in dict.fromkeys(scale for scale, _ in rows):
         own = [factor for other, factor in rows if other == scale]
         print(f"scale {scale:4g}: {sum(own):6.2f}  (lowest {min(own):.2f})")
