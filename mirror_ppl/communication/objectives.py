@@ -126,11 +126,12 @@ class ExpectedUtility:
 
         @torch.no_grad()
         def value(candidates: Tensor) -> Valued:
-            tree = _Tree(context, candidates, self.world.draws)
+            worlds, roots = rollouts.observation(0)["ego"].shape[:2]
+            tree = _Tree(context, candidates, worlds, roots)
             utility = torch.zeros(len(candidates), person.number, device=device)
             if self.terminal_value:
-                world = torch.arange(person.number, device=device) % self.world.draws
-                utility += rollouts.values(0)[world, 0]
+                draw = torch.arange(person.number, device=device)
+                utility += rollouts.values(0)[draw % worlds, draw % roots]
             predicted = []
             for step in range(horizon):
                 observation = {
@@ -173,7 +174,9 @@ class _Tree:
         group_of: group of each candidate and draw, ``[C, S]``.
     """
 
-    def __init__(self, context: PlanningContext, candidates: Tensor, worlds: int) -> None:
+    def __init__(
+        self, context: PlanningContext, candidates: Tensor, worlds: int, roots: int
+    ) -> None:
         device = candidates.device
         person = self.person = context.person
         self.candidates, self.worlds = candidates, worlds
@@ -183,7 +186,7 @@ class _Tree:
         self.candidate = torch.arange(count, device=device).repeat(person.number)
         self.group = torch.arange(len(self.draw), device=device)
         self.group_of = self.group.view(person.number, count).T
-        self.path = torch.zeros_like(self.draw)
+        self.path = self.draw % roots
         self.weight = torch.ones(len(self.draw), device=device)
         self.state = context.before
         self.belief = context.own[person.percept[self.draw]]

@@ -6,7 +6,8 @@ sequence; paths are computed when first requested. The *name* of a path is a num
 ``p`` followed by action ``a`` is ``p * A + a``, and that of the empty path is 0.
 
 There are two worlds. `SelfModelWorld` is the robot's learned world model; `SimulatorWorld` is the
-domain itself. W stands for draws of the world.
+domain itself. W stands for draws of the world in which all paths are computed. In a random domain
+paths begin in R *roots* instead, states with different futures, and each path is of one of them.
 """
 
 from __future__ import annotations
@@ -74,8 +75,8 @@ class RolloutTree:
 
     Args:
         dynamics: of the states.
-        state: the present state, ``[W, 1]``.
-        now: the present observation, ``[W, 1, ...]``.
+        state: the present state ``[W, R]``; R is 1 or, in random domains, the number of futures.
+        now: the present observation, ``[W, R, ...]``.
         actions: number of actions A.
         horizon: maximum number of steps.
 
@@ -92,7 +93,7 @@ class RolloutTree:
                 f"ahead, not {horizon}"
             )
         self.dynamics, self.actions = dynamics, actions
-        root = torch.zeros(1, dtype=torch.long, device=now["ego"].device)
+        root = torch.zeros(now["ego"].shape[1], dtype=torch.long, device=now["ego"].device)
         self._steps = [_Paths(state, root, now)]
 
     def observation(self, step: int) -> Observation:
@@ -219,7 +220,7 @@ class SimulatorWorld:
     def rollouts(self, past: RoundSoFar, horizon: int, generator: torch.Generator) -> RolloutTree:
         """Return the rollouts, see :class:`World`."""
         now = {
-            name: value[None, None].expand(self.draws, 1, *value.shape)
+            name: value[None, None].expand(1, self.draws, *value.shape)
             for name, value in past.now.items()
         }
         state = self.domain.state_behind(now)

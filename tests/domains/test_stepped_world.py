@@ -359,8 +359,8 @@ def test_what_happens_by_chance_is_predicted_in_several_futures():
     past = RoundSoFar(start, [], {"visual": torch.zeros(0, 1, dtype=torch.bool)})
     simulator = SimulatorWorld(windy)
     rollouts = simulator.rollouts(past, 2, torch.Generator().manual_seed(0))
-    path = rollouts.follow(0, torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long))
-    places = rollouts.observation(1)["ego"][:, path, 0]
+    path = rollouts.follow(0, torch.arange(8), torch.ones(8, dtype=torch.long))
+    places = rollouts.observation(1)["ego"][0, path, 0]
     assert simulator.draws == 8 and len(places.unique()) > 1
     assert SimulatorWorld(Way()).draws == 1
 
