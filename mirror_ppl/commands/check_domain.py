@@ -34,16 +34,23 @@ def main(options: Options) -> int:
     Raises:
         DomainError: the file or class is missing, does not import, or is no world.
     """
-    from mirror_ppl.domains.checking import faults_of
+    from mirror_ppl.domains.checking import faults_of, remarks_on
     from mirror_ppl.domains.registry import load_world
+    from mirror_ppl.errors import DomainError
 
     world = load_world(options.domain)
-    if faults := faults_of(world) or _of_record(world):
+    faults, remark = faults_of(world) or _of_record(world), ""
+    if not faults:
+        try:
+            remark = remarks_on(world)
+        except DomainError as error:  # more rounds than those of the check have shown it
+            faults = [str(error)]
+    if faults:
         print(f"{world.name}: {len(faults)} thing{'s' * (len(faults) > 1)} wrong")
         for fault in faults:
             print(f"  {fault}")
         return 1
-    _show(world)
+    _show(world, remark)
     return 0
 
 
@@ -75,15 +82,14 @@ def _of_record(world: World) -> list[str]:
     return found
 
 
-def _show(world: World) -> None:
+def _show(world: World, remark: str) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     from mirror_ppl.console import console_for_tables
-    from mirror_ppl.domains.checking import capabilities, remarks_on
+    from mirror_ppl.domains.checking import capabilities
     from mirror_ppl.domains.controls import bounds_in_words
 
-    remark = remarks_on(world)  # before anything is printed, as a fault may be found
     table = Table(title=f"{world.name}: nothing wrong", box=SIMPLE_HEAD, title_justify="left")
     for column in ("capability", "here", "what it gives"):
         table.add_column(column)

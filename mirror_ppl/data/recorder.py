@@ -12,6 +12,7 @@ import torch
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, require_known
 from mirror_ppl.domains.environment_world import EnvironmentWorld
+from mirror_ppl.domains.registry import known_domains
 from mirror_ppl.errors import InputError
 
 
@@ -33,7 +34,7 @@ class Recorder(gym.Wrapper):
 
     Raises:
         InputError: the world is no
-            :class:`~mirror_ppl.domains.environment_world.EnvironmentWorld`.
+            :class:`~mirror_ppl.domains.environment_world.EnvironmentWorld`, or was not added.
         UnknownNameError: there is no such setting.
     """
 
@@ -44,6 +45,10 @@ class Recorder(gym.Wrapper):
         if not isinstance(world, EnvironmentWorld):
             raise InputError(
                 "the world has to be one of a Gymnasium environment (GymnasiumWorld, SteppedWorld)"
+            )
+        if not any(world is known for known in known_domains()):
+            raise InputError(
+                f"{world.name} is not known; add it first, world = mirror_ppl.add_domain(...)"
             )
         self.world, self.person = world, person
         self.setting = require_known(
@@ -63,6 +68,8 @@ class Recorder(gym.Wrapper):
         Raises:
             InputError: the round does not begin in one of the world's states.
         """
+        if not isinstance(self.person, str) or not self.person.strip():
+            raise InputError(f"person has to be a name, not {self.person!r}")
         if seed is None:
             seed = int(self._chooser.integers(self.world.layouts))
         found = self.env.reset(seed=seed, options=options)
@@ -80,12 +87,14 @@ class Recorder(gym.Wrapper):
         """Record that items are communicated before the next action.
 
         Raises:
+            InputError: the round has not begun or is over.
             UnknownNameError: there is no such modality or item.
         """
         known = {m.name: m.items for m in self.world.modalities}
         own = known[require_known(modality, "modality", tuple(known), self.world.name)]
-        for item in items:
-            self._told.append((modality, own.index(require_known(item, "item", own, modality))))
+        numbers = [own.index(require_known(item, "item", own, modality)) for item in items]
+        self._require_begun()
+        self._told += [(modality, number) for number in numbers]
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play one step; see `gymnasium.Env.step`.
@@ -94,13 +103,13 @@ class Recorder(gym.Wrapper):
             InputError: the round has not begun or is over, the world has no such action, or the
                 environment terminates where the world does not, or not where it does.
         """
-        if not self._rounds or self._rounds[-1].over:
-            raise InputError("the round is over or has not begun; call reset()")
+        self._require_begun()
         number, control = self.world.action_of(action)
         if control is not None:  # within the bounds, where the given one is by a rounding error
             action = control.astype(np.asarray(action).dtype)
-        found, reward, terminated, truncated, info = self.env.step(action)
         now = self._rounds[-1]
+        now.over = True  # if the step fails, the round cannot go on
+        found, reward, terminated, truncated, info = self.env.step(action)
         seen = self.world.look(self.env.unwrapped)
         terms = self.world.named_terms(self.env, action, float(reward), bool(terminated))
         now.add(number, control, self._told, sum(terms.values()), seen)
@@ -114,6 +123,10 @@ class Recorder(gym.Wrapper):
                 "says otherwise; mend the world (done), as the recording contradicts it"
             )
         return found, float(reward), terminated, truncated, info
+
+    def _require_begun(self) -> None:
+        if not self._rounds or self._rounds[-1].over:
+            raise InputError("the round is over or has not begun; call reset()")
 
     def recordings(self) -> Demonstrations:
         """Return all rounds so far, by person in the order of their first rounds.

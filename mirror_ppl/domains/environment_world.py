@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from copy import copy
+from operator import index
 from typing import Any
 
 import gymnasium as gym
@@ -35,12 +36,15 @@ class EnvironmentWorld(World):
         moves: the environment's actions that people may take, in the order of ``actions``; the
             first ones unless given. Without meaning where there are ``controls``.
         layouts: number of resets, with the seeds 0, 1 and so on.
-        likely_cause: what messages name where outcomes are not those of the environment.
     """
 
     moves: tuple[int, ...] = ()
     layouts: int = 20
-    likely_cause: str = UNSEEN
+
+    @property
+    def likely_cause(self) -> str:
+        """Name what may be wrong where outcomes are not those of the environment."""
+        return f"steps are random (then it has to be a SteppedWorld), or {UNSEEN}"
 
     @abstractmethod
     def make(self) -> gym.Env:
@@ -123,9 +127,13 @@ class EnvironmentWorld(World):
         """
         if not self.controls:
             moves = self._moves
-            if command not in moves:
+            try:
+                number = None if isinstance(command, bool | np.bool_) else index(command)
+            except TypeError:
+                number = None
+            if number not in moves:
                 raise InputError(f"action has to be one of {moves} (moves), not {command!r}")
-            return moves.index(command), None
+            return moves.index(number), None
         low, high = np.transpose([(one.low, one.high) for one in self.controls])
         return action_at(self.controls, command), np.array(command, float).clip(low, high)
 
@@ -143,6 +151,12 @@ class EnvironmentWorld(World):
         from what was observed before it.
         """
         env, chooser = self.make(), np.random.default_rng(0)
+        inner: Any = env
+        while isinstance(inner, gym.Wrapper):
+            limit = getattr(inner, "_max_episode_steps", self.horizon)
+            if limit < self.horizon:
+                return [f"the environment truncates rounds; horizon may be {limit} at most"]
+            inner = inner.env
         for seed in range(min(PLAYED, self.layouts)):
             env.reset(seed=seed)
             if self.terminates(self.look(env.unwrapped)):

@@ -345,7 +345,9 @@ def _visited(world: GymnasiumWorld) -> Tables:
             )
             if not same:
                 raise DomainError(
-                    f"{world.name}: outcomes of actions in {seen[number]} vary; {UNSEEN}"
+                    f"{world.name}: outcomes of actions in "
+                    f"{ {n: p.tolist() for n, p in seen[number].items()} } vary; "
+                    f"{world.likely_cause}"
                 )
     return Tables(
         {name: torch.stack([one[name] for one in seen]) for name in seen[0]},

@@ -34,7 +34,17 @@ from mirror_ppl.domains.environment_world import (
 )
 from mirror_ppl.errors import DomainError
 
-CACHED = ("_env", "_commands", "_sizes", "_outcomes", "_starts", "_done", "_left_to_try", "_dtype")
+CACHED = (
+    "_env",
+    "_commands",
+    "_sizes",
+    "_outcomes",
+    "_starts",
+    "_done",
+    "_left_to_try",
+    "_ends_to_try",
+    "_dtype",
+)
 """Attributes that are of one process: the environment, and what was seen of it."""
 MOST_OUTCOMES = 500_000
 """Number of outcomes that are kept."""
@@ -42,6 +52,8 @@ SEEDS = 2**31
 """Number of seeds of what happens by chance."""
 TRIED_TWICE = 100
 """Number of outcomes that are computed twice, to detect what cannot be observed."""
+ENDS_TRIED = 20
+"""Number of those at which the task is done."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +79,16 @@ class SteppedWorld(EnvironmentWorld):
     """
 
     layouts = 1000
-    likely_cause = (
-        "restore() does not set all that step() reads, steps draw random numbers (random), or "
-        f"{UNSEEN}"
-    )
+
+    @property
+    def likely_cause(self) -> str:
+        """Name what may be wrong where outcomes are not those of the environment."""
+        chance = (
+            "steps draw from another generator than np_random, or from one kept from reset()"
+            if self.random
+            else "steps are random (then random = True)"
+        )
+        return f"restore() does not set all that step() reads, {chance}, or {UNSEEN}"
 
     @abstractmethod
     def restore(self, env: Any, observation: Mapping[str, np.ndarray]) -> None:
@@ -102,6 +120,8 @@ class SteppedWorld(EnvironmentWorld):
         seeds = torch.randint(self.layouts, (batch,), generator=generator, device=device).tolist()
         for seed in set(seeds) - self._starts.keys():
             self._env.reset(seed=seed)
+            if self.done(self._env.unwrapped):
+                raise DomainError(f"{self.name}: the task is done where rounds begin (seed {seed})")
             self._starts[seed] = torch.from_numpy(self._look())
         values = torch.stack([self._starts[seed] for seed in seeds]).to(device)
         begun = torch.zeros(batch, dtype=torch.bool, device=device)
@@ -210,10 +230,13 @@ class SteppedWorld(EnvironmentWorld):
     ) -> tuple[np.ndarray, bool, np.ndarray]:
         """Return the observation after an action, whether the task is done, and reward terms."""
         found = self._step(row, command, seed)
-        if self._left_to_try:
-            self._left_to_try.pop()
+        reached, end, _ = found
+        left = self._ends_to_try if end else self._left_to_try
+        if left:
+            left.pop()
             again = self._step(row, command, seed)
-            reached, _, _ = found
+            self._restored(row)  # from elsewhere; it may be imagined, so it need not look the same
+            self._require_done(row, False)
             self._restored(reached)
             off = np.abs(self._look() - reached) > TOLERANCE * (1 + np.abs(reached))
             if off.any():
@@ -221,6 +244,7 @@ class SteppedWorld(EnvironmentWorld):
                     f"{self.name}: restore() of the observation {reached.tolist()} leads to "
                     f"{self._look().tolist()}"
                 )
+            self._require_done(reached, end)
             for one, other in zip(found, again, strict=True):
                 if np.abs(np.subtract(one, other, dtype=float)).max() > CLOSE:
                     raise DomainError(
@@ -228,6 +252,13 @@ class SteppedWorld(EnvironmentWorld):
                         f"{self.likely_cause}"
                     )
         return found
+
+    def _require_done(self, row: np.ndarray, end: bool) -> None:
+        if bool(self.done(self._env.unwrapped)) != end:
+            raise DomainError(
+                f"{self.name}: done() is {not end} after restore() of {row.tolist()}, expected "
+                f"{end}; restore() does not set all that done() reads"
+            )
 
     def _step(
         self, row: np.ndarray, command: Any, seed: int
@@ -264,7 +295,10 @@ class SteppedWorld(EnvironmentWorld):
     def _look(self) -> np.ndarray:
         seen = self.look(self._env.unwrapped)
         flat = [np.asarray(seen[name], self._dtype).ravel() for name in self._sizes]
-        return np.concatenate(flat)
+        row = np.concatenate(flat)
+        if not np.isfinite(row).all():
+            raise DomainError(f"{self.name}: look() has {row.tolist()}, expected finite numbers")
+        return row
 
     @cached_property
     def _dtype(self) -> np.dtype:
@@ -310,6 +344,10 @@ class SteppedWorld(EnvironmentWorld):
     @cached_property
     def _left_to_try(self) -> list[None]:
         return [None] * TRIED_TWICE
+
+    @cached_property
+    def _ends_to_try(self) -> list[None]:
+        return [None] * ENDS_TRIED
 
 
 def _listed(shapes: Mapping[str, torch.Size]) -> str:

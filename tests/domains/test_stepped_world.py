@@ -15,7 +15,7 @@ from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.domains import Control, Modality, add_domain
 from mirror_ppl.domains.checking import faults_of, remarks_on
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
-from mirror_ppl.domains.registry import load_world
+from mirror_ppl.domains.registry import know, load_world
 from mirror_ppl.domains.stepped_world import SteppedWorld
 from mirror_ppl.errors import DomainError, InputError
 
@@ -131,6 +131,19 @@ class Unseen(Way):
         env.speed = 0
 
 
+class Cut(Walk):
+    """Truncates rounds itself."""
+
+    def reset(self, **given):
+        self.steps = 0
+        return super().reset(**given)
+
+    def step(self, action):
+        self.steps += 1
+        seen, reward, end, _, info = super().step(action)
+        return seen, reward, end, self.steps == 3, info
+
+
 class Arrived(Walk):
     def reset(self, *, seed=None, options=None):
         self.place = 10
@@ -161,6 +174,62 @@ class Endless(Way):
         return False
 
 
+class Cliff(Walk):
+    """Who goes beyond the ninth step stays there and has fallen, which cannot be seen."""
+
+    def reset(self, *, seed=None, options=None):
+        self.fell = False
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.place += int(action)
+        self.fell |= self.place > 9
+        self.place = min(self.place, 9)
+        return np.array([self.place]), 0.0, self.fell, False, {}
+
+
+class Edge(Way):
+    """The flag is restored, and observed as the place."""
+
+    horizon = 12
+
+    def make(self):
+        return Cliff()
+
+    def look(self, env):
+        return {"ego": [env.place + env.fell], "visual": [[10 - env.place]]}
+
+    def restore(self, env, observation):
+        place = int(observation["ego"][0])
+        env.place, env.fell = min(place, 9), place > 9
+
+    def done(self, env):
+        return env.fell
+
+
+class Left(Edge):
+    """Nothing is done about the flag."""
+
+    def look(self, env):
+        return {"ego": [env.place], "visual": [[10 - env.place]]}
+
+    def restore(self, env, observation):
+        env.place = min(int(observation["ego"][0]), 9)
+
+
+class Cleared(Left):
+    def restore(self, env, observation):
+        super().restore(env, observation)
+        env.fell = False
+
+
+class Stuck(Edge):
+    """The flag is observed, and not restored."""
+
+    def restore(self, env, observation):
+        env.place = min(int(observation["ego"][0]), 9)
+
+
 def moved(state):
     return replace(state, values=state.values - torch.tensor([0.0, 1.0]))
 
@@ -170,9 +239,17 @@ def moved(state):
     [
         (Forgetful, {}, "restore.. of the observation"),
         (Idle, {}, "restore.. of the observation"),
+        (Left, {}, "done.. is True after restore.. of .*, expected False; restore.. does not set"),
+        (Cleared, {}, "done.. is False after restore.. of .*, expected True"),
+        (Stuck, {}, "done.. is True after restore.. of .*, expected False"),
+        (
+            Way,
+            {"look": lambda self, env: {"ego": [np.nan], "visual": [[0.0]]}},
+            r"look.. has \[nan, 0.0\], expected finite numbers",
+        ),
         (Way, {"make": lambda self: Random()}, "vary; restore.. does not set all"),
-        (Way, {"make": lambda self: Wind()}, r"vary; .*steps draw random numbers \(random\)"),
-        (Windy, {"make": lambda self: Dice()}, r"vary; .*steps draw random numbers \(random\)"),
+        (Way, {"make": lambda self: Wind()}, r"vary; .*steps are random \(then random = True"),
+        (Windy, {"make": lambda self: Dice()}, "vary; .*another generator than np_random"),
         (Windy, {"redrawn": lambda self, state, generator: state}, "expected other seeds"),
         (
             Windy,
@@ -185,6 +262,7 @@ def moved(state):
             r"step 1 after reset.seed=\d.: after \d, ego is .* but computed as .*restore..",
         ),
         (Way, {"make": lambda self: gym.wrappers.TimeLimit(Walk(), 4)}, "may be 4 at most"),
+        (Way, {"make": lambda self: Cut()}, "may be 3 at most"),
         (Named, {}, "terms.. has walked, expected reward"),
         (Way, {"make": lambda self: Arrived()}, "done where rounds begin .seed 0"),
         (Endless, {"horizon": 12}, "but done.. says otherwise"),
@@ -232,6 +310,33 @@ def test_controls_are_executed_as_they_are_recorded():
     assert env.unwrapped.place == 5.0
 
 
+def test_a_flag_that_is_observed_and_restored_is_sound():
+    assert faults_of(Edge()) == []
+
+
+def test_a_session_is_refused_where_it_goes_wrong():
+    way = Way()
+    with pytest.raises(InputError, match="way is not known; add it first"):
+        Recorder(way.make(), way)
+    env = Recorder(way.make(), add_domain(way))
+    with pytest.raises(InputError, match="has not begun"):
+        env.tell("visual", "end")
+    env.person = ""
+    with pytest.raises(InputError, match="person has to be a name, not ''"):
+        env.reset(seed=0)
+    env.person = "ada"
+    env.reset(seed=0)
+    for other in (True, 1.0, "1", np.array([1])):
+        with pytest.raises(InputError, match="action has to be one of"):
+            env.step(other)
+    env.step(np.int64(1))
+    env.unwrapped.step = lambda action: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        env.step(1)
+    with pytest.raises(InputError, match="call reset"):
+        env.step(1)
+
+
 def test_what_a_world_needs_is_named():
     kind = type("Half", (Way,), {"restore": SteppedWorld.restore})
     with pytest.raises(DomainError, match="Half needs restore; see docs"):
@@ -246,7 +351,7 @@ def test_remarks_say_whether_ends_were_checked():
 
 
 def test_recorded_rounds_end_where_the_world_says_so():
-    way = Endless()
+    way = know(Endless())  # its check would find the fault
     env = Recorder(way.make(), way)
     env.reset(seed=next(seed for seed in range(99) if _place(way, seed) == 7))
     env.step(1)
@@ -256,7 +361,7 @@ def test_recorded_rounds_end_where_the_world_says_so():
 
 
 def test_rounds_do_not_go_on_where_the_world_has_ended():
-    early = type("Early", (Way,), {"done": lambda self, env: env.place >= 9})()
+    early = know(type("Early", (Way,), {"done": lambda self, env: env.place >= 9})())
     env = Recorder(early.make(), early)
     env.reset(seed=next(seed for seed in range(99) if _place(early, seed) == 7))
     env.step(1)
