@@ -264,7 +264,7 @@ def moved(state):
         (Way, {"make": lambda self: gym.wrappers.TimeLimit(Walk(), 4)}, "may be 4 at most"),
         (Way, {"make": lambda self: Cut()}, "may be 3 at most"),
         (Named, {}, "terms.. has walked, expected reward"),
-        (Way, {"make": lambda self: Arrived()}, "done where rounds begin .seed 0"),
+        (Way, {"make": lambda self: Arrived()}, "done where rounds begin .seed"),
         (Endless, {"horizon": 12}, "but done.. says otherwise"),
         (Way, {"look": lambda self, env: {"ego": [0.0, 1.0], "visual": [[0.0]]}}, "look.. has ego"),
         (Way, {"moves": (0, 2)}, "the environment has 2 actions, from 0 on, and no 2"),

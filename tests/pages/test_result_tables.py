@@ -4,7 +4,8 @@ import csv
 
 import pytest
 
-from benchmarks import highway_messages
+from benchmarks import example_world, highway_messages
+from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
 from benchmarks.tables import DOCS, RESULTS, results_page, studies, study_page
@@ -58,6 +59,17 @@ def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
     rounds = int(silent["people"]) * int(silent["rounds"])
     assert rounds == 80 and round(float(silent["mishaps"]) * rounds) == 1
     assert "Of 80 rounds in silence one ended in an accident" in words
+
+
+def test_the_example_of_a_random_world_is_what_its_rows_say():
+    page = (DOCS / "adding_a_world.md").read_text()
+    found = page.partition("<!-- obstacles -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == example_world.table(rows_in(example_world.MESSAGES))
+    assert example_world.held(rows_in(example_world.IMPLANTS)) == {
+        "sight_around": 10,
+        "consistency": 10,
+    }
+    assert "hold all ten thresholds and all ten consistencies" in " ".join(page.split())
 
 
 def test_the_table_of_reaches_is_what_its_rows_say():
