@@ -6,7 +6,7 @@ r"""What is inferred of people among rolling balls, and what messages are worth 
     python -m mirror_ppl.fit --domain docs/examples/obstacles.py:Obstacles --demos runs/balls.nc \
         --train-rounds 20 --explore 0 --out runs/balls
     python -m mirror_ppl.assist --domain docs/examples/obstacles.py:Obstacles \
-        --posterior runs/balls/posterior.nc --rounds 10 \
+        --posterior runs/balls/posterior.nc --rounds 5 \
         --communicator none nearest all mirror oracle --json runs/balls.json
     python -m benchmarks.example_world runs/balls/summary.json runs/balls.json
 

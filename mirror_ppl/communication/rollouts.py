@@ -224,8 +224,7 @@ class SimulatorWorld:
             for name, value in past.now.items()
         }
         state = self.domain.state_behind(now)
-        if self.domain.random:
-            state = self.domain.redrawn(state, generator)
+        state = self.domain.redrawn(state, generator)
         return RolloutTree(self, state, now, len(self.domain.actions), horizon)
 
     def observe(self, state: Any) -> Observation:

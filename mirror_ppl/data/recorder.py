@@ -111,7 +111,7 @@ class Recorder(gym.Wrapper):
         now.over = True  # if the step fails, the round cannot go on
         found, reward, terminated, truncated, info = self.env.step(action)
         seen = self.world.look(self.env.unwrapped)
-        terms = self.world.named_terms(self.env, action, float(reward), bool(terminated))
+        terms = self.world.named_terms(self.env, action, reward, terminated)
         now.add(number, control, self._told, sum(terms.values()), seen)
         self._told = []
         truncated = truncated or len(now.actions) == self.world.horizon

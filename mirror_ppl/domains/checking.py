@@ -286,6 +286,8 @@ def remarks_on(world: World) -> str:
         earned += total_reward(world.rewards(state, action, following))[~ended].tolist()
         state, ended = following, ended | world.over(following)
     number = int(ended.sum())
+    if not earned:
+        return "all rounds are over where they begin"
     remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
     if not offers(world, "over"):
         return remark

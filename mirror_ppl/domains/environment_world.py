@@ -64,9 +64,9 @@ class EnvironmentWorld(World):
         return {self.reward_terms[0]: reward}
 
     def named_terms(
-        self, env: gym.Env, action: Any, reward: float, terminated: bool
+        self, env: gym.Env, action: Any, reward: Any, terminated: bool
     ) -> dict[str, float]:
-        """Return `terms` of a step that an environment has taken.
+        """Return `terms` of a step that an environment has taken, its reward of any numeric kind.
 
         Raises:
             DomainError: they are not the world's.
@@ -134,8 +134,12 @@ class EnvironmentWorld(World):
             if number not in moves:
                 raise InputError(f"action has to be one of {moves} (moves), not {command!r}")
             return moves.index(number), None
-        low, high = np.transpose([(one.low, one.high) for one in self.controls])
-        return action_at(self.controls, command), np.array(command, float).clip(low, high)
+        return action_at(self.controls, command), np.array(command, float).clip(*self._bounds)
+
+    @property
+    def _bounds(self) -> np.ndarray:
+        """Least and largest values of the controls, ``[2, C]``."""
+        return np.transpose([(one.low, one.high) for one in self.controls])
 
     def seed_chance(self, env: gym.Env, state: Any) -> None:
         """Let an environment draw in its next step what the state holds; nothing is drawn here."""
@@ -151,7 +155,7 @@ class EnvironmentWorld(World):
         from what was observed before it.
         """
         env, chooser = self.make(), np.random.default_rng(0)
-        inner: Any = env
+        commands, inner = self.commands(env), env
         while isinstance(inner, gym.Wrapper):
             limit = getattr(inner, "_max_episode_steps", self.horizon)
             if limit < self.horizon:
@@ -162,7 +166,12 @@ class EnvironmentWorld(World):
             if self.terminates(self.look(env.unwrapped)):
                 return [f"the task is done where rounds begin (seed {seed})"]
             for step in range(self.horizon):
-                fault, end = self._fault_of_step(env, chooser, step)
+                number = int(chooser.integers(len(commands)))
+                command, action = commands[number], torch.tensor(number)
+                if self.controls:
+                    command = chooser.uniform(*self._bounds).astype(command.dtype)
+                    action = torch.from_numpy(command).to(torch.get_default_dtype())
+                fault, end = self._fault_of_step(env, command, action, step)
                 if fault:
                     return [f"step {step} after reset(seed={seed}): {fault}"]
                 if end:
@@ -170,20 +179,13 @@ class EnvironmentWorld(World):
         return []
 
     def _fault_of_step(
-        self, env: gym.Env, chooser: np.random.Generator, step: int
+        self, env: gym.Env, command: Any, action: Tensor, step: int
     ) -> tuple[str, bool]:
-        """Take a random step; return what the world computes otherwise, and whether it ended."""
-        before = as_tensors(self.look(env.unwrapped))
-        number = int(chooser.integers(len(self.actions)))
-        command, action = self.commands(env)[number], torch.tensor(number)
-        if self.controls:
-            low, high = np.transpose([(one.low, one.high) for one in self.controls])
-            command = chooser.uniform(low, high).astype(command.dtype)
-            action = torch.from_numpy(command).to(before["ego"])
-        state = self.state_behind(before)
+        """Take a step; return what the world computes otherwise, and whether it ended."""
+        state = self.state_behind(as_tensors(self.look(env.unwrapped)))
         self.seed_chance(env, state)
         _, reward, end, cut, _ = env.step(copy(command))
-        own = as_tensors(self.named_terms(env, command, float(reward), bool(end)))
+        own = as_tensors(self.named_terms(env, command, reward, end))
         found = as_tensors(self.look(env.unwrapped))
         following = self.transition(state, action)
         for values, computed in (

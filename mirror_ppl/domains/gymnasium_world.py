@@ -315,7 +315,7 @@ def _visited(world: GymnasiumWorld) -> Tables:
             found.append(
                 (
                     visit(bool(terminated)),
-                    world.named_terms(env, move, float(reward), bool(terminated)),
+                    world.named_terms(env, move, reward, terminated),
                 )
             )
         return found

@@ -272,7 +272,7 @@ class SteppedWorld(EnvironmentWorld):
                 f"{self.name}: the environment {'is' if end else 'is not'} terminated after "
                 f"{command} in {row.tolist()}, but done() says otherwise"
             )
-        own = self.named_terms(self._env, command, float(reward), end)
+        own = self.named_terms(self._env, command, reward, end)
         earned = np.array([own[name] for name in self.reward_terms], float)
         return self._look(), end, earned
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import torch
-from walks import Way, Windy
+from stepped_worlds import Way, Windy
 
 from mirror_ppl.communication import Communicator, ExpectedUtility, Person
 from mirror_ppl.communication.objectives import Valued
@@ -93,7 +93,7 @@ class Toss(SteppedWorld):
 
 
 def test_chance_that_draws_share_counts_once_in_standard_errors(seed):
-    """Of 100 plans with two standard errors of eight futures, some 4% gain by chance."""
+    """Gains by chance are as large as standard errors say, though 200 draws share 8 futures."""
     toss = add_domain(Toss)
     torch.manual_seed(seed)
     human = PerceptualOnly(SelfModel(toss, Sizes()).eval())

@@ -8,43 +8,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from walks import Walk, Way, Wind, Windy
+from stepped_worlds import Endless, Swing, Walk, Way, Wind, Windy
 
-from mirror_ppl.data.contradictions import check_world
-from mirror_ppl.data.recorder import Recorder
-from mirror_ppl.domains import Control, Modality, add_domain
+from mirror_ppl.domains import Control, Modality
 from mirror_ppl.domains.checking import faults_of, remarks_on
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
-from mirror_ppl.domains.registry import know, load_world
+from mirror_ppl.domains.registry import load_world
 from mirror_ppl.domains.stepped_world import SteppedWorld
-from mirror_ppl.errors import DomainError, InputError
+from mirror_ppl.errors import DomainError
 
 
-class Swing(SteppedWorld):
-    """Gymnasium's pendulum; who looks sees where its end is."""
-
-    modalities = (Modality("visual", ("end",), ("up", "right"), ("m", "m"), (1.0, 1.0), 0.01),)
-    ego_features = ("speed",)
-    controls = (Control("torque", -2, 2, 5, "Nm"),)
-    horizon = 5
-    reach_bins = (0.0, 1.0)
-    positions = ("up", "right")
-
-    def make(self):
-        return gym.make("Pendulum-v1")
-
-    def look(self, env):
-        angle, speed = env.state
-        return {"ego": [speed], "visual": [[np.cos(angle), np.sin(angle)]]}
-
-    def restore(self, env, observation):
-        up, right = observation["visual"][0].astype(float)
-        env.state = np.array([np.arctan2(right, up), float(observation["ego"][0])])
-
-
-@pytest.mark.parametrize("kind", ["Swing", "Way", "Windy"])
+@pytest.mark.parametrize("kind", [Swing, Way, Windy])
 def test_such_worlds_keep_the_contract(kind):
-    assert faults_of(globals()[kind]()) == []
+    assert faults_of(kind()) == []
 
 
 def test_pendulum_moves_as_when_it_is_stepped():
@@ -169,11 +145,6 @@ class Random(Walk):
         return np.array([self.place]), 0.0, self.place >= 10, False, {}
 
 
-class Endless(Way):
-    def done(self, env):
-        return False
-
-
 class Cliff(Walk):
     """Who goes beyond the ninth step stays there and has fallen, which cannot be seen."""
 
@@ -291,50 +262,8 @@ def test_steps_of_different_worlds_are_compared_in_tables_too():
     assert "terms() has reward, more, expected reward" in faults_of(kind())[0]
 
 
-def test_rounds_of_different_lengths_do_not_contradict_controls_without_0():
-    drive = add_domain(type("Drive", (Fast,), {}))
-    env = Recorder(drive.make(), drive)
-    for steps in (2, 4):
-        env.reset(seed=0)
-        for _ in range(steps):
-            env.step(np.array([3.0]))
-    assert check_world(env.recordings(), 0.0).share == 0
-
-
-def test_controls_are_executed_as_they_are_recorded():
-    drive = add_domain(Fast)
-    env = Recorder(drive.make(), drive)
-    env.reset(seed=0)
-    env.step(np.array([5.001]))  # within a thousandth of a level
-    assert env.recordings().controls.tolist() == [[[[5.0]]]]
-    assert env.unwrapped.place == 5.0
-
-
 def test_a_flag_that_is_observed_and_restored_is_sound():
     assert faults_of(Edge()) == []
-
-
-def test_a_session_is_refused_where_it_goes_wrong():
-    way = Way()
-    with pytest.raises(InputError, match="way is not known; add it first"):
-        Recorder(way.make(), way)
-    env = Recorder(way.make(), add_domain(way))
-    with pytest.raises(InputError, match="has not begun"):
-        env.tell("visual", "end")
-    env.person = ""
-    with pytest.raises(InputError, match="person has to be a name, not ''"):
-        env.reset(seed=0)
-    env.person = "ada"
-    env.reset(seed=0)
-    for other in (True, 1.0, "1", np.array([1])):
-        with pytest.raises(InputError, match="action has to be one of"):
-            env.step(other)
-    env.step(np.int64(1))
-    env.unwrapped.step = lambda action: 1 / 0
-    with pytest.raises(ZeroDivisionError):
-        env.step(1)
-    with pytest.raises(InputError, match="call reset"):
-        env.step(1)
 
 
 def test_what_a_world_needs_is_named():
@@ -350,34 +279,9 @@ def test_remarks_say_whether_ends_were_checked():
     assert remarks_on(Swing()).endswith("0 of 100 rounds ended, so ends were not checked")
 
 
-def test_recorded_rounds_end_where_the_world_says_so():
-    way = know(Endless())  # its check would find the fault
-    env = Recorder(way.make(), way)
-    env.reset(seed=next(seed for seed in range(99) if _place(way, seed) == 7))
-    env.step(1)
-    env.step(1)
-    with pytest.raises(InputError, match=r"has terminated after step 2, but endless .*done"):
-        env.step(1)
-
-
-def test_rounds_do_not_go_on_where_the_world_has_ended():
-    early = know(type("Early", (Way,), {"done": lambda self, env: env.place >= 9})())
-    env = Recorder(early.make(), early)
-    env.reset(seed=next(seed for seed in range(99) if _place(early, seed) == 7))
-    env.step(1)
-    with pytest.raises(InputError, match="has not terminated after step 1, but early says other"):
-        env.step(1)
-
-
 def test_controls_have_different_names():
     with pytest.raises(DomainError, match="controls need different names, found .'a', 'a'"):
         type("Twins", (Swing,), {"controls": (Control("a"), Control("a"))})()
-
-
-def _place(way, seed):
-    env = way.make()
-    env.reset(seed=seed)
-    return env.place
 
 
 def test_controls_outside_the_bounds_are_not_stepped():
@@ -401,54 +305,6 @@ def test_tables_are_for_numbered_actions():
     )
     (fault,) = faults_of(kind())
     assert "has to be a SteppedWorld" in fault
-
-
-def test_played_controls_are_recorded():
-    swing = add_domain(Swing)
-    env = Recorder(swing.make(), swing, person="ada")
-    env.reset(seed=5)
-    torques = (-2.0, 0.3, 1.6, 1.4, 0.0)
-    earned = [env.step(np.array([torque], np.float32))[1] for torque in torques]
-    with pytest.raises(InputError, match="over"):
-        env.step(np.zeros(1))
-    env.reset()
-    with pytest.raises(InputError, match=r"shape \(1,\), torque -2 to 2; \[5.0\] is out of bounds"):
-        env.step(np.array([5.0]))
-    found = env.recordings()
-    assert found.controls.flatten().tolist() == pytest.approx([-2.0, 0.3, 1.6, 1.4, 0.0])
-    assert found.actions.flatten().tolist() == [0, 2, 4, 3, 2]
-    assert found.rewards.flatten().tolist() == pytest.approx(earned)
-    assert check_world(found, 0.0).share == 0
-
-
-class Track(gym.Env):
-    observation_space = gym.spaces.Box(0, 99, (1,))
-    action_space = gym.spaces.Box(1, 5, (1,), dtype=np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place = 0.0
-        return np.array([0.0]), {}
-
-    def step(self, action):
-        self.place += float(action[0])
-        return np.array([self.place]), 0.0, False, False, {}
-
-
-class Fast(SteppedWorld):
-    modalities = (Modality("visual", ("end",), ("offset",), ("m",), (40.0,), 0.01),)
-    ego_features = ("nothing",)
-    controls = (Control("speed", 1, 5),)
-    horizon = 4
-
-    def make(self):
-        return Track()
-
-    def look(self, env):
-        return {"ego": [0.0], "visual": [[40.0 - env.place]]}
-
-    def restore(self, env, observation):
-        env.place = 40.0 - float(observation["visual"][0, 0])
 
 
 class Pair(gym.Env):

@@ -1,7 +1,5 @@
 """Pages of studies are what their rows say: `make tables` changes nothing."""
 
-import csv
-
 import pytest
 
 from benchmarks import example_world, highway_messages
@@ -33,8 +31,7 @@ def test_a_number_that_is_not_in_the_rows_is_found():
 
 
 def test_the_choice_of_the_prior_over_directions_is_what_its_rows_say():
-    with SCALES.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(SCALES)
     total = {
         scale: sum(float(row["log_bayes_factor"]) for row in rows if row["scale"] == scale)
         for scale in ("0.5", "2", "inf")
@@ -47,8 +44,7 @@ def test_the_choice_of_the_prior_over_directions_is_what_its_rows_say():
 
 def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
     page = (DOCS / "highway.md").read_text()
-    with highway_messages.ROWS.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(highway_messages.ROWS)
     found = page.partition("<!-- messages -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == highway_messages.table(rows)
     mirror = next(row for row in rows if row["communicator"] == "mirror")
@@ -74,8 +70,7 @@ def test_the_example_of_a_random_world_is_what_its_rows_say():
 
 def test_the_table_of_reaches_is_what_its_rows_say():
     page = (DOCS / "highway.md").read_text()
-    with ROWS.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_in(ROWS)
     found = page.partition("<!-- reach -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == table(rows)
     people = {(row["fit"], row["person"]): row for row in rows}.values()

@@ -1,9 +1,9 @@
-"""A walk of ten steps as a Gymnasium environment and a world, without and with wind."""
+"""Worlds that are stepped: a walk of ten steps, without and with wind, and a pendulum."""
 
 import gymnasium as gym
 import numpy as np
 
-from mirror_ppl.domains import Modality
+from mirror_ppl.domains import Control, Modality
 from mirror_ppl.domains.stepped_world import SteppedWorld
 
 
@@ -55,3 +55,30 @@ class Windy(Way):
 
     def make(self):
         return Wind()
+
+
+class Endless(Way):
+    def done(self, env):
+        return False
+
+
+class Swing(SteppedWorld):
+    """Gymnasium's pendulum; who looks sees where its end is."""
+
+    modalities = (Modality("visual", ("end",), ("up", "right"), ("m", "m"), (1.0, 1.0), 0.01),)
+    ego_features = ("speed",)
+    controls = (Control("torque", -2, 2, 5, "Nm"),)
+    horizon = 5
+    reach_bins = (0.0, 1.0)
+    positions = ("up", "right")
+
+    def make(self):
+        return gym.make("Pendulum-v1")
+
+    def look(self, env):
+        angle, speed = env.state
+        return {"ego": [speed], "visual": [[np.cos(angle), np.sin(angle)]]}
+
+    def restore(self, env, observation):
+        up, right = observation["visual"][0].astype(float)
+        env.state = np.array([np.arctan2(right, up), float(observation["ego"][0])])

@@ -1,0 +1,128 @@
+"""Rounds that are played in environments: what is kept, and what is refused where it happens."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stepped_worlds import Endless, Swing, Way
+
+from mirror_ppl.data.contradictions import check_world
+from mirror_ppl.data.recorder import Recorder
+from mirror_ppl.domains import Control, Modality, add_domain
+from mirror_ppl.domains.registry import know
+from mirror_ppl.domains.stepped_world import SteppedWorld
+from mirror_ppl.errors import InputError
+
+
+class Track(gym.Env):
+    observation_space = gym.spaces.Box(0, 99, (1,))
+    action_space = gym.spaces.Box(1, 5, (1,), dtype=np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = 0.0
+        return np.array([0.0]), {}
+
+    def step(self, action):
+        self.place += float(action[0])
+        return np.array([self.place]), 0.0, False, False, {}
+
+
+class Fast(SteppedWorld):
+    modalities = (Modality("visual", ("end",), ("offset",), ("m",), (40.0,), 0.01),)
+    ego_features = ("nothing",)
+    controls = (Control("speed", 1, 5),)
+    horizon = 4
+
+    def make(self):
+        return Track()
+
+    def look(self, env):
+        return {"ego": [0.0], "visual": [[40.0 - env.place]]}
+
+    def restore(self, env, observation):
+        env.place = 40.0 - float(observation["visual"][0, 0])
+
+
+def test_played_controls_are_recorded():
+    swing = add_domain(Swing)
+    env = Recorder(swing.make(), swing, person="ada")
+    env.reset(seed=5)
+    torques = (-2.0, 0.3, 1.6, 1.4, 0.0)
+    earned = [env.step(np.array([torque], np.float32))[1] for torque in torques]
+    with pytest.raises(InputError, match="over"):
+        env.step(np.zeros(1))
+    env.reset()
+    with pytest.raises(InputError, match=r"shape \(1,\), torque -2 to 2; \[5.0\] is out of bounds"):
+        env.step(np.array([5.0]))
+    found = env.recordings()
+    assert found.controls.flatten().tolist() == pytest.approx([-2.0, 0.3, 1.6, 1.4, 0.0])
+    assert found.actions.flatten().tolist() == [0, 2, 4, 3, 2]
+    assert found.rewards.flatten().tolist() == pytest.approx(earned)
+    assert check_world(found, 0.0).share == 0
+
+
+def test_rounds_of_different_lengths_do_not_contradict_controls_without_0():
+    drive = add_domain(type("Drive", (Fast,), {}))
+    env = Recorder(drive.make(), drive)
+    for steps in (2, 4):
+        env.reset(seed=0)
+        for _ in range(steps):
+            env.step(np.array([3.0]))
+    assert check_world(env.recordings(), 0.0).share == 0
+
+
+def test_controls_are_executed_as_they_are_recorded():
+    drive = add_domain(Fast)
+    env = Recorder(drive.make(), drive)
+    env.reset(seed=0)
+    env.step(np.array([5.001]))  # within a thousandth of a level
+    assert env.recordings().controls.tolist() == [[[[5.0]]]]
+    assert env.unwrapped.place == 5.0
+
+
+def test_a_session_is_refused_where_it_goes_wrong():
+    way = Way()
+    with pytest.raises(InputError, match="way is not known; add it first"):
+        Recorder(way.make(), way)
+    env = Recorder(way.make(), add_domain(way))
+    with pytest.raises(InputError, match="has not begun"):
+        env.tell("visual", "end")
+    env.person = ""
+    with pytest.raises(InputError, match="person has to be a name, not ''"):
+        env.reset(seed=0)
+    env.person = "ada"
+    env.reset(seed=0)
+    for other in (True, 1.0, "1", np.array([1])):
+        with pytest.raises(InputError, match="action has to be one of"):
+            env.step(other)
+    env.step(np.int64(1))
+    env.unwrapped.step = lambda action: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        env.step(1)
+    with pytest.raises(InputError, match="call reset"):
+        env.step(1)
+
+
+def test_recorded_rounds_end_where_the_world_says_so():
+    way = know(Endless())  # its check would find the fault
+    env = Recorder(way.make(), way)
+    env.reset(seed=next(seed for seed in range(99) if _place(way, seed) == 7))
+    env.step(1)
+    env.step(1)
+    with pytest.raises(InputError, match=r"has terminated after step 2, but endless .*done"):
+        env.step(1)
+
+
+def test_rounds_do_not_go_on_where_the_world_has_ended():
+    early = know(type("Early", (Way,), {"done": lambda self, env: env.place >= 9})())
+    env = Recorder(early.make(), early)
+    env.reset(seed=next(seed for seed in range(99) if _place(early, seed) == 7))
+    env.step(1)
+    with pytest.raises(InputError, match="has not terminated after step 1, but early says other"):
+        env.step(1)
+
+
+def _place(way, seed):
+    env = way.make()
+    env.reset(seed=seed)
+    return env.place
