@@ -71,6 +71,14 @@ def run_tasks(
             raise
 
 
+def pickled(thing: object) -> bytes:
+    """Pickle what may be of a user's file, which other processes cannot import."""
+    import cloudpickle
+
+    _files_of_users()
+    return cloudpickle.dumps(thing)
+
+
 def cluster(address: str) -> ExitStack:
     """Make a context in which tasks that do not run here run on the workers of a Dask scheduler.
 

@@ -26,7 +26,7 @@ EXAMPLES = {
 }
 """Arguments, by what they are for."""
 SELF_MODEL, GUIDE = "self-model", "guide"
-OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "sizes", "device")
+OF_SELF_MODEL = ("phases", "steps", "learning_rate", "speech", "sizes", "device", "jobs")
 OF_GUIDE = ("people", "elbo_steps", "dropout", "human_model", "self_model")
 
 
@@ -76,13 +76,16 @@ class Options:
     """Seed of everything random."""
     device: str = "cpu"
     """Where to compute: cpu, cuda or cuda:0."""
+    jobs: int = -1
+    """Of a self-model: processes that step the environment of a world of your own, where that takes
+    long; -1 for one a core."""
     card: Path | None = None
     """Do not train: print the card of this weights file."""
 
     def __post_init__(self) -> None:
         if self.what not in (SELF_MODEL, GUIDE):
             raise OptionError(f"--what must be {SELF_MODEL} or {GUIDE}, not {self.what}")
-        check_numbers(self, "phases", "steps", "elbo_steps", "seed", people=LEAST_PEOPLE)
+        check_numbers(self, "phases", "steps", "elbo_steps", "seed", "jobs", people=LEAST_PEOPLE)
         other, of_other = (SELF_MODEL, OF_SELF_MODEL) if self.what == GUIDE else (GUIDE, OF_GUIDE)
         defaults = {field.name: field.default for field in fields(self)}
         for name in of_other:
@@ -132,6 +135,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
     from mirror_ppl.models.sizes import sizes_of
     from mirror_ppl.models.speech import EMBEDDINGS
     from mirror_ppl.models.weights import save_self_model
+    from mirror_ppl.stepping import stepped_by
     from mirror_ppl.training.self_model import train_self_model
     from mirror_ppl.training.self_model_options import SelfModelOptions
 
@@ -150,7 +154,10 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
         learning_rate=options.learning_rate,
     )
     generator = torch.Generator(usable_device(options.device)).manual_seed(options.seed)
-    with Progress("train", settings.phases) as progress:
+    with (
+        stepped_by(options.jobs, domain.as_believed),
+        Progress("train", settings.phases) as progress,
+    ):
         self_model = train_self_model(
             domain.as_believed,
             settings,
@@ -162,7 +169,7 @@ def _self_model(options: Options, out: Path, checkpoint: Path) -> dict[str, Any]
         )
     # It was taught the world as it is believed to be, and lives in the world as it is.
     self_model.domain = domain
-    with Stages() as stages:
+    with stepped_by(options.jobs, domain), Stages() as stages:
         quality = self_model_quality(
             self_model,
             discount=settings.discount,
@@ -225,7 +232,7 @@ def _card(path: Path) -> dict[str, Any]:
 
 def _command(options: Options) -> str:
     """The command that does it again; without what does not matter to what is trained."""
-    left_out = {"out", "card", *(OF_SELF_MODEL if options.what == GUIDE else OF_GUIDE)}
+    left_out = {"out", "card", "jobs", *(OF_SELF_MODEL if options.what == GUIDE else OF_GUIDE)}
     values = {
         part.name: getattr(options, part.name)
         for part in fields(options)

@@ -11,7 +11,7 @@ import torch
 
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, require_known
-from mirror_ppl.domains.environment_world import EnvironmentWorld
+from mirror_ppl.domains.environment_world import EnvironmentWorld, as_tensors
 from mirror_ppl.domains.registry import known_domains
 from mirror_ppl.errors import InputError
 
@@ -57,6 +57,8 @@ class Recorder(gym.Wrapper):
         self._rounds: list[_Round] = []
         self._told: list[tuple[str, int]] = []
         self._chooser = np.random.default_rng()
+        self._chance = torch.Generator()
+        self._chance.seed()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -73,7 +75,7 @@ class Recorder(gym.Wrapper):
         if seed is None:
             seed = int(self._chooser.integers(self.world.layouts))
         found = self.env.reset(seed=seed, options=options)
-        first = self.world.look(self.env.unwrapped)
+        first = self.world.seen(self.env)
         if not self.world.knows(first):
             raise InputError(
                 f"seed {seed} begins in a state that {self.world.name} does not have; its layouts "
@@ -100,8 +102,8 @@ class Recorder(gym.Wrapper):
         """Play one step; see `gymnasium.Env.step`.
 
         Raises:
-            InputError: the round has not begun or is over, the world has no such action, or the
-                environment terminates where the world does not, or not where it does.
+            InputError: the round has not begun or is over, the world has no such action, or it
+                computes something else than the environment does.
         """
         self._require_begun()
         number, control = self.world.action_of(action)
@@ -109,18 +111,22 @@ class Recorder(gym.Wrapper):
             action = control.astype(np.asarray(action).dtype)
         now = self._rounds[-1]
         now.over = True  # if the step fails, the round cannot go on
+        state = self.world.state_behind(as_tensors(now.seen[-1]))
+        state = self.world.redrawn(state, self._chance)
+        self.world.seed_chance(self.env, state)
         found, reward, terminated, truncated, info = self.env.step(action)
-        seen = self.world.look(self.env.unwrapped)
+        seen = self.world.seen(self.env)
         terms = self.world.named_terms(self.env, action, reward, terminated)
         now.add(number, control, self._told, sum(terms.values()), seen)
         self._told = []
         truncated = truncated or len(now.actions) == self.world.horizon
         now.over = terminated or truncated
-        if self.world.terminates(seen) != terminated:
-            ended = "has terminated" if terminated else "has not terminated"
+        command = torch.tensor(number) if control is None else torch.from_numpy(action)
+        fault = self.world.fault_of_step(self.env, state, action, command, reward, bool(terminated))
+        if fault:
             raise InputError(
-                f"the environment {ended} after step {len(now.actions) - 1}, but {self.world.name} "
-                "says otherwise; mend the world (done), as the recording contradicts it"
+                f"step {len(now.actions) - 1}: {fault}; mend {self.world.name}, as the recording "
+                "contradicts it"
             )
         return found, float(reward), terminated, truncated, info
 

@@ -279,16 +279,22 @@ def remarks_on(world: World) -> str:
     """Return what random rounds of a sound world are like: rewards a step, how many ended."""
     generator = torch.Generator().manual_seed(1)
     state = world.initial(REMARKED, generator)
-    ended, earned = world.over(state), []
+    ended, earned, chance = world.over(state), [], False
     for _ in range(world.horizon):
         action = torch.randint(len(world.actions), (REMARKED,), generator=generator)
         following = world.transition(state, action)
+        if world.random and not chance:
+            other = world.observe(world.transition(world.redrawn(state, generator), action))
+            seen = world.observe(following)
+            chance = any(not torch.equal(other[name], seen[name]) for name in seen)
         earned += total_reward(world.rewards(state, action, following))[~ended].tolist()
         state, ended = following, ended | world.over(following)
     number = int(ended.sum())
     if not earned:
         return "all rounds are over where they begin"
     remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
+    if world.random and not chance:
+        remark += "; no step depended on chance, so random may be left out"
     if not offers(world, "over"):
         return remark
     remark += f"; {number} of {REMARKED} rounds ended"

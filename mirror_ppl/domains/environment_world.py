@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mirror_ppl.domains.controls import action_at
 from mirror_ppl.domains.world import World
-from mirror_ppl.errors import DomainError, InputError
+from mirror_ppl.errors import DomainError, InputError, shown
 
 CLOSE = 1e-6
 """Largest difference between rewards that count as equal."""
@@ -24,6 +24,7 @@ PLAYED = 6
 """Number of rounds that a check plays."""
 TOLERANCE = 1e-4
 """Differences up to this, and to this share of a value, are rounding."""
+VARIES = "look() varies where nothing was done"
 
 
 class EnvironmentWorld(World):
@@ -63,6 +64,28 @@ class EnvironmentWorld(World):
         del env, action, terminated
         return {self.reward_terms[0]: reward}
 
+    def made(self) -> gym.Env:
+        """Return what `make` returns.
+
+        Raises:
+            DomainError: it is no environment.
+        """
+        env = self.make()
+        if not isinstance(env, gym.Env):
+            raise DomainError(f"{self.name}: make() has {shown(env)}, expected a gymnasium.Env")
+        return env
+
+    def seen(self, env: gym.Env) -> Mapping[str, Any]:
+        """Return what `look` returns.
+
+        Raises:
+            DomainError: it is not a mapping.
+        """
+        found = self.look(env.unwrapped)
+        if not isinstance(found, Mapping):
+            raise DomainError(f"{self.name}: look() has {shown(found)}, expected a dict of arrays")
+        return found
+
     def named_terms(
         self, env: gym.Env, action: Any, reward: Any, terminated: bool
     ) -> dict[str, float]:
@@ -72,9 +95,10 @@ class EnvironmentWorld(World):
             DomainError: they are not the world's.
         """
         own = self.terms(env.unwrapped, action, float(reward), bool(terminated))
-        if set(own) != set(self.reward_terms):
+        if not isinstance(own, Mapping) or set(own) != set(self.reward_terms):
+            found = ", ".join(own) if isinstance(own, Mapping) else shown(own)
             raise DomainError(
-                f"{self.name}: terms() has {', '.join(own)}, expected "
+                f"{self.name}: terms() has {found}, expected "
                 f"{', '.join(self.reward_terms)} (reward_terms)"
             )
         return own
@@ -144,17 +168,13 @@ class EnvironmentWorld(World):
     def seed_chance(self, env: gym.Env, state: Any) -> None:
         """Let an environment draw in its next step what the state holds; nothing is drawn here."""
 
-    def terminates(self, observation: Mapping[str, Any]) -> bool:
-        """True if the task is done where `look` returns this observation."""
-        return bool(self.over(self.state_behind(as_tensors(observation))))
-
     def own_faults(self) -> list[str]:
         """Return the first fault found in rounds of random actions, played from resets on.
 
         The environment is not put anywhere: each step has to be the one that the world computes
         from what was observed before it.
         """
-        env, chooser = self.make(), np.random.default_rng(0)
+        env, chooser = self.made(), np.random.default_rng(0)
         commands, inner = self.commands(env), env
         while isinstance(inner, gym.Wrapper):
             limit = getattr(inner, "_max_episode_steps", self.horizon)
@@ -163,7 +183,10 @@ class EnvironmentWorld(World):
             inner = inner.env
         for seed in range(min(PLAYED, self.layouts)):
             env.reset(seed=seed)
-            if self.terminates(self.look(env.unwrapped)):
+            first, again = as_tensors(self.seen(env)), as_tensors(self.seen(env))
+            if any(not torch.equal(first[name], again[name]) for name in first):
+                return [VARIES]
+            if bool(self.over(self.state_behind(first))):
                 return [f"the task is done where rounds begin (seed {seed})"]
             for step in range(self.horizon):
                 number = int(chooser.integers(len(commands)))
@@ -182,11 +205,29 @@ class EnvironmentWorld(World):
         self, env: gym.Env, command: Any, action: Tensor, step: int
     ) -> tuple[str, bool]:
         """Take a step; return what the world computes otherwise, and whether it ended."""
-        state = self.state_behind(as_tensors(self.look(env.unwrapped)))
+        state = self.state_behind(as_tensors(self.seen(env)))
         self.seed_chance(env, state)
         _, reward, end, cut, _ = env.step(copy(command))
+        fault = self.fault_of_step(env, state, command, action, reward, bool(end))
+        if not fault and cut and not end and step + 1 < self.horizon:
+            fault = f"the environment truncates rounds; horizon may be {step + 1} at most"
+        return fault, bool(end)
+
+    def fault_of_step(
+        self, env: gym.Env, state: Any, command: Any, action: Tensor, reward: Any, end: bool
+    ) -> str:
+        """Return what the world computes otherwise than an environment did; empty if nothing.
+
+        Args:
+            env: after the step.
+            state: before it.
+            command: the environment's action.
+            action: the world's.
+            reward: the environment's.
+            end: whether it has terminated.
+        """
         own = as_tensors(self.named_terms(env, command, reward, end))
-        found = as_tensors(self.look(env.unwrapped))
+        found = as_tensors(self.seen(env))
         following = self.transition(state, action)
         for values, computed in (
             (found, self.observe(following)),
@@ -197,13 +238,11 @@ class EnvironmentWorld(World):
                     return (
                         f"after {command}, {name} is {value.tolist()} in the environment, but "
                         f"computed as {computed[name].tolist()}; {self.likely_cause}"
-                    ), False
-        if bool(end) != bool(self.over(following)):
+                    )
+        if end != bool(self.over(following)):
             ended = "has terminated" if end else "has not terminated"
-            return f"after {command} the environment {ended}, but the world says otherwise", False
-        if cut and not end and step + 1 < self.horizon:
-            return f"the environment truncates rounds; horizon may be {step + 1} at most", False
-        return "", bool(end)
+            return f"after {command} the environment {ended}, but the world says otherwise (done)"
+        return ""
 
 
 def as_tensors(observation: Mapping[str, Any]) -> dict[str, Tensor]:

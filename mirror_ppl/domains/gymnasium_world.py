@@ -259,7 +259,7 @@ def _file(world: GymnasiumWorld) -> Path | None:
     kind, given = type(world), {n: v for n, v in vars(world).items() if n not in CACHED}
     content = f"{kind.version} {kind.layouts} {kind.horizon} {kind.moves} {given} {gym.__version__}"
     try:
-        for each in (*kind.__mro__, *type(world.make().unwrapped).__mro__):
+        for each in (*kind.__mro__, *type(world.made().unwrapped).__mro__):
             if each not in (object, Generic):  # built in from Python 3.12 on
                 content += inspect.getsource(each) + Path(inspect.getfile(each)).read_text()
     except (OSError, TypeError):
@@ -271,7 +271,7 @@ def _file(world: GymnasiumWorld) -> Path | None:
 
 def _visited(world: GymnasiumWorld) -> Tables:
     """Visit every state that can be reached."""
-    env = world.make()
+    env = world.made()
     if world.controls:
         raise DomainError(f"{world.name}: a world with controls has to be a SteppedWorld")
     if world.random:
@@ -285,7 +285,7 @@ def _visited(world: GymnasiumWorld) -> Tables:
     most = 0
 
     def visit(end: bool, begin: bool = False) -> int:
-        own = as_tensors(world.look(env.unwrapped))
+        own = as_tensors(world.seen(env))
         key = pickle.dumps([part.tolist() for part in own.values()])
         number = numbers.get(key)
         if number is None:

@@ -145,7 +145,9 @@ def get_domain(name: str) -> Domain:
     installed = [entry.name for entry in entry_points(group=ENTRY_POINTS)]
     known = dict.fromkeys([*DOMAINS, *_ADDED, *installed])
     message = f"{UnknownNameError.of('domain', name, known)}"
-    raise UnknownNameError(f"{message}; a world of your own is --domain path/to/file.py:Class")
+    raise UnknownNameError(
+        f"{message}; a world of your own is path/to/file.py:Class (--domain, mirror_ppl.add_domain)"
+    )
 
 
 def _of_file(specification: str) -> World:

@@ -10,8 +10,9 @@ Where steps draw from the environment's generator, a state also holds the seed o
 
 from __future__ import annotations
 
+import time
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,10 +30,11 @@ from mirror_ppl.domains.environment_world import (
     CLOSE,
     TOLERANCE,
     UNSEEN,
+    VARIES,
     EnvironmentWorld,
     as_tensors,
 )
-from mirror_ppl.errors import DomainError
+from mirror_ppl.errors import DomainError, shown
 
 CACHED = (
     "_env",
@@ -43,9 +45,12 @@ CACHED = (
     "_done",
     "_left_to_try",
     "_ends_to_try",
-    "_dtype",
+    "_seconds",
+    "elsewhere",
 )
 """Attributes that are of one process: the environment, and what was seen of it."""
+WORTH_SHARING = 0.1
+"""Seconds of stepping from which on other processes are asked."""
 MOST_OUTCOMES = 500_000
 """Number of outcomes that are kept."""
 SEEDS = 2**31
@@ -54,6 +59,11 @@ TRIED_TWICE = 100
 """Number of outcomes that are computed twice, to detect what cannot be observed."""
 ENDS_TRIED = 20
 """Number of those at which the task is done."""
+
+Trial = tuple[np.ndarray, Any, int]
+"""A full observation, the environment's action, and the seed of what is drawn."""
+Outcome = tuple[np.ndarray, bool, np.ndarray]
+"""The full observation after a step, whether the task is done, and the reward terms."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +86,14 @@ class SteppedWorld(EnvironmentWorld):
 
     Implement ``make()``, ``look(env)`` and :meth:`restore`; also :meth:`done` where rounds can end
     before the horizon. ``random = True`` is for environments whose steps draw from ``np_random``.
+
+    Attributes:
+        elsewhere: what other processes compute for this one, see
+            :func:`mirror_ppl.stepping.stepped_by`; None if there are none.
     """
 
     layouts = 1000
+    elsewhere: Callable[[Sequence[Trial]], list[Outcome]] | None = None
 
     @property
     def likely_cause(self) -> str:
@@ -104,7 +119,8 @@ class SteppedWorld(EnvironmentWorld):
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle without the environment; other processes make their own."""
-        return {name: part for name, part in vars(self).items() if name not in CACHED}
+        own = {name: part for name, part in vars(self).items() if name not in CACHED}
+        return own | {"_dtype": self._dtype}
 
     def knows(self, observation: Mapping[str, Any]) -> bool:
         """True: all observations are states."""
@@ -120,7 +136,7 @@ class SteppedWorld(EnvironmentWorld):
         seeds = torch.randint(self.layouts, (batch,), generator=generator, device=device).tolist()
         for seed in set(seeds) - self._starts.keys():
             self._env.reset(seed=seed)
-            if self.done(self._env.unwrapped):
+            if self._ends():
                 raise DomainError(f"{self.name}: the task is done where rounds begin (seed {seed})")
             self._starts[seed] = torch.from_numpy(self._look())
         values = torch.stack([self._starts[seed] for seed in seeds]).to(device)
@@ -200,23 +216,19 @@ class SteppedWorld(EnvironmentWorld):
         if len(outcomes) > MOST_OUTCOMES:
             outcomes.clear()
         kind = bytes([continuous])  # an index and control values may have the same bytes
-        found, own, stay = [], rows.numpy(), np.zeros(len(self.reward_terms))
+        own, keys, new = rows.numpy(), [], {}
         each = zip(own, deeds.numpy(), ended, seeds.flatten().tolist(), strict=True)
         for row, deed, end, seed in each:
-            if end:
-                found.append((row, True, stay))
-                continue
-            key = kind + row.tobytes() + deed.tobytes() + seed.to_bytes(4)
-            outcome = outcomes.get(key)
-            if outcome is None:
-                if continuous and not bool(within_bounds(self.controls, torch.tensor(deed)).all()):
-                    raise DomainError(
-                        f"{self.name}: controls are {bounds_in_words(self.controls)}, not "
-                        f"{deed.tolist()}"
-                    )
-                command = deed if continuous else self._commands[int(deed[0])]
-                outcome = outcomes[key] = self._tried(row, command, seed)
-            found.append(outcome)
+            key = b"" if end else kind + row.tobytes() + deed.tobytes() + seed.to_bytes(4)
+            keys.append(key)
+            if not end and key not in outcomes and key not in new:
+                new[key] = (row, self._command(deed, continuous), seed)
+        if new:
+            outcomes.update(zip(new, self.outcomes(list(new.values())), strict=True))
+        stay = np.zeros(len(self.reward_terms))
+        found = [
+            outcomes[key] if key else (row, True, stay) for key, row in zip(keys, own, strict=True)
+        ]
         values = torch.from_numpy(np.array([one for one, _, _ in found], own.dtype)).to(device)
         done = torch.tensor([one for _, one, _ in found], dtype=torch.bool, device=device)
         earned = torch.from_numpy(np.array([one for _, _, one in found], float)).to(values)
@@ -225,10 +237,26 @@ class SteppedWorld(EnvironmentWorld):
         moment = Moment(values.view(*shape, width), done.view(shape), seeds)
         return moment, earned.view(*shape, len(self.reward_terms))
 
-    def _tried(
-        self, row: np.ndarray, command: Any, seed: int
-    ) -> tuple[np.ndarray, bool, np.ndarray]:
-        """Return the observation after an action, whether the task is done, and reward terms."""
+    def _command(self, deed: np.ndarray, continuous: bool) -> Any:
+        """Return the environment's action, by its number or its control values."""
+        if not continuous:
+            return self._commands[int(deed[0])]
+        if not bool(within_bounds(self.controls, torch.tensor(deed)).all()):
+            raise DomainError(
+                f"{self.name}: controls are {bounds_in_words(self.controls)}, not {deed.tolist()}"
+            )
+        return deed
+
+    def outcomes(self, trials: Sequence[Trial]) -> list[Outcome]:
+        """Return what follows, computed here or, where that takes long, `elsewhere`."""
+        if self.elsewhere is not None and len(trials) * self._seconds > WORTH_SHARING:
+            return self.elsewhere(trials)
+        begun = time.perf_counter()
+        found = [self._tried(*trial) for trial in trials]
+        self._seconds = (time.perf_counter() - begun) / len(trials)
+        return found
+
+    def _tried(self, row: np.ndarray, command: Any, seed: int) -> Outcome:
         found = self._step(row, command, seed)
         reached, end, _ = found
         left = self._ends_to_try if end else self._left_to_try
@@ -240,6 +268,8 @@ class SteppedWorld(EnvironmentWorld):
             self._restored(reached)
             off = np.abs(self._look() - reached) > TOLERANCE * (1 + np.abs(reached))
             if off.any():
+                if (self._look() != self._look()).any():
+                    raise DomainError(f"{self.name}: {VARIES}")
                 raise DomainError(
                     f"{self.name}: restore() of the observation {reached.tolist()} leads to "
                     f"{self._look().tolist()}"
@@ -254,20 +284,18 @@ class SteppedWorld(EnvironmentWorld):
         return found
 
     def _require_done(self, row: np.ndarray, end: bool) -> None:
-        if bool(self.done(self._env.unwrapped)) != end:
+        if self._ends() != end:
             raise DomainError(
                 f"{self.name}: done() is {not end} after restore() of {row.tolist()}, expected "
                 f"{end}; restore() does not set all that done() reads"
             )
 
-    def _step(
-        self, row: np.ndarray, command: Any, seed: int
-    ) -> tuple[np.ndarray, bool, np.ndarray]:
+    def _step(self, row: np.ndarray, command: Any, seed: int) -> Outcome:
         self._restored(row)
         self._seed(self._env, seed)
         _, reward, terminated, _, _ = self._env.step(copy(command))
-        inner, end = self._env.unwrapped, bool(terminated)
-        if end != bool(self.done(inner)):
+        end = bool(terminated)
+        if end != self._ends():
             raise DomainError(
                 f"{self.name}: the environment {'is' if end else 'is not'} terminated after "
                 f"{command} in {row.tolist()}, but done() says otherwise"
@@ -283,17 +311,24 @@ class SteppedWorld(EnvironmentWorld):
             begin += size.numel()
         self.restore(self._env.unwrapped, observation)
 
+    def _ends(self) -> bool:
+        """Return what `done` says of the environment as it is."""
+        end = self.done(self._env.unwrapped)
+        if np.ndim(end):
+            raise DomainError(f"{self.name}: done() has {shown(end)}, expected True or False")
+        return bool(end)
+
     def _is_done(self, row: Tensor) -> bool:
         key = row.numpy().tobytes()
         if len(self._done) > MOST_OUTCOMES:
             self._done.clear()
         if key not in self._done:
             self._restored(row.numpy())
-            self._done[key] = bool(self.done(self._env.unwrapped))
+            self._done[key] = self._ends()
         return self._done[key]
 
     def _look(self) -> np.ndarray:
-        seen = self.look(self._env.unwrapped)
+        seen = self.seen(self._env)
         flat = [np.asarray(seen[name], self._dtype).ravel() for name in self._sizes]
         row = np.concatenate(flat)
         if not np.isfinite(row).all():
@@ -305,8 +340,12 @@ class SteppedWorld(EnvironmentWorld):
         return torch.empty(0).numpy().dtype  # torch's default
 
     @cached_property
+    def _seconds(self) -> float:
+        return 0.0  # that an outcome took, in the last batch
+
+    @cached_property
     def _env(self) -> gym.Env:
-        env = self.make()
+        env = self.made()
         env.reset(seed=0)
         return env
 
@@ -320,9 +359,7 @@ class SteppedWorld(EnvironmentWorld):
         expected = {"ego": torch.Size((len(self.ego_features),))} | {
             m.name: torch.Size((len(m.items), len(m.features))) for m in self.modalities
         }
-        found = {
-            name: part.shape for name, part in as_tensors(self.look(self._env.unwrapped)).items()
-        }
+        found = {name: part.shape for name, part in as_tensors(self.seen(self._env)).items()}
         if found != expected:
             raise DomainError(
                 f"{self.name}: look() has {_listed(found)}, expected {_listed(expected)}"
@@ -334,7 +371,7 @@ class SteppedWorld(EnvironmentWorld):
         return {}  # observations after resets, by seed
 
     @cached_property
-    def _outcomes(self) -> dict[bytes, tuple[np.ndarray, bool, np.ndarray]]:
+    def _outcomes(self) -> dict[bytes, Outcome]:
         return {}  # by observation and action
 
     @cached_property

@@ -199,7 +199,7 @@ BAD_DATASETS = {
     "unknown domain": (
         renamed(domain="boats"),
         'unknown domain "boats"; known: bomb_defusal, driving, highway, search_rescue; '
-        "a world of your own is --domain path/to/file.py:Class",
+        "a world of your own is path/to/file.py:Class (--domain, mirror_ppl.add_domain)",
     ),
     "unknown setting": (
         renamed(setting="rain"),

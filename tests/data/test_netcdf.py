@@ -53,10 +53,9 @@ def test_what_declares_more_than_can_be_in_it_is_refused_before_memory_is_taken(
 def test_reading_that_does_not_end_or_crashes_is_noticed(tmp_path, monkeypatch):
     path = tmp_path / "a.nc"
     xr.Dataset({"x": ("y", np.arange(3.0))}).to_netcdf(path, engine="h5netcdf")
-    monkeypatch.setattr(netcdf, "SECONDS", 0.3)
     # Whatever threads earlier tests have left.
     monkeypatch.setattr(netcdf.threading, "enumerate", list)
-    parent, read = os.getpid(), netcdf._read
+    parent = os.getpid()
 
     def endless(content, engine, groups, allow):
         assert os.getpid() != parent
@@ -68,9 +67,12 @@ def test_reading_that_does_not_end_or_crashes_is_noticed(tmp_path, monkeypatch):
         os.abort()
 
     for fault in (endless, crash):
-        monkeypatch.setattr(netcdf, "_read", fault)
-        assert refused(path) == f"{path}: is truncated or damaged (it cannot be read to its end)"
-    monkeypatch.setattr(netcdf, "_read", read)
+        with monkeypatch.context() as patch:
+            patch.setattr(netcdf, "SECONDS", 0.3)
+            patch.setattr(netcdf, "_read", fault)
+            assert refused(path) == (
+                f"{path}: is truncated or damaged (it cannot be read to its end)"
+            )
     read_netcdf(path, PosteriorError)
 
 

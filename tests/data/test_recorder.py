@@ -3,14 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from stepped_worlds import Endless, Swing, Way
+from stepped_worlds import Endless, Swing, Way, Wind, Windy
 
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.domains import Control, Modality, add_domain
 from mirror_ppl.domains.registry import know
 from mirror_ppl.domains.stepped_world import SteppedWorld
-from mirror_ppl.errors import InputError
+from mirror_ppl.errors import DomainError, InputError
 
 
 class Track(gym.Env):
@@ -109,7 +109,7 @@ def test_recorded_rounds_end_where_the_world_says_so():
     env.reset(seed=next(seed for seed in range(99) if _place(way, seed) == 7))
     env.step(1)
     env.step(1)
-    with pytest.raises(InputError, match=r"has terminated after step 2, but endless .*done"):
+    with pytest.raises(DomainError, match=r"endless: .* is terminated after 1 in .*done"):
         env.step(1)
 
 
@@ -118,8 +118,32 @@ def test_rounds_do_not_go_on_where_the_world_has_ended():
     env = Recorder(early.make(), early)
     env.reset(seed=next(seed for seed in range(99) if _place(early, seed) == 7))
     env.step(1)
-    with pytest.raises(InputError, match="has not terminated after step 1, but early says other"):
+    with pytest.raises(DomainError, match=r"early: .* is not terminated after 1 in .*done"):
         env.step(1)
+
+
+def test_steps_have_to_be_those_of_the_world():
+    way = add_domain(Way)
+    env = Recorder(gym.wrappers.TransformReward(way.make(), lambda reward: 2 * reward), way)
+    env.reset(seed=0)
+    env.step(0)
+    with pytest.raises(InputError, match=r"step 1: after 1, reward is 2.0 .*computed as 1.0.*mend"):
+        env.step(1)
+    env = Recorder(Wind(), way)
+    with pytest.raises(InputError, match=r"step \d: after 1, ego is .*steps are random"):
+        for _ in range(20):  # gusts of one step are the world's
+            env.reset(seed=0)
+            env.step(1)
+
+
+def test_chance_differs_between_rounds_and_is_that_of_the_world():
+    windy = add_domain(Windy)
+    env = Recorder(windy.make(), windy)
+    for _ in range(60):
+        env.reset(seed=0)
+        env.step(1)
+    # All equal with a probability of 1e-28.
+    assert env.recordings().ego[0, :, 1, 0].unique().numel() > 1
 
 
 def _place(way, seed):

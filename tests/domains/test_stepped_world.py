@@ -1,8 +1,10 @@
 """Gymnasium environments that are stepped when needed: equal to the environment, and refusals."""
 
+import os
 import pickle
 import re
 from dataclasses import replace
+from operator import itemgetter
 
 import gymnasium as gym
 import numpy as np
@@ -10,12 +12,14 @@ import pytest
 import torch
 from stepped_worlds import Endless, Swing, Walk, Way, Wind, Windy
 
-from mirror_ppl.domains import Control, Modality
+from mirror_ppl.domains import Control, Modality, stepped_world
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.checking import faults_of, remarks_on
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
 from mirror_ppl.domains.registry import load_world
 from mirror_ppl.domains.stepped_world import SteppedWorld
 from mirror_ppl.errors import DomainError
+from mirror_ppl.stepping import stepped_by
 
 
 @pytest.mark.parametrize("kind", [Swing, Way, Windy])
@@ -218,6 +222,19 @@ def moved(state):
             {"look": lambda self, env: {"ego": [np.nan], "visual": [[0.0]]}},
             r"look.. has \[nan, 0.0\], expected finite numbers",
         ),
+        (Way, {"look": lambda self, env: None}, "look.. has None, expected a dict of arrays"),
+        (
+            Way,
+            {"look": lambda self, env: {"ego": [np.random.rand()], "visual": [[0.0]]}},
+            "look.. varies where nothing was done",
+        ),
+        (Way, {"make": lambda self: None}, "make.. has None, expected a gymnasium.Env"),
+        (
+            Way,
+            {"done": lambda self, env: np.array([True, False])},
+            r"done.. has .*\(2,\), expected True or False",
+        ),
+        (Way, {"terms": lambda self, *found: found[2]}, "terms.. has .*, expected reward"),
         (Way, {"make": lambda self: Random()}, "vary; restore.. does not set all"),
         (Way, {"make": lambda self: Wind()}, r"vary; .*steps are random \(then random = True"),
         (Windy, {"make": lambda self: Dice()}, "vary; .*another generator than np_random"),
@@ -277,6 +294,12 @@ def test_remarks_say_whether_ends_were_checked():
     assert remark.startswith("random actions: rewards 0 to 1 a step; ")
     assert re.search(r"; [1-9]\d* of 100 rounds ended$", remark)
     assert remarks_on(Swing()).endswith("0 of 100 rounds ended, so ends were not checked")
+
+
+def test_remarks_say_where_nothing_depends_on_chance():
+    calm = type("Calm", (Way,), {"random": True})()
+    assert "no step depended on chance, so random may be left out" in remarks_on(calm)
+    assert "chance" not in remarks_on(Windy())
 
 
 def test_controls_have_different_names():
@@ -354,3 +377,31 @@ def test_no_states_lead_to_none():
     none = way.state_behind({"ego": torch.zeros(0, 1), "visual": torch.zeros(0, 1, 1)})
     following = way.transition(none, torch.zeros(0, dtype=torch.long))
     assert following.values.shape == (0, 2) and following.done.dtype == torch.bool
+
+
+class PaidByProcess(Way):
+    """Rewards are the number of the process that steps."""
+
+    def terms(self, env, action, reward, terminated):
+        return {"reward": os.getpid()}
+
+
+def test_other_processes_step_where_that_takes_long(monkeypatch):
+    own, way = PaidByProcess(), PaidByProcess()
+    every = torch.arange(10.0)[:, None]
+    state = way.state_behind({"ego": every, "visual": 10 - every[..., None]})
+    some, others = (map_state(itemgetter(rows), state) for rows in (slice(5), slice(5, 9)))
+    go = torch.ones((), dtype=torch.long)
+
+    def paid(world, state):
+        following = world.transition(state, go)
+        return set(world.rewards(state, go, following)["reward"].long().tolist()), following
+
+    with stepped_by(2, way):
+        assert paid(way, some)[0] == {os.getpid()}  # it is soon done
+        monkeypatch.setattr(stepped_world, "WORTH_SHARING", 0.0)
+        processes, following = paid(way, others)
+        assert processes and os.getpid() not in processes
+        assert pickle.loads(pickle.dumps(way)).elsewhere is None
+    assert paid(way, state)[0] == processes | {os.getpid()}  # known by now
+    assert torch.equal(following.values, own.transition(others, go).values)
