@@ -2,7 +2,7 @@
 
 For each guide, in the same run: the median and the slowest over people of adding the n-th round and
 asking for 200 draws again, and what all rounds take from nothing. Besides, how many of the proposed
-draws count (effective draws) and how far marginals of thresholds are from those of ``exact``.
+draws count (effective draws) and how far marginals of thresholds are from those of ``importance``.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class Options:
     """How many rounds of each person to learn from, from the first on; 0 for none. Default: 20 of
     recordings with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
     human_model: str | None = None
-    """Another human model: all (weighs mirror, late and preferring for each person), late,
+    """Another human model: all (weighs several models for each person), late,
     preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or no-implants,
     or one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
     self_model: Path | None = None
