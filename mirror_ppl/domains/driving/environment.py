@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from mirror_ppl.domains.driving.world import ROAD_END, Driving
+from mirror_ppl.domains.driving.knowledge import ROAD_END
+from mirror_ppl.domains.driving.world import Driving
 from mirror_ppl.domains.environment import DomainEnv
 
 

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.driving.lane_values import action_values
-from mirror_ppl.domains.driving.world import lane_rewards
+from mirror_ppl.domains.driving.rewards import lane_rewards
 from mirror_ppl.errors import DemonstrationsError
 
 CENTRE, SWITCH = "centre_distance", "switch"

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from mirror_ppl.communication.messages import Channels, every_message
 from mirror_ppl.domains.base import Observation, map_state, total_reward
+from mirror_ppl.domains.driving.cars import DrivingState
 from mirror_ppl.domains.driving.people import Memory, SimulatedDrivers, remember
-from mirror_ppl.domains.driving.world import Driving, DrivingState
+from mirror_ppl.domains.driving.world import Driving
 from mirror_ppl.row_hashing import distinct_rows
 
 CHUNK = 2000

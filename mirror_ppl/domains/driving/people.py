@@ -30,17 +30,11 @@ from torch import Tensor
 
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
 from mirror_ppl.domains.base import Observation, Visibility
-from mirror_ppl.domains.driving.knowledge import ASSUMPTIONS
+from mirror_ppl.domains.driving.cars import CAR_LANES, CARS, DrivingState
+from mirror_ppl.domains.driving.knowledge import ASSUMPTIONS, ROAD_END
 from mirror_ppl.domains.driving.maximum_entropy import LearnedReward
-from mirror_ppl.domains.driving.world import (
-    CAR_LANES,
-    CARS,
-    ROAD_END,
-    Driving,
-    DrivingState,
-    known_car_values,
-    lane_rewards,
-)
+from mirror_ppl.domains.driving.rewards import known_car_values, lane_rewards
+from mirror_ppl.domains.driving.world import Driving
 from mirror_ppl.people.base import SimulatedPeople, each
 
 HORIZON = 10

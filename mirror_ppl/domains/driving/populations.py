@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import require_known
-from mirror_ppl.domains.driving.world import FOG_REACH, ROAD_END, Driving
+from mirror_ppl.domains.driving.knowledge import ROAD_END
+from mirror_ppl.domains.driving.world import FOG_REACH, Driving
 from mirror_ppl.people.base import derived_generator
 
 CONSISTENCY_MEDIAN = 3.0

@@ -17,9 +17,10 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person, transitions
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import Domain
+from mirror_ppl.domains.driving.cars import CAR_LANES, CARS, DrivingState
+from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.domains.driving.people import Memory
 from mirror_ppl.domains.driving.road import DARK_TO_LIGHT, DISTANCES, draw_car, draw_road
-from mirror_ppl.domains.driving.world import CAR_LANES, CARS, ROAD_END, DrivingState
 from mirror_ppl.models.belief_tracking import BeliefState
 from mirror_ppl.plots.communication import WORDS, in_words
 from mirror_ppl.plots.picture import Picture

@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
-from mirror_ppl.domains.driving.world import ROAD_END
+from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLUE, TRUE, draws, of_person, people, truth

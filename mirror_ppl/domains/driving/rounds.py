@@ -12,8 +12,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from scipy.stats import beta
 
+from mirror_ppl.domains.driving.cars import CAR_LANES
+from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.domains.driving.road import DARK_TO_LIGHT, DISTANCES, sight_probability
-from mirror_ppl.domains.driving.world import CAR_LANES, ROAD_END, SWITCH
+from mirror_ppl.domains.driving.world import SWITCH
 from mirror_ppl.errors import DemonstrationsError
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import (

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
+from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.domains.driving.road import (
     HEADLIGHT,
     draw_car,
@@ -21,7 +22,6 @@ from mirror_ppl.domains.driving.road import (
     seen_of_draws,
     true_sight,
 )
-from mirror_ppl.domains.driving.world import ROAD_END
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import explain, label_columns, people
 

@@ -44,7 +44,7 @@ Version history
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -52,55 +52,33 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from mirror_ppl.domains.base import Modality, Observation, Visibility, require_known
+from mirror_ppl.domains.driving.cars import (
+    CAR_LANES,
+    CAR_SIDES,
+    CARS,
+    SCENARIO_SPEEDS,
+    DrivingState,
+)
 from mirror_ppl.domains.driving.knowledge import (
     ASSUMPTIONS,
     ROAD_END,
     CarKnowledge,
     assumed_cars,
 )
-from mirror_ppl.domains.driving.lane_values import action_values
 from mirror_ppl.domains.driving.record import RECORD
+from mirror_ppl.domains.driving.rewards import (
+    COLLISION,
+    LANE_CHANGE,
+    NEAR,
+    OFF_ROAD,
+    PROXIMITY,
+    known_car_values,
+)
 from mirror_ppl.domains.world import World
 
 STAY, SWITCH = 0, 1
-NEAR = 2
-"""Cars of the ego's lane at most this many cells away incur the proximity penalty."""
 FOG_REACH = 2
 """Number of cells ahead that a person sees in dense fog."""
-PROXIMITY, COLLISION, OFF_ROAD, LANE_CHANGE = -2.0, -5.0, -5.0, -1.0
-
-CARS = ("front-left", "front-right", "rear-left", "rear-right")
-"""The four cars, named by where they start."""
-CAR_LANES = (0, 1, 0, 1)
-CAR_SIDES = (1, 1, -1, -1)
-
-# Relative speed of each car in cells per step, one row a scenario: a front car approaches when it
-# slows down (-1), a rear car when it speeds up (+1).
-SCENARIO_SPEEDS = {
-    "front-left slows": (-1, +1, -1, -1),
-    "front-right slows": (+1, -1, -1, -1),
-    "both front cars slow": (-1, -1, -1, -1),
-    "left lane squeezes": (-1, +1, +1, -1),
-    "right lane squeezes": (+1, -1, -1, +1),
-    "front-left slows, rear-right speeds up": (-1, +1, -1, +1),
-    "front-right slows, rear-left speeds up": (+1, -1, +1, -1),
-    "all four close in": (-1, -1, +1, +1),
-}
-
-
-@dataclass(frozen=True)
-class DrivingState:
-    """State of a batch of rounds.
-
-    Attributes:
-        lane: ego's lane ``[...]``, 0 left, 1 right.
-        position: cells ahead of the ego ``[..., 4]``, negative behind, not saturated.
-        speed: relative speed ``[..., 4]`` in cells per step.
-    """
-
-    lane: Tensor
-    position: Tensor
-    speed: Tensor
 
 
 class Driving(World):
@@ -408,52 +386,3 @@ class Driving(World):
                 block(lane, position, (200, 60, 50))
         block(int(state.lane), 0, (40, 90, 200))
         return picture
-
-
-def lane_rewards(
-    position: Tensor, speed: Tensor, known: Tensor, horizon: int, weights: Tensor
-) -> Tensor:
-    """Return rewards of being in each lane at the next steps, given the known cars.
-
-    Args:
-        position: cells ahead ``[..., 4]``.
-        speed: relative speed ``[..., 4]`` in cells per step.
-        known: known cars ``[..., 4]``; the others are assumed absent.
-        horizon: number of steps H.
-        weights: reward of a car of the same lane by its distance in cells, ``[D]`` or
-            ``[..., D]``; cars at D cells and beyond do not matter.
-
-    Returns:
-        ``[..., H, 2]``: entry (h, lane) is the reward at step h + 1.
-    """
-    steps = torch.arange(1, horizon + 1, device=position.device)
-    gap = (position[..., None, :] + speed[..., None, :] * steps[:, None]).abs().long()
-    number = weights.shape[-1]
-    near = known[..., None, :] & (gap < number)
-    shape = gap.shape[:-1]
-    table = weights[..., None, :].expand(*shape, number)
-    value = torch.where(near, table.gather(-1, gap.clamp(max=number - 1)), 0.0)
-    lanes = torch.tensor(CAR_LANES, device=position.device)
-    return torch.stack([(value * (lanes == lane)).sum(-1) for lane in range(2)], -1)
-
-
-def task_weights(device: torch.device | None = None) -> Tensor:
-    """Return rewards of a car of the ego's lane at 0, 1, ..., ``NEAR`` cells, ``[NEAR + 1]``."""
-    weights = torch.full((NEAR + 1,), PROXIMITY, device=device)
-    weights[0] += COLLISION
-    return weights
-
-
-def known_car_values(state: DrivingState, known: Tensor, horizon: int, discount: float) -> Tensor:
-    """Return action values ``[..., 2]`` of the task for a planner that knows some of the cars.
-
-    Args:
-        state: positions and speeds of these cars; those of others are not used.
-        known: ``[..., 4]``; unknown cars are assumed absent.
-        horizon: number of steps planned ahead.
-        discount: discount per step.
-    """
-    rewards = lane_rewards(
-        state.position, state.speed, known, horizon, task_weights(state.position.device)
-    )
-    return action_values(rewards, state.lane, LANE_CHANGE, discount)
