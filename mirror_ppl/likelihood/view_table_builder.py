@@ -7,15 +7,12 @@ and exact marginalization stays cheap.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from math import prod
 
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -30,23 +27,18 @@ from mirror_ppl.likelihood.combinations import (
     require_own_attention,
 )
 from mirror_ppl.likelihood.densities import (
-    choices,
-    log_weighted_latents,
     require_compilable,
 )
 from mirror_ppl.likelihood.policies import draw_policies, within
+from mirror_ppl.likelihood.policy_likelihoods import PolicyLikelihoods
 from mirror_ppl.likelihood.round_views import (
-    ManyViews,
     Rounds,
     RoundViews,
-    distinct_in_groups,
     views_of_rounds,
 )
 from mirror_ppl.likelihood.screening import Screening
-from mirror_ppl.likelihood.sums import Sums
 from mirror_ppl.likelihood.telling import MANY, some_of, telling_first
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
-from mirror_ppl.models.belief_tracking import CHUNK
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
@@ -60,8 +52,6 @@ FEW_ROUNDS = 2
 """Number of rounds up to which they are processed in the given order."""
 GROWTH = 3
 """With screening, largest ratio of the rounds processed at once to those before them."""
-KINDS_MERGE = 32
-"""Policies that distinguish moments if people are of several kinds; total over kinds."""
 PROPOSING_POLICIES = 64
 """Draws from the prior that propose attention without screening."""
 TEMPERATURE = 4.0
@@ -121,6 +111,7 @@ class ViewTableBuilder:
         if self.policies:
             number = len(next(iter(self.policies.values())))
         self.score = torch.zeros(number, prod(self.sizes), device=device)
+        self._likelihoods = PolicyLikelihoods(human, self.policies, number)
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
@@ -170,9 +161,8 @@ class ViewTableBuilder:
         row = torch.arange(number, device=some.device).repeat_interleave(len(some))
         views, which = views_of_rounds(self.human, candidates, row, rounds)
         # The policies that distinguish moments suffice to distinguish rounds.
-        found = self._log_likelihoods(views, self._merging(self.screening))[:, which].unflatten(
-            -1, (number, -1)
-        )
+        policies = self._likelihoods.merging(self.screening)
+        found = self._likelihoods.of_views(views, policies)[:, which].unflatten(-1, (number, -1))
         prior = (self.score + self.log_prior)[: len(found), some]
         return telling_first(found, prior, self.screening.margin)
 
@@ -202,9 +192,9 @@ class ViewTableBuilder:
         candidates = {name: value.repeat(len(rounds)) for name, value in candidates.items()}
         views, which = views_of_rounds(self.human, candidates, row, rounds)
         if self.screening is not None and self.screening.resolution > 0:
-            views, place = self._merged(views, self.screening)
+            views, place = self._likelihoods.merged(views, self.screening)
             which = place[which]
-        found = None if self.screening is None else self._log_likelihoods(views)
+        found = None if self.screening is None else self._likelihoods.of_views(views)
         total = torch.zeros(len(self.score), len(alive), device=alive.device)
         for one, (own, part), seen in zip(
             rounds.each(), views.split(), which.view(len(rounds), number), strict=True
@@ -217,7 +207,7 @@ class ViewTableBuilder:
             if found is not None:
                 likelihoods = found[:, own]
                 if attended is not None and sights is not None:
-                    joint = self._attending(likelihoods[:, sights], attended)
+                    joint = self._likelihoods.with_attention(likelihoods[:, sights], attended)
                     useful = torch.softmax(joint, -1).mean(1)
                     likelihoods = torch.logsumexp(joint, -1)
                     attended = attended.thinned(self._weights() @ useful, KEPT, seed)
@@ -252,7 +242,7 @@ class ViewTableBuilder:
         views, chains = chained_views(self.human, candidates, len(alive), rounds)
         if self.screening is not None and self.screening.resolution > 0:
             before = [own.start for own, _ in views.split()]
-            views, place = self._merged(views, self.screening)
+            views, place = self._likelihoods.merged(views, self.screening)
             begins = [own.start for own, _ in views.split()]
             chains = [
                 chain.of_views(place[first:] - begin)
@@ -260,9 +250,9 @@ class ViewTableBuilder:
             ]
         parts = views.split()
         if self.screening is not None:
-            likelihoods = self._log_likelihoods(views)[:, None]
+            likelihoods = self._likelihoods.of_views(views)[:, None]
             together = Chain.one_after_another(chains, [len(part.moments) for _, part in parts])
-            with self._deciding(self.policies):
+            with self._likelihoods.conditioned():
                 probabilities = together.log_probabilities(
                     self.human, self.human.prior(), len(rounds)
                 )
@@ -374,81 +364,6 @@ class ViewTableBuilder:
         """Log prior probability of each combination under each policy, ``[policies, M]``."""
         others = {name: policy for name, policy in self.policies.items() if name not in self.grid}
         return log_priors(self.human, self.grid, others, 1)[:, 0]
-
-    def _merged(self, views: ManyViews, screening: Screening) -> tuple[ManyViews, Tensor]:
-        """Merge equivalent moments of rounds; also returns the new number of each view."""
-        if not len(views.acted):  # padding only
-            return views, torch.arange(len(views.moments), device=views.moments.device)
-        policies = self._merging(screening)
-        keys = [
-            torch.round(self._of_moments(policies, views, some) / screening.resolution).long().T
-            for some in torch.arange(len(views.acted), device=views.acted.device).split(CHUNK)
-        ]
-        # Moments with different actions stay apart: each has one entry of ``acted``.
-        key = torch.cat([torch.cat(keys), views.acted[:, None]], -1)
-        first, cluster = distinct_in_groups(key, views.rounds)
-        moments = views.moments
-        moments = torch.where(moments == NO_VIEW, NO_VIEW, cluster[moments.clamp(min=0)])
-        distinct, place = distinct_in_groups(moments, views.views)
-        kept = ManyViews(
-            moments[distinct],
-            views.belief[first],
-            views.values[first],
-            views.acted[first],
-            views.views[distinct],
-            views.rounds[first],
-            views.number,
-        )
-        return kept, place
-
-    def _merging(self, screening: Screening) -> dict[str, Tensor]:
-        """Policies that distinguish moments; twice as many in all if there are kinds of people."""
-        kinds = len(self.score) // screening.policies
-        number = kinds * (screening.merge_policies if kinds == 1 else max(1, KINDS_MERGE // kinds))
-        return {name: policy[:number] for name, policy in self.policies.items()}
-
-    def _log_likelihoods(
-        self, views: ManyViews, policies: Mapping[str, Tensor] | None = None
-    ) -> Tensor:
-        """Log-likelihood of the recorded actions under each policy and view, ``[policies, V]``."""
-        if not len(views.acted):  # padding only
-            return self.score.new_zeros(len(self.score), len(views.moments))
-        moments = views.moments[None]
-        along = Sums.of(moments, moments != NO_VIEW, len(views.acted))
-        policies = self.policies if policies is None else policies
-        return along(self._of_moments(policies, views)[:, None])[:, 0]
-
-    def _attending(self, likelihoods: Tensor, attended: AttentionValues) -> Tensor:
-        """Log joint ``[policies, U, G]`` of actions and attention, given log-likelihoods."""
-        values = {name: value[None, None] for name, value in attended.values.items()}
-        with self._deciding(self.policies):
-            implants = self.human.prior()
-            probabilities = log_weighted_latents(
-                self.human, implants, values, attended.log_weights[None, None], attended.covariates
-            )
-        return likelihoods + probabilities[:, 0]
-
-    def _of_moments(
-        self, policies: Mapping[str, Tensor], views: ManyViews, some: Tensor | slice = slice(None)
-    ) -> Tensor:
-        """Log-likelihood ``[policies, N]`` of the record at some moments."""
-        moments = (one[None, some] for one in (views.belief, views.values, views.acted))
-        with self._deciding(policies) as number:
-            _, found = choices(self.human, self.human.prior(), *moments)
-        # If actions depend on no implant, they are the same under every policy.
-        return found.expand(number, *found.shape[-2:])[:, 0]
-
-    @contextmanager
-    def _deciding(self, policies: Mapping[str, Tensor]) -> Iterator[int]:
-        """Condition the program on the policies, one draw each; yields their number."""
-        number = len(next(iter(policies.values()))) if policies else len(self.score)
-        with (
-            poutine.block(),
-            poutine.condition(data=dict(policies)),
-            pyro.plate("policy", number, dim=-3),
-            pyro.plate("person", 1, dim=-2),
-        ):
-            yield number
 
 
 def _number_of(values: Mapping[str, Tensor]) -> int:
