@@ -1,0 +1,208 @@
+r"""What highway messages lose to the greedy oracle at a decision, and why: for docs/highway.md.
+
+    python -m mirror_ppl.fit --domain highway --setting fog --population diverse \
+        --train-rounds 20 --explore 0 --out runs/highway_0
+    python -m benchmarks.highway_gap runs/highway_0/posterior.nc
+    python -m benchmarks.highway_gap runs/highway_0/posterior.nc --receive mirror --rounds 2
+
+Simulated drivers play rounds in silence, or receive messages of ``mirror``. At every sixth decision
+messages of up to two items are chosen in several ways, and judged as the oracle judges them: by the
+driver's true choices and the expert's values of the true state, less the cost. The last commands
+write a row for each driver to docs/results/highway_gap.csv. Without a file, the table of the rows
+that are there is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import mirror_ppl
+from benchmarks._rows import rows_in
+from mirror_ppl.communication.communicator import choose
+from mirror_ppl.communication.messages import Channels, every_message
+from mirror_ppl.communication.objectives import Valued
+from mirror_ppl.communication.person import PlanningContext
+from mirror_ppl.communication.rollouts import robot_belief
+from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.domains.base import map_state
+from mirror_ppl.domains.highway import Highway, expert
+from mirror_ppl.people import simulated_people
+
+ROWS = Path(__file__).parents[1] / "docs/results/highway_gap.csv"
+EVERY = 6
+"""Decisions from one that is looked at to the next."""
+WAYS = {
+    "best": "the best message",
+    "mirror": "`mirror`: predicted choices, the robot's values",
+    "true_values": "predicted choices, the expert's values of the true state",
+    "true_choices": "the driver's true choices, the robot's values",
+    "estimated_state": "true choices, the expert's values of the state estimated from the lidar",
+}
+"""Ways to choose a message, by the names of columns."""
+RECEIVED = ("none", "mirror")
+"""What drivers receive in the rounds that are looked at."""
+
+
+def gains(
+    planner: mirror_ppl.Communicator,
+    past: RoundSoFar,
+    true: Tensor,
+    values: Tensor,
+    messages: Tensor,
+) -> dict[str, float]:
+    """Return the true gain over silence of what each way chooses at one decision.
+
+    Args:
+        planner: with the posterior of the driver.
+        past: the round so far.
+        true: probabilities of the driver's manoeuvres after each message, ``[C, A]``.
+        values: the expert's, of the true state, ``[A]``.
+        messages: candidates ``[C, N]``, silence first.
+    """
+    human = planner.person.human
+    cost = Channels(human.domain).cost(messages)
+    context = PlanningContext.of(planner.person, past)
+    state, index = context.told(messages)
+    own = state.belief[index][:, context.person.percept].T
+    predicted = context.person.act(state.mean[own], human.action_values(state.mean)[own]).exp()
+    robot = robot_values(planner, past)
+    estimated = expert.values(human.domain.state_behind({n: v[None] for n, v in past.now.items()}))
+
+    def chosen(probabilities: Tensor, worth: Tensor) -> int:
+        """Choose by probabilities ``[S, C, A]`` and values ``[A]``, as the planner does."""
+        utility = (probabilities @ worth).T - cost[:, None]
+        return choose(Valued(utility, None), planner.min_standard_errors)
+
+    gain = true @ values - cost
+    gain = gain - gain[0]
+    sent = planner.plan(past).flags
+    return {
+        "best": float(gain.max()),
+        "mirror": float(gain[int((messages == sent).all(-1).nonzero()[0])]),
+        "true_values": float(gain[chosen(predicted, values)]),
+        "true_choices": float(gain[chosen(true[None], robot)]),
+        "estimated_state": float(gain[chosen(true[None], estimated[0])]),
+    }
+
+
+def robot_values(planner: mirror_ppl.Communicator, past: RoundSoFar) -> Tensor:
+    """Return the robot's values ``[A]``, by which `mirror` chooses."""
+    self_model = planner.person.human.self_model
+    return self_model.action_values(robot_belief(self_model, past).mean).view(-1)
+
+
+@torch.no_grad()
+def measured(path: Path, people: int, rounds: int, seed: int, receive: str) -> list[dict[str, str]]:
+    """Return a row for each driver: means over the decisions that were looked at."""
+    world = Highway()
+    channels = Channels(world)
+    drivers = simulated_people("highway", "fog", "diverse", people, seed)
+    generator = torch.Generator().manual_seed(seed)
+    state = map_state(
+        lambda part: part.view(people, rounds, *part.shape[1:]),
+        world.initial(people * rounds, generator),
+    )
+    names = [f"person-{number:02d}" for number in range(1, people + 1)]
+    planners = [mirror_ppl.Communicator(path, name) for name in names]
+    memory, observation = drivers.start(rounds), world.observe(state)
+    past = [
+        [RoundSoFar.begin(world, _at(observation, one, two)) for two in range(rounds)]
+        for one in range(people)
+    ]
+    found: list[list[dict[str, float]]] = [[] for _ in names]
+    for step in range(world.horizon):
+        values = expert.values(state)
+        sent = torch.zeros(people, rounds, len(channels), dtype=torch.bool)
+        for one in range(people * (step % EVERY == EVERY - 1)):
+            driver = drivers.select([one])
+            for two in range(rounds):
+                if bool(world.over(state)[one, two]):
+                    continue
+                now = _at(observation, one, two)
+                messages = every_message(channels.join(world.communicable(now)), 2)
+                many = len(messages)
+                true, _ = driver.step(
+                    map_state(
+                        lambda part: part[one, two].expand(many, *part.shape[2:])[None],  # noqa: B023
+                        memory,
+                    ),
+                    {n: part.expand(many, *part.shape)[None] for n, part in now.items()},
+                    channels.split(messages[None]),
+                )
+                found[one].append(
+                    gains(planners[one], past[one][two], true[0], values[one, two], messages)
+                )
+        if receive == "mirror":
+            for one, planner in enumerate(planners):
+                for two in range(rounds):
+                    sent[one, two] = planner.plan(past[one][two]).flags
+        told = channels.split(sent)
+        chances, memory = drivers.step(memory, observation, told)
+        action = torch.multinomial(chances.flatten(0, 1), 1, generator=generator)
+        action = action.view(people, rounds)
+        state = world.transition(state, action)
+        observation = world.observe(state)
+        for one in range(people):
+            for two in range(rounds):
+                past[one][two] = past[one][two].then(
+                    _at(told, one, two), action[one, two], _at(observation, one, two)
+                )
+        print(f"decision {step + 1} of {world.horizon}", end="\r", flush=True)
+    return [
+        {"receive": receive, "person": name, "decisions": str(len(own))}
+        | {way: f"{np.mean([gain[way] for gain in own]):.4f}" for way in WAYS}
+        for name, own in zip(names, found, strict=True)
+    ]
+
+
+def _at(parts: dict[str, Tensor], one: int, two: int) -> dict[str, Tensor]:
+    return {name: part[one, two] for name, part in parts.items()}
+
+
+def table(rows: Sequence[dict[str, str]]) -> str:
+    """Return the table of the page; intervals are of a bootstrap over drivers."""
+    lines = [
+        "| Message chosen by | Gain in silence | % of the best | Gain with `mirror` | % of the best |",
+        "|---|---|---|---|---|",
+    ]
+    cells = {way: [f"| {label}"] for way, label in WAYS.items()}
+    for receive in RECEIVED:
+        some = [row for row in rows if row["receive"] == receive]
+        own = {way: np.array([float(row[way]) for row in some]) for way in WAYS}
+        drawn = np.random.default_rng(0).integers(len(some), size=(10_000, len(some)))
+        for way, gain in own.items():
+            shares = 100 * gain[drawn].mean(1) / own["best"][drawn].mean(1)
+            low, high = np.quantile(shares, (0.05, 0.95))
+            share = 100 * gain.mean() / own["best"].mean()
+            interval = "" if way == "best" else f"{share:.0f} [{low:.0f}, {high:.0f}]"
+            cells[way] += [f"{gain.mean():.1f}", interval]
+    return "\n".join([*lines, *(" | ".join(own) + " |" for own in cells.values())])
+
+
+def main() -> None:
+    """Measure with a posterior, if one is given, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("file", nargs="?", type=Path, help="posterior of simulated drivers")
+    parser.add_argument("--people", type=int, default=10)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=0, help="of the drivers")
+    parser.add_argument("--receive", choices=RECEIVED, default="none", help="messages they receive")
+    given = parser.parse_args()
+    rows = rows_in(ROWS)
+    if given.file is not None:
+        kept = [row for row in rows if row["receive"] != given.receive]
+        new = measured(given.file, given.people, given.rounds, given.seed, given.receive)
+        rows = rows_in(ROWS, kept + new)
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
