@@ -168,7 +168,8 @@ def _at(parts: dict[str, Tensor], one: int, two: int) -> dict[str, Tensor]:
 def table(rows: Sequence[dict[str, str]]) -> str:
     """Return the table of the page; intervals are of a bootstrap over drivers."""
     lines = [
-        "| Message chosen by | Gain in silence | % of the best | Gain with `mirror` | % of the best |",
+        "| Message chosen by | Gain in silence | % of the best | "
+        "Gain with `mirror` | % of the best |",
         "|---|---|---|---|---|",
     ]
     cells = {way: [f"| {label}"] for way, label in WAYS.items()}

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache, partial
-from typing import TYPE_CHECKING, cast
+from functools import cached_property, lru_cache, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from mirror_ppl.domains import Domain
 from mirror_ppl.domains.registry import code_of
+from mirror_ppl.user_code import describe
 from mirror_ppl.workers import pickled, run_tasks
 
 if TYPE_CHECKING:
@@ -23,7 +27,8 @@ KEPT = 4
 def stepped_by(jobs: int, domain: Domain) -> Iterator[None]:
     """Step the environment of a world in several processes; the outcomes are the same.
 
-    Nothing changes in worlds that are not stepped, and where a batch of steps is soon done.
+    Nothing changes in worlds that are not stepped, and where steps are soon done. Where other
+    processes fail, a warning says why, and the world is stepped in this one.
 
     Args:
         jobs: number of processes; 1 for this one, -1 for one per core.
@@ -37,26 +42,68 @@ def stepped_by(jobs: int, domain: Domain) -> Iterator[None]:
     if number == 1 or not isinstance(domain, SteppedWorld):
         yield
         return
-    code_of(domain)  # other processes may not have its file
-    domain.elsewhere = partial(_shared, number, pickled(domain))
+    vars(domain)["elsewhere"] = _Elsewhere(number, domain)
     try:
         yield
     finally:
-        domain.elsewhere = None
+        vars(domain)["elsewhere"] = None
 
 
-def _shared(jobs: int, own: bytes, trials: Sequence[Trial]) -> list[Outcome]:
-    """Return what follows each trial, computed by ``jobs`` processes."""
-    parts = [trials[place::jobs] for place in range(jobs)]
-    tasks = [partial(_outcomes, own, place, part) for place, part in enumerate(parts) if part]
-    found: list[Outcome | None] = [None] * len(trials)
-    for place, outcomes in run_tasks(tasks, jobs):
-        found[place::jobs] = outcomes
-    return cast("list[Outcome]", found)
+class _Elsewhere:
+    """Outcomes of a world, computed by other processes."""
+
+    def __init__(self, jobs: int, world: SteppedWorld) -> None:
+        self.jobs, self.world = jobs, world
+
+    @cached_property
+    def _own(self) -> bytes:
+        code_of(self.world)  # other processes may not have its file
+        return pickled(self.world)
+
+    def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
+        """Return what follows each trial."""
+        try:
+            return self._shared(trials)
+        except Exception as error:
+            vars(self.world)["elsewhere"] = None
+            found = self.world.outcomes(trials)  # where the world itself is at fault, this fails
+            warnings.warn(
+                f"{self.world.name} is stepped in one process, as others failed: {describe(error)}",
+                stacklevel=2,
+            )
+            return found
+
+    def _shared(self, trials: Sequence[Trial]) -> list[Outcome]:
+        parts = [trials[place :: self.jobs] for place in range(self.jobs)]
+        tasks = [
+            partial(_outcomes, self._own, place, *_stacked(part))
+            for place, part in enumerate(parts)
+            if part
+        ]
+        found: list[Any] = [None] * len(trials)
+        seconds = []
+        for place, taken, reached, ends, earned in run_tasks(tasks, self.jobs):
+            found[place :: self.jobs] = zip(reached, ends, earned, strict=True)
+            seconds.append(taken)
+        self.world.took(max(seconds))
+        return found
 
 
-def _outcomes(own: bytes, place: int, trials: Sequence[Trial]) -> tuple[int, list[Outcome]]:
-    return place, _world(own).outcomes(trials)
+def _stacked(trials: Sequence[Trial]) -> tuple[np.ndarray, Any, list[int]]:
+    """Return trials as arrays, which are sent much faster."""
+    rows, commands, seeds = zip(*trials, strict=True)
+    alike = all(isinstance(command, np.ndarray) for command in commands)
+    return np.array(rows), np.array(commands) if alike else commands, list(seeds)
+
+
+def _outcomes(
+    own: bytes, place: int, rows: np.ndarray, commands: Sequence[Any], seeds: Sequence[int]
+) -> tuple[int, float, np.ndarray, list[bool], np.ndarray]:
+    """Return the place, the seconds that an outcome took, and the parts of outcomes."""
+    world = _world(own)
+    found = world.outcomes(list(zip(rows, commands, seeds, strict=True)))
+    reached, ends, earned = zip(*found, strict=True)
+    return place, world.seconds, np.array(reached), list(ends), np.array(earned)
 
 
 @lru_cache(KEPT)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -59,8 +61,8 @@ def run_tasks(
         own: dict[str, Any] = {}
         if here:
             own = {"backend": "loky", "initializer": _end_with, "initargs": (os.getpid(),)}
-        files, worlds = _files_of_users(), added_worlds()
-        calls = (delayed(partial(_in_worker, files, worlds, task))() for task in tasks)
+        context = _Context(_files_of_users(), added_worlds(), _environments())
+        calls = (delayed(partial(_in_worker, context, task))() for task in tasks)
         results = Parallel(n_jobs=jobs, return_as="generator_unordered", **own)(calls)
         try:
             yield from cast(Iterator[Result], results)
@@ -125,13 +127,40 @@ def _files_of_users() -> tuple[Path, ...]:
     return files
 
 
-def _in_worker(
-    files: Sequence[Path], worlds: Sequence[World], task: Callable[[], Result]
-) -> Result:
-    for file in files:
+def _environments() -> dict[str, bytes]:
+    """Specifications of environments that were registered with Gymnasium, by their ids, pickled.
+
+    Other processes do not run the file that registers them. What cannot be pickled is left out.
+    """
+    registration = sys.modules.get("gymnasium.envs.registration")
+    found: dict[str, bytes] = {}
+    for name, spec in registration.registry.items() if registration else ():
+        if not str(spec.entry_point).startswith(("gymnasium.", "mirror_ppl.")):
+            with suppress(Exception):
+                found[name] = pickled(spec)
+    return found
+
+
+@dataclass(frozen=True)
+class _Context:
+    """What is known in this process and has to be known in others."""
+
+    files: Sequence[Path]
+    worlds: Sequence[World]
+    environments: Mapping[str, bytes]
+
+
+def _in_worker(context: _Context, task: Callable[[], Result]) -> Result:
+    for file in context.files:
         remember_file(file)
-    for world in worlds:
+    for world in context.worlds:
         know(world)
+    if context.environments:
+        from gymnasium.envs.registration import registry
+
+        for name, spec in context.environments.items():
+            if name not in registry:
+                registry[name] = pickle.loads(spec)
     # One thread a process: the cores are shared by processes.
     import torch
 

@@ -76,6 +76,13 @@ class Recorder(gym.Wrapper):
             seed = int(self._chooser.integers(self.world.layouts))
         found = self.env.reset(seed=seed, options=options)
         first = self.world.seen(self.env)
+        for modality in self.world.modalities:
+            shape = (len(modality.items), len(modality.features))
+            found_shape = np.shape(first.get(modality.name, ()))
+            if found_shape != shape:
+                raise InputError(
+                    f"{modality.name} has shape {found_shape} in this environment, expected {shape}"
+                )
         if not self.world.knows(first):
             raise InputError(
                 f"seed {seed} begins in a state that {self.world.name} does not have; its layouts "
@@ -103,7 +110,8 @@ class Recorder(gym.Wrapper):
 
         Raises:
             InputError: the round has not begun or is over, the world has no such action, or it
-                computes something else than the environment does.
+                computes something else than the environment does; the round ends before this step.
+            DomainError: the world is at fault where this step leads.
         """
         self._require_begun()
         number, control = self.world.action_of(action)
@@ -114,20 +122,21 @@ class Recorder(gym.Wrapper):
         state = self.world.state_behind(as_tensors(now.seen[-1]))
         state = self.world.redrawn(state, self._chance)
         self.world.seed_chance(self.env, state)
-        found, reward, terminated, truncated, info = self.env.step(action)
-        seen = self.world.seen(self.env)
-        terms = self.world.named_terms(self.env, action, reward, terminated)
-        now.add(number, control, self._told, sum(terms.values()), seen)
-        self._told = []
-        truncated = truncated or len(now.actions) == self.world.horizon
-        now.over = terminated or truncated
-        command = torch.tensor(number) if control is None else torch.from_numpy(action)
+        found, reward, terminated, truncated, info = self.world.stepped(self.env, action)
+        command = torch.tensor(number)
+        if control is not None:
+            command = torch.from_numpy(control).to(torch.get_default_dtype())
         fault = self.world.fault_of_step(self.env, state, action, command, reward, bool(terminated))
         if fault:
             raise InputError(
-                f"step {len(now.actions) - 1}: {fault}; mend {self.world.name}, as the recording "
-                "contradicts it"
+                f"step {len(now.actions)}: {fault}; or this environment is not as make() returns "
+                "it (wrappers, arguments)"
             )
+        terms = self.world.named_terms(self.env, action, reward, terminated)
+        now.add(number, control, self._told, sum(terms.values()), self.world.seen(self.env))
+        self._told = []
+        truncated = truncated or len(now.actions) == self.world.horizon
+        now.over = terminated or truncated
         return found, float(reward), terminated, truncated, info
 
     def _require_begun(self) -> None:

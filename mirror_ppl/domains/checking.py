@@ -284,9 +284,10 @@ def remarks_on(world: World) -> str:
         action = torch.randint(len(world.actions), (REMARKED,), generator=generator)
         following = world.transition(state, action)
         if world.random and not chance:
-            other = world.observe(world.transition(world.redrawn(state, generator), action))
-            seen = world.observe(following)
-            chance = any(not torch.equal(other[name], seen[name]) for name in seen)
+            one, other = (
+                _outcome(world, now, action) for now in (state, world.redrawn(state, generator))
+            )
+            chance = any(not torch.equal(part, other[name]) for name, part in one.items())
         earned += total_reward(world.rewards(state, action, following))[~ended].tolist()
         state, ended = following, ended | world.over(following)
     number = int(ended.sum())
@@ -299,6 +300,13 @@ def remarks_on(world: World) -> str:
         return remark
     remark += f"; {number} of {REMARKED} rounds ended"
     return remark if number else f"{remark}, so ends were not checked"
+
+
+def _outcome(world: World, state: Any, action: Tensor) -> dict[str, Tensor]:
+    """Return all that can be told of what follows an action."""
+    later = world.transition(state, action)
+    earned = world.rewards(state, action, later)
+    return {"over": world.over(later), **world.observe(later), **earned}
 
 
 def _fault_of_chance(world: World, states: Any, observation: Mapping[str, Tensor]) -> str:

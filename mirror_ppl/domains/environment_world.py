@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from copy import copy
+from numbers import Real
 from operator import index
 from typing import Any
 
@@ -86,6 +87,21 @@ class EnvironmentWorld(World):
             raise DomainError(f"{self.name}: look() has {shown(found)}, expected a dict of arrays")
         return found
 
+    def stepped(self, env: gym.Env, command: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step an environment, which may change the command that it is given.
+
+        Raises:
+            DomainError: it does not return five values.
+        """
+        found = env.step(copy(command))
+        if not isinstance(found, tuple) or len(found) != 5:
+            number = f"{len(found)} values" if isinstance(found, tuple) else shown(found)
+            raise DomainError(
+                f"{self.name}: step() of the environment has {number}, expected observation, "
+                "reward, terminated, truncated and info"
+            )
+        return found
+
     def named_terms(
         self, env: gym.Env, action: Any, reward: Any, terminated: bool
     ) -> dict[str, float]:
@@ -101,6 +117,9 @@ class EnvironmentWorld(World):
                 f"{self.name}: terms() has {found}, expected "
                 f"{', '.join(self.reward_terms)} (reward_terms)"
             )
+        for name, value in own.items():
+            if np.ndim(value) or not isinstance(value, Real):
+                raise DomainError(f"{self.name}: terms() has {name} {shown(value)}, not a number")
         return own
 
     @property
@@ -184,7 +203,7 @@ class EnvironmentWorld(World):
         for seed in range(min(PLAYED, self.layouts)):
             env.reset(seed=seed)
             first, again = as_tensors(self.seen(env)), as_tensors(self.seen(env))
-            if any(not torch.equal(first[name], again[name]) for name in first):
+            if not all(torch.allclose(first[n], again[n], equal_nan=True) for n in first):
                 return [VARIES]
             if bool(self.over(self.state_behind(first))):
                 return [f"the task is done where rounds begin (seed {seed})"]
@@ -207,7 +226,7 @@ class EnvironmentWorld(World):
         """Take a step; return what the world computes otherwise, and whether it ended."""
         state = self.state_behind(as_tensors(self.seen(env)))
         self.seed_chance(env, state)
-        _, reward, end, cut, _ = env.step(copy(command))
+        _, reward, end, cut, _ = self.stepped(env, command)
         fault = self.fault_of_step(env, state, command, action, reward, bool(end))
         if not fault and cut and not end and step + 1 < self.horizon:
             fault = f"the environment truncates rounds; horizon may be {step + 1} at most"

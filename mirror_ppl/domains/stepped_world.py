@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -45,12 +44,14 @@ CACHED = (
     "_done",
     "_left_to_try",
     "_ends_to_try",
-    "_seconds",
+    "seconds",
     "elsewhere",
 )
 """Attributes that are of one process: the environment, and what was seen of it."""
 WORTH_SHARING = 0.1
 """Seconds of stepping from which on other processes are asked."""
+SLOW = 5e-4
+"""Seconds of a step from which on they are; faster ones take as long to send."""
 MOST_OUTCOMES = 500_000
 """Number of outcomes that are kept."""
 SEEDS = 2**31
@@ -249,12 +250,17 @@ class SteppedWorld(EnvironmentWorld):
 
     def outcomes(self, trials: Sequence[Trial]) -> list[Outcome]:
         """Return what follows, computed here or, where that takes long, `elsewhere`."""
-        if self.elsewhere is not None and len(trials) * self._seconds > WORTH_SHARING:
+        slow = self.seconds >= SLOW and len(trials) * self.seconds >= WORTH_SHARING
+        if self.elsewhere is not None and slow:
             return self.elsewhere(trials)
         begun = time.perf_counter()
         found = [self._tried(*trial) for trial in trials]
-        self._seconds = (time.perf_counter() - begun) / len(trials)
+        self.took((time.perf_counter() - begun) / len(trials))
         return found
+
+    def took(self, seconds: float) -> None:
+        """Keep the seconds that an outcome took, to decide where the next are computed."""
+        vars(self)["seconds"] = seconds
 
     def _tried(self, row: np.ndarray, command: Any, seed: int) -> Outcome:
         found = self._step(row, command, seed)
@@ -293,7 +299,7 @@ class SteppedWorld(EnvironmentWorld):
     def _step(self, row: np.ndarray, command: Any, seed: int) -> Outcome:
         self._restored(row)
         self._seed(self._env, seed)
-        _, reward, terminated, _, _ = self._env.step(copy(command))
+        _, reward, terminated, _, _ = self.stepped(self._env, command)
         end = bool(terminated)
         if end != self._ends():
             raise DomainError(
@@ -340,8 +346,9 @@ class SteppedWorld(EnvironmentWorld):
         return torch.empty(0).numpy().dtype  # torch's default
 
     @cached_property
-    def _seconds(self) -> float:
-        return 0.0  # that an outcome took, in the last batch
+    def seconds(self) -> float:
+        """Seconds that an outcome took in the last batch; 0 at first."""
+        return 0.0
 
     @cached_property
     def _env(self) -> gym.Env:

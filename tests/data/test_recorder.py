@@ -80,6 +80,34 @@ def test_controls_are_executed_as_they_are_recorded():
     assert env.unwrapped.place == 5.0
 
 
+class Halved(gym.Wrapper):
+    """Changes the action that it is given."""
+
+    def step(self, action):
+        action /= 2
+        return self.env.step(action)
+
+
+class Slow(Fast):
+    def make(self):
+        return Halved(Track())
+
+
+def test_controls_of_any_kind_are_recorded():
+    slow = add_domain(Slow)
+    env = Recorder(slow.make(), slow)
+    env.reset(seed=0)
+    for action in ([1.5], np.array([3.0]), np.array([3.5], np.float32)):
+        env.step(np.asarray(action))
+    fast = add_domain(Fast)
+    whole = Recorder(fast.make(), fast)
+    whole.reset(seed=0)
+    for action in ([2], np.array([3], np.int8), np.array([4], object)):
+        whole.step(action)
+    assert env.recordings().controls.flatten().tolist() == [1.5, 3.0, 3.5]
+    assert whole.recordings().controls.flatten().tolist() == [2.0, 3.0, 4.0]
+
+
 def test_a_session_is_refused_where_it_goes_wrong():
     way = Way()
     with pytest.raises(InputError, match="way is not known; add it first"):
@@ -127,8 +155,13 @@ def test_steps_have_to_be_those_of_the_world():
     env = Recorder(gym.wrappers.TransformReward(way.make(), lambda reward: 2 * reward), way)
     env.reset(seed=0)
     env.step(0)
-    with pytest.raises(InputError, match=r"step 1: after 1, reward is 2.0 .*computed as 1.0.*mend"):
+    with pytest.raises(
+        InputError, match=r"step 1: after 1, reward is 2.0 .*computed as 1.0.*wrappers"
+    ):
         env.step(1)
+    with pytest.raises(InputError, match="call reset"):
+        env.step(1)
+    assert env.recordings().lengths.tolist() == [[1]]  # without the step that was wrong
     env = Recorder(Wind(), way)
     with pytest.raises(InputError, match=r"step \d: after 1, ego is .*steps are random"):
         for _ in range(20):  # gusts of one step are the world's

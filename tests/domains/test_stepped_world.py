@@ -5,6 +5,7 @@ import pickle
 import re
 from dataclasses import replace
 from operator import itemgetter
+from threading import Lock
 
 import gymnasium as gym
 import numpy as np
@@ -205,6 +206,16 @@ class Stuck(Edge):
         env.place = min(int(observation["ego"][0]), 9)
 
 
+class Old(Walk):
+    def step(self, action):
+        found, reward, end, _, info = super().step(action)
+        return found, reward, end, info
+
+
+def paid_by_chance(self, env, action, reward, terminated):
+    return {"reward": env.np_random.random()}
+
+
 def moved(state):
     return replace(state, values=state.values - torch.tensor([0.0, 1.0]))
 
@@ -235,6 +246,12 @@ def moved(state):
             r"done.. has .*\(2,\), expected True or False",
         ),
         (Way, {"terms": lambda self, *found: found[2]}, "terms.. has .*, expected reward"),
+        (
+            Way,
+            {"terms": lambda self, *found: {"reward": np.ones(1)}},
+            "terms.. has reward .*, not a number",
+        ),
+        (Way, {"make": lambda self: Old()}, "step.. of the environment has 4 values, expected obs"),
         (Way, {"make": lambda self: Random()}, "vary; restore.. does not set all"),
         (Way, {"make": lambda self: Wind()}, r"vary; .*steps are random \(then random = True"),
         (Windy, {"make": lambda self: Dice()}, "vary; .*another generator than np_random"),
@@ -300,6 +317,8 @@ def test_remarks_say_where_nothing_depends_on_chance():
     calm = type("Calm", (Way,), {"random": True})()
     assert "no step depended on chance, so random may be left out" in remarks_on(calm)
     assert "chance" not in remarks_on(Windy())
+    paid = type("Paid", (Way,), {"random": True, "terms": paid_by_chance})()
+    assert "chance" not in remarks_on(paid)
 
 
 def test_controls_have_different_names():
@@ -379,29 +398,56 @@ def test_no_states_lead_to_none():
     assert following.values.shape == (0, 2) and following.done.dtype == torch.bool
 
 
+PAID = "mirror_ppl_tests/Paid-v0"
+TENS = torch.arange(10.0)[:, None]
+GO = torch.ones((), dtype=torch.long)
+
+
+@pytest.fixture
+def registered():
+    gym.register(id=PAID, entry_point=Walk)
+    yield
+    del gym.registry[PAID]
+
+
 class PaidByProcess(Way):
-    """Rewards are the number of the process that steps."""
+    """Rewards are the number of the process that steps; other processes do not register it."""
+
+    def make(self):
+        return gym.make(PAID).unwrapped
 
     def terms(self, env, action, reward, terminated):
         return {"reward": os.getpid()}
 
 
-def test_other_processes_step_where_that_takes_long(monkeypatch):
+def paid(world, state):
+    following = world.transition(state, GO)
+    return set(world.rewards(state, GO, following)["reward"].long().tolist()), following
+
+
+def test_other_processes_step_where_that_takes_long(monkeypatch, registered):
     own, way = PaidByProcess(), PaidByProcess()
-    every = torch.arange(10.0)[:, None]
-    state = way.state_behind({"ego": every, "visual": 10 - every[..., None]})
+    state = way.state_behind({"ego": TENS, "visual": 10 - TENS[..., None]})
     some, others = (map_state(itemgetter(rows), state) for rows in (slice(5), slice(5, 9)))
-    go = torch.ones((), dtype=torch.long)
-
-    def paid(world, state):
-        following = world.transition(state, go)
-        return set(world.rewards(state, go, following)["reward"].long().tolist()), following
-
     with stepped_by(2, way):
         assert paid(way, some)[0] == {os.getpid()}  # it is soon done
         monkeypatch.setattr(stepped_world, "WORTH_SHARING", 0.0)
+        monkeypatch.setattr(stepped_world, "SLOW", 0.0)
         processes, following = paid(way, others)
         assert processes and os.getpid() not in processes
         assert pickle.loads(pickle.dumps(way)).elsewhere is None
     assert paid(way, state)[0] == processes | {os.getpid()}  # known by now
-    assert torch.equal(following.values, own.transition(others, go).values)
+    assert torch.equal(following.values, own.transition(others, GO).values)
+
+
+def test_what_other_processes_cannot_step_is_stepped_here(monkeypatch, registered):
+    way = PaidByProcess()
+    way.lock = Lock()
+    monkeypatch.setattr(stepped_world, "WORTH_SHARING", 0.0)
+    monkeypatch.setattr(stepped_world, "SLOW", 0.0)
+    state = way.state_behind({"ego": TENS, "visual": 10 - TENS[..., None]})
+    with stepped_by(2, way), pytest.warns(UserWarning, match="in one process, as .*cannot pickle"):
+        assert paid(way, state)[0] == {os.getpid()}
+    way.look = lambda env: None
+    with stepped_by(2, way), pytest.raises(DomainError, match="look.. has None"):
+        way.outcomes([(np.array([3.0, 7.0]), 1, 0)])
