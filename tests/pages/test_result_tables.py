@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks import example_world, highway_messages
+from benchmarks import example_world, highway_gap, highway_messages
 from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
@@ -55,6 +55,23 @@ def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
     rounds = int(silent["people"]) * int(silent["rounds"])
     assert rounds == 80 and round(float(silent["mishaps"]) * rounds) == 1
     assert "Of 80 rounds in silence one ended in an accident" in words
+
+
+def test_the_table_of_what_messages_to_drivers_lose_is_what_its_rows_say():
+    page = (DOCS / "highway.md").read_text()
+    rows = rows_in(highway_gap.ROWS)
+    found = page.partition("<!-- gap -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == highway_gap.table(rows)
+    for receive, decisions in (("none", 400), ("mirror", 160)):
+        own = [row for row in rows if row["receive"] == receive]
+        assert len(own) == 10 and sum(int(row["decisions"]) for row in own) == decisions
+    words = " ".join(page.split())
+    cells = [line.split(" | ") for line in found.splitlines()[-3:-1]]
+    state, choices = (cell[-1].split()[0] for cell in cells)
+    assert (
+        f"it would gain {state}% of what is left, with the driver's true choices {choices}%"
+        in words
+    )
 
 
 def test_the_example_of_a_random_world_is_what_its_rows_say():
