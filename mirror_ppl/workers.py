@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -115,6 +115,11 @@ def cluster(address: str) -> ExitStack:
         return stack.pop_all()
 
 
+@cache
+def _resolved(path: str) -> Path:
+    return Path(path).resolve()
+
+
 def _files_of_users() -> tuple[Path, ...]:
     """Files of users; their classes are pickled by value, as other processes cannot import them."""
     import cloudpickle
@@ -122,7 +127,7 @@ def _files_of_users() -> tuple[Path, ...]:
     files = remembered_files()
     for module in list(sys.modules.values()) if files else ():
         path = getattr(module, "__file__", None)
-        if path is not None and Path(path).resolve() in files:
+        if path is not None and _resolved(path) in files:
             cloudpickle.register_pickle_by_value(module)
     return files
 
@@ -132,12 +137,14 @@ def _environments() -> dict[str, bytes]:
 
     Other processes do not run the file that registers them. What cannot be pickled is left out.
     """
+    import cloudpickle
+
     registration = sys.modules.get("gymnasium.envs.registration")
     found: dict[str, bytes] = {}
     for name, spec in registration.registry.items() if registration else ():
         if not str(spec.entry_point).startswith(("gymnasium.", "mirror_ppl.")):
             with suppress(Exception):
-                found[name] = pickled(spec)
+                found[name] = cloudpickle.dumps(spec)
     return found
 
 
