@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import secrets
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import numpy as np
 
 from mirror_ppl.domains import Domain
 from mirror_ppl.domains.registry import code_of
+from mirror_ppl.errors import DomainError
 from mirror_ppl.user_code import describe
 from mirror_ppl.workers import pickled, run_tasks
 
@@ -58,15 +60,18 @@ class _Elsewhere:
     @cached_property
     def _own(self) -> bytes:
         code_of(self.world)  # other processes may not have its file
-        return pickled(self.world)
+        # The number: processes that go on to the next run make the environment anew.
+        return pickled((secrets.token_bytes(8), self.world))
 
     def __call__(self, trials: Sequence[Trial]) -> list[Outcome]:
         """Return what follows each trial."""
         try:
             return self._shared(trials)
+        except DomainError:  # the world is at fault
+            raise
         except Exception as error:
             vars(self.world)["elsewhere"] = None
-            found = self.world.outcomes(trials)  # where the world itself is at fault, this fails
+            found = self.world.outcomes(trials)
             warnings.warn(
                 f"{self.world.name} is stepped in one process, as others failed: {describe(error)}",
                 stacklevel=2,
@@ -109,4 +114,4 @@ def _outcomes(
 @lru_cache(KEPT)
 def _world(own: bytes) -> SteppedWorld:
     """Return the world of this process, whose environment is made once."""
-    return pickle.loads(own)
+    return pickle.loads(own)[1]

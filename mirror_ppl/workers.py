@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickle
 import signal
@@ -61,7 +62,8 @@ def run_tasks(
         own: dict[str, Any] = {}
         if here:
             own = {"backend": "loky", "initializer": _end_with, "initargs": (os.getpid(),)}
-        context = _Context(_files_of_users(), added_worlds(), _environments())
+        worlds = added_worlds()
+        context = _Context(_files_of_users(), worlds, _environments() if worlds else {})
         calls = (delayed(partial(_in_worker, context, task))() for task in tasks)
         results = Parallel(n_jobs=jobs, return_as="generator_unordered", **own)(calls)
         try:
@@ -133,19 +135,35 @@ def _files_of_users() -> tuple[Path, ...]:
 
 
 def _environments() -> dict[str, bytes]:
-    """Specifications of environments that were registered with Gymnasium, by their ids, pickled.
+    """Specifications of environments that are registered with Gymnasium, by their ids, pickled.
 
-    Other processes do not run the file that registers them. What cannot be pickled is left out.
+    Other processes do not run files that register some. What cannot be pickled is left out.
     """
     import cloudpickle
 
     registration = sys.modules.get("gymnasium.envs.registration")
     found: dict[str, bytes] = {}
     for name, spec in registration.registry.items() if registration else ():
-        if not str(spec.entry_point).startswith(("gymnasium.", "mirror_ppl.")):
+        if not name.startswith("mirror_ppl/"):
             with suppress(Exception):
                 found[name] = cloudpickle.dumps(spec)
     return found
+
+
+def _register(environments: Mapping[str, bytes]) -> None:
+    """Register environments as they are in the process that sent them, as far as this one can."""
+    if not environments:
+        return
+    from gymnasium.envs.registration import registry
+
+    for name, content in environments.items():
+        with suppress(Exception):  # whoever makes it learns what is missing
+            spec = pickle.loads(content)
+            if isinstance(spec.entry_point, str):
+                # Packages register theirs, and warn where they are registered already.
+                importlib.import_module(spec.entry_point.partition(".")[0].partition(":")[0])
+            if registry.get(name) != spec:
+                registry[name] = spec
 
 
 @dataclass(frozen=True)
@@ -162,12 +180,7 @@ def _in_worker(context: _Context, task: Callable[[], Result]) -> Result:
         remember_file(file)
     for world in context.worlds:
         know(world)
-    if context.environments:
-        from gymnasium.envs.registration import registry
-
-        for name, spec in context.environments.items():
-            if name not in registry:
-                registry[name] = pickle.loads(spec)
+    _register(context.environments)
     # One thread a process: the cores are shared by processes.
     import torch
 

@@ -126,14 +126,15 @@ class Recorder(gym.Wrapper):
         command = torch.tensor(number)
         if control is not None:
             command = torch.from_numpy(control).to(torch.get_default_dtype())
-        fault = self.world.fault_of_step(self.env, state, action, command, reward, bool(terminated))
+        terms = self.world.named_terms(self.env, action, reward, terminated)
+        seen = self.world.seen(self.env)
+        fault = self.world.fault_of_step(state, action, command, terms, seen, bool(terminated))
         if fault:
             raise InputError(
                 f"step {len(now.actions)}: {fault}; or this environment is not as make() returns "
                 "it (wrappers, arguments)"
             )
-        terms = self.world.named_terms(self.env, action, reward, terminated)
-        now.add(number, control, self._told, sum(terms.values()), self.world.seen(self.env))
+        now.add(number, control, self._told, sum(terms.values()), seen)
         self._told = []
         truncated = truncated or len(now.actions) == self.world.horizon
         now.over = terminated or truncated

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from numbers import Real
 from operator import index
 from typing import Any
 
@@ -94,13 +93,14 @@ class EnvironmentWorld(World):
             DomainError: it does not return five values.
         """
         found = env.step(copy(command))
-        if not isinstance(found, tuple) or len(found) != 5:
-            number = f"{len(found)} values" if isinstance(found, tuple) else shown(found)
+        if not isinstance(found, tuple | list) or len(found) != 5:
+            number = f"{len(found)} values" if isinstance(found, tuple | list) else shown(found)
             raise DomainError(
                 f"{self.name}: step() of the environment has {number}, expected observation, "
                 "reward, terminated, truncated and info"
             )
-        return found
+        observation, reward, terminated, truncated, info = found
+        return observation, reward, terminated, truncated, info
 
     def named_terms(
         self, env: gym.Env, action: Any, reward: Any, terminated: bool
@@ -117,10 +117,13 @@ class EnvironmentWorld(World):
                 f"{self.name}: terms() has {found}, expected "
                 f"{', '.join(self.reward_terms)} (reward_terms)"
             )
-        for name, value in own.items():
-            if np.ndim(value) or not isinstance(value, Real):
-                raise DomainError(f"{self.name}: terms() has {name} {shown(value)}, not a number")
-        return own
+        try:
+            if not any(np.ndim(value) for value in own.values()):
+                return {name: float(value) for name, value in own.items()}
+        except (TypeError, ValueError):
+            pass
+        found = ", ".join(f"{name} {shown(value)}" for name, value in own.items())
+        raise DomainError(f"{self.name}: terms() has {found}, expected numbers")
 
     @property
     def _moves(self) -> tuple[int, ...]:
@@ -203,7 +206,7 @@ class EnvironmentWorld(World):
         for seed in range(min(PLAYED, self.layouts)):
             env.reset(seed=seed)
             first, again = as_tensors(self.seen(env)), as_tensors(self.seen(env))
-            if not all(torch.allclose(first[n], again[n], equal_nan=True) for n in first):
+            if not all(np.array_equal(first[n], again[n], equal_nan=True) for n in first):
                 return [VARIES]
             if bool(self.over(self.state_behind(first))):
                 return [f"the task is done where rounds begin (seed {seed})"]
@@ -227,26 +230,32 @@ class EnvironmentWorld(World):
         state = self.state_behind(as_tensors(self.seen(env)))
         self.seed_chance(env, state)
         _, reward, end, cut, _ = self.stepped(env, command)
-        fault = self.fault_of_step(env, state, command, action, reward, bool(end))
+        terms, found = self.named_terms(env, command, reward, end), self.seen(env)
+        fault = self.fault_of_step(state, command, action, terms, found, bool(end))
         if not fault and cut and not end and step + 1 < self.horizon:
             fault = f"the environment truncates rounds; horizon may be {step + 1} at most"
         return fault, bool(end)
 
     def fault_of_step(
-        self, env: gym.Env, state: Any, command: Any, action: Tensor, reward: Any, end: bool
+        self,
+        state: Any,
+        command: Any,
+        action: Tensor,
+        terms: Mapping[str, float],
+        seen: Mapping[str, Any],
+        end: bool,
     ) -> str:
         """Return what the world computes otherwise than an environment did; empty if nothing.
 
         Args:
-            env: after the step.
-            state: before it.
+            state: before the step.
             command: the environment's action.
             action: the world's.
-            reward: the environment's.
-            end: whether it has terminated.
+            terms: reward terms of the step.
+            seen: after the step.
+            end: whether the environment has terminated.
         """
-        own = as_tensors(self.named_terms(env, command, reward, end))
-        found = as_tensors(self.seen(env))
+        own, found = as_tensors(terms), as_tensors(seen)
         following = self.transition(state, action)
         for values, computed in (
             (found, self.observe(following)),

@@ -17,7 +17,7 @@ from mirror_ppl.domains import Control, Modality, stepped_world
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.checking import faults_of, remarks_on
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
-from mirror_ppl.domains.registry import load_world
+from mirror_ppl.domains.registry import know, load_world
 from mirror_ppl.domains.stepped_world import SteppedWorld
 from mirror_ppl.errors import DomainError
 from mirror_ppl.stepping import stepped_by
@@ -249,7 +249,7 @@ def moved(state):
         (
             Way,
             {"terms": lambda self, *found: {"reward": np.ones(1)}},
-            "terms.. has reward .*, not a number",
+            "terms.. has reward .*, expected numbers",
         ),
         (Way, {"make": lambda self: Old()}, "step.. of the environment has 4 values, expected obs"),
         (Way, {"make": lambda self: Random()}, "vary; restore.. does not set all"),
@@ -426,7 +426,7 @@ def paid(world, state):
 
 
 def test_other_processes_step_where_that_takes_long(monkeypatch, registered):
-    own, way = PaidByProcess(), PaidByProcess()
+    own, way = PaidByProcess(), know(PaidByProcess())
     state = way.state_behind({"ego": TENS, "visual": 10 - TENS[..., None]})
     some, others = (map_state(itemgetter(rows), state) for rows in (slice(5), slice(5, 9)))
     with stepped_by(2, way):
@@ -448,6 +448,13 @@ def test_what_other_processes_cannot_step_is_stepped_here(monkeypatch, registere
     state = way.state_behind({"ego": TENS, "visual": 10 - TENS[..., None]})
     with stepped_by(2, way), pytest.warns(UserWarning, match="in one process, as .*cannot pickle"):
         assert paid(way, state)[0] == {os.getpid()}
-    way.look = lambda env: None
-    with stepped_by(2, way), pytest.raises(DomainError, match="look.. has None"):
-        way.outcomes([(np.array([3.0, 7.0]), 1, 0)])
+
+
+def test_a_fault_that_other_processes_find_is_an_error(monkeypatch, registered):
+    way = type("Wild", (PaidByProcess,), {"make": lambda self: Random()})()
+    way._left_to_try.clear()  # here it is no longer tried
+    monkeypatch.setattr(stepped_world, "WORTH_SHARING", 0.0)
+    monkeypatch.setattr(stepped_world, "SLOW", 0.0)
+    state = way.state_behind({"ego": TENS, "visual": 10 - TENS[..., None]})
+    with stepped_by(2, way), pytest.raises(DomainError, match="vary; restore"):
+        way.transition(state, GO)
