@@ -26,9 +26,8 @@ import mirror_ppl
 from benchmarks._rows import rows_in
 from mirror_ppl.communication.communicator import choose
 from mirror_ppl.communication.messages import Channels, every_message
-from mirror_ppl.communication.objectives import Valued
+from mirror_ppl.communication.objectives import Valued, predicted_choices, robot_values
 from mirror_ppl.communication.person import PlanningContext
-from mirror_ppl.communication.rollouts import robot_belief
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import Highway, expert
@@ -68,10 +67,7 @@ def gains(
     human = planner.person.human
     cost = Channels(human.domain).cost(messages)
     context = PlanningContext.of(planner.person, past)
-    state, index = context.told(messages)
-    own = state.belief[index][:, context.person.percept].T
-    predicted = context.person.act(state.mean[own], human.action_values(state.mean)[own]).exp()
-    robot = robot_values(planner, past)
+    predicted, robot = predicted_choices(context, messages), robot_values(human.self_model, past)
     estimated = expert.values(human.domain.state_behind({n: v[None] for n, v in past.now.items()}))
 
     def chosen(probabilities: Tensor, worth: Tensor) -> int:
@@ -89,12 +85,6 @@ def gains(
         "true_choices": float(gain[chosen(true[None], robot)]),
         "estimated_state": float(gain[chosen(true[None], estimated[0])]),
     }
-
-
-def robot_values(planner: mirror_ppl.Communicator, past: RoundSoFar) -> Tensor:
-    """Return the robot's values ``[A]``, by which `mirror` chooses."""
-    self_model = planner.person.human.self_model
-    return self_model.action_values(robot_belief(self_model, past).mean).view(-1)
 
 
 @torch.no_grad()
@@ -143,8 +133,8 @@ def measured(path: Path, people: int, rounds: int, seed: int, receive: str) -> l
                 for two in range(rounds):
                     sent[one, two] = planner.plan(past[one][two]).flags
         told = channels.split(sent)
-        chances, memory = drivers.step(memory, observation, told)
-        action = torch.multinomial(chances.flatten(0, 1), 1, generator=generator)
+        probabilities, memory = drivers.step(memory, observation, told)
+        action = torch.multinomial(probabilities.flatten(0, 1), 1, generator=generator)
         action = action.view(people, rounds)
         state = world.transition(state, action)
         observation = world.observe(state)

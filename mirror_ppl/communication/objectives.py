@@ -18,12 +18,14 @@ from mirror_ppl.checks import require_methods, whole_number
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import PlanningContext
 from mirror_ppl.communication.rollouts import RolloutTree, World, robot_belief
+from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import Observation
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
+from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, mixed, uniform_of
 
 
@@ -307,22 +309,32 @@ class ExpectedValue:
         person = context.person
         human = person.human
         channels = Channels(human.domain)
-        robot = robot_belief(human.self_model, context.past)
-        true_values = human.self_model.action_values(robot.mean)
+        true_values = robot_values(human.self_model, context.past)
 
         @torch.no_grad()
         def value(candidates: Tensor) -> Valued:
             message = candidates[:, 0]
-            state, index = context.told(message)
-            # Beliefs of each draw after each message, [S, C].
-            own = state.belief[index][:, person.percept].T
-            beliefs, values = state.mean, human.action_values(state.mean)
-            probabilities = person.act(beliefs[own], values[own]).exp()
+            probabilities = predicted_choices(context, message)
             utility = (probabilities * true_values).sum(-1).T
             predicted = probabilities.mean(0)[:, None]
             return Valued(utility - channels.cost(message)[:, None], predicted)
 
         return value
+
+
+def robot_values(self_model: SelfModel, past: RoundSoFar) -> Tensor:
+    """Return the action values ``[A]`` of the robot, who sees everything."""
+    return self_model.action_values(robot_belief(self_model, past).mean).view(-1)
+
+
+def predicted_choices(context: PlanningContext, messages: Tensor) -> Tensor:
+    """Return probabilities of the next action ``[S, C, A]`` after messages ``[C, N]``."""
+    person = context.person
+    state, index = context.told(messages)
+    # Beliefs of each draw after each message, [S, C].
+    own = state.belief[index][:, person.percept].T
+    beliefs, values = state.mean, person.human.action_values(state.mean)
+    return person.act(beliefs[own], values[own]).exp()
 
 
 @dataclass(frozen=True)
