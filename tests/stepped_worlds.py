@@ -50,6 +50,12 @@ class Wind(Walk):
         return super().step(int(action) * self.np_random.integers(1, 4))
 
 
+class Random(Walk):
+    def step(self, action):
+        self.place += int(self.np_random.integers(5))
+        return np.array([self.place]), 0.0, self.place >= 10, False, {}
+
+
 class Windy(Way):
     random = True
 

@@ -77,8 +77,8 @@ class Options:
     device: str = "cpu"
     """Where to compute: cpu, cuda or cuda:0."""
     jobs: int = -1
-    """Of a self-model: processes that step the environment of a world of your own, where that takes
-    long; -1 for one a core."""
+    """Of a self-model: processes that step a slow environment of your own world; -1 for one a
+    core."""
     card: Path | None = None
     """Do not train: print the card of this weights file."""
 

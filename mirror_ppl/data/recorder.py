@@ -69,6 +69,7 @@ class Recorder(gym.Wrapper):
 
         Raises:
             InputError: the round does not begin in one of the world's states.
+            DomainError: what is observed has other shapes than the world's.
         """
         if not isinstance(self.person, str) or not self.person.strip():
             raise InputError(f"person has to be a name, not {self.person!r}")
@@ -76,13 +77,7 @@ class Recorder(gym.Wrapper):
             seed = int(self._chooser.integers(self.world.layouts))
         found = self.env.reset(seed=seed, options=options)
         first = self.world.seen(self.env)
-        for modality in self.world.modalities:
-            shape = (len(modality.items), len(modality.features))
-            found_shape = np.shape(first.get(modality.name, ()))
-            if found_shape != shape:
-                raise InputError(
-                    f"{modality.name} has shape {found_shape} in this environment, expected {shape}"
-                )
+        self.world.require_shapes(first)
         if not self.world.knows(first):
             raise InputError(
                 f"seed {seed} begins in a state that {self.world.name} does not have; its layouts "

@@ -86,6 +86,22 @@ class EnvironmentWorld(World):
             raise DomainError(f"{self.name}: look() has {shown(found)}, expected a dict of arrays")
         return found
 
+    def require_shapes(self, seen: Mapping[str, Any]) -> dict[str, torch.Size]:
+        """Return the shapes of an observation from `look`, in the order of names.
+
+        Raises:
+            DomainError: they are not the world's.
+        """
+        expected = {"ego": torch.Size((len(self.ego_features),))} | {
+            m.name: torch.Size((len(m.items), len(m.features))) for m in self.modalities
+        }
+        found = {name: torch.Size(np.shape(part)) for name, part in seen.items()}
+        if found != expected:
+            raise DomainError(
+                f"{self.name}: look() has {_listed(found)}, expected {_listed(expected)}"
+            )
+        return dict(sorted(expected.items()))
+
     def stepped(self, env: gym.Env, command: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step an environment, which may change the command that it is given.
 
@@ -271,6 +287,10 @@ class EnvironmentWorld(World):
             ended = "has terminated" if end else "has not terminated"
             return f"after {command} the environment {ended}, but the world says otherwise (done)"
         return ""
+
+
+def _listed(shapes: Mapping[str, torch.Size]) -> str:
+    return ", ".join(f"{name} {tuple(size)}" for name, size in sorted(shapes.items()))
 
 
 def as_tensors(observation: Mapping[str, Any]) -> dict[str, Tensor]:

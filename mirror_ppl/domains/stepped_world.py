@@ -31,7 +31,6 @@ from mirror_ppl.domains.environment_world import (
     UNSEEN,
     VARIES,
     EnvironmentWorld,
-    as_tensors,
 )
 from mirror_ppl.errors import DomainError, shown
 
@@ -363,15 +362,7 @@ class SteppedWorld(EnvironmentWorld):
     @cached_property
     def _sizes(self) -> dict[str, torch.Size]:
         """Shapes of the parts of an observation, in the order of names."""
-        expected = {"ego": torch.Size((len(self.ego_features),))} | {
-            m.name: torch.Size((len(m.items), len(m.features))) for m in self.modalities
-        }
-        found = {name: part.shape for name, part in as_tensors(self.seen(self._env)).items()}
-        if found != expected:
-            raise DomainError(
-                f"{self.name}: look() has {_listed(found)}, expected {_listed(expected)}"
-            )
-        return dict(sorted(expected.items()))
+        return self.require_shapes(self.seen(self._env))
 
     @cached_property
     def _starts(self) -> dict[int, Tensor]:
@@ -392,7 +383,3 @@ class SteppedWorld(EnvironmentWorld):
     @cached_property
     def _ends_to_try(self) -> list[None]:
         return [None] * ENDS_TRIED
-
-
-def _listed(shapes: Mapping[str, torch.Size]) -> str:
-    return ", ".join(f"{name} {tuple(size)}" for name, size in sorted(shapes.items()))

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from stepped_worlds import Endless, Swing, Way, Wind, Windy
+from stepped_worlds import Endless, Swing, Walk, Way, Wind, Windy
 
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.data.recorder import Recorder
@@ -150,6 +150,13 @@ def test_rounds_do_not_go_on_where_the_world_has_ended():
         env.step(1)
 
 
+class Ends(Way):
+    """As many ends as the environment has."""
+
+    def look(self, env):
+        return {"ego": [env.place], "visual": [[10 - env.place]] * getattr(env, "ends", 1)}
+
+
 def test_steps_have_to_be_those_of_the_world():
     way = add_domain(Way)
     env = Recorder(gym.wrappers.TransformReward(way.make(), lambda reward: 2 * reward), way)
@@ -162,6 +169,8 @@ def test_steps_have_to_be_those_of_the_world():
     with pytest.raises(InputError, match="call reset"):
         env.step(1)
     assert env.recordings().lengths.tolist() == [[1]]  # without the step that was wrong
+    with pytest.raises(DomainError, match=r"look.. has ego \(1,\), visual \(2, 1\), expected ego"):
+        Recorder(type("Two", (Walk,), {"ends": 2})(), add_domain(Ends)).reset(seed=0)
     env = Recorder(Wind(), way)
     with pytest.raises(InputError, match=r"step \d: after 1, ego is .*steps are random"):
         for _ in range(20):  # gusts of one step are the world's
