@@ -77,8 +77,8 @@ class Options:
     """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
     course a draw; 0.1 in driving and 0.4 in search_rescue and bomb_defusal unless given."""
     hears: float = 0.9
-    """Probability that messages of a channel reach a person, before anything was told: what they do
-    after messages tells. 1 takes it for granted."""
+    """Prior probability that messages of a channel reach a person; updated by what they do after
+    messages. 1 assumes that all messages reach them."""
     kl_weight: float = 1.0
     """Units of reward that mirror-kl gives for a nat."""
     kl_measure: str = "kl"

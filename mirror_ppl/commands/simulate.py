@@ -18,7 +18,7 @@ PROGRAM = "python -m mirror_ppl.simulate"
 COPIES = 4
 """Of recordings in memory: while they are made, checked and packed into a file."""
 DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
-for python -m mirror_ppl.fit. How the people are made is told in docs/people.md."""
+for python -m mirror_ppl.fit. docs/people.md describes the people."""
 EXAMPLES = {
     "ten people who drive in fog": (
         "--setting fog --people 10 --rounds 40 --seed 1 --out runs/people.nc"

@@ -303,7 +303,7 @@ def remarks_on(world: World) -> str:
 
 
 def _outcome(world: World, state: Any, action: Tensor) -> dict[str, Tensor]:
-    """Return all that can be told of what follows an action."""
+    """Return everything that is observable of what follows an action."""
     later = world.transition(state, action)
     earned = world.rewards(state, action, later)
     return {"over": world.over(later), **world.observe(later), **earned}

@@ -1,4 +1,4 @@
-"""What people can be shown and told: groups of sectors, and sentences about six directions.
+"""What can be communicated to people: groups of sectors, and sentences about six directions.
 
 People see sectors; a message shows them a whole group of neighbouring sectors, so that there are
 six groups and six sentences, in the same order. The coefficients of costs are those of driving in
