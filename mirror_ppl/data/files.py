@@ -20,7 +20,7 @@ from mirror_ppl.data.schema import MEASURED, OF_PERSON, TOLD, TRUTH
 from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError, shown
 from mirror_ppl.files import write_whole
-from mirror_ppl.netcdf import read_netcdf
+from mirror_ppl.netcdf import made, read_netcdf
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -61,7 +61,7 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrat
     dataset = to_dataset(require_kind(demonstrations, Demonstrations, "demonstrations"))
     packed = {"zlib": True, "complevel": 4, "shuffle": True, "fletcher32": True}
     encoding = {str(name): packed for name in dataset.data_vars}
-    return write_whole(path, dataset.to_netcdf(engine="h5netcdf", encoding=encoding))
+    return write_whole(path, made(dataset.to_netcdf(engine="h5netcdf", encoding=encoding)))
 
 
 def load_demonstrations(

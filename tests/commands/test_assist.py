@@ -24,7 +24,7 @@ def posterior(tmp_path_factory):
     every = load_demonstrations(asset_path("driving_fog_paper.nc"))
     # Of the people who were simulated first, so that their number tells who they are.
     save_demonstrations(folder / "some.nc", every.select_people([0, 1]).select_rounds(range(3)))
-    small = ("--demos", folder / "some.nc", "--steps", "3", "--draws", "6")
+    small = ("--demos", folder / "some.nc", "--explore", "0", "--draws", "6")
     assert command(fit, *small, "--out", folder / "out") == 0
     return folder / "out" / "posterior.nc"
 
@@ -319,7 +319,7 @@ def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     example = EXAMPLES / "late_reactions.py"
     late = ("--human-model", f"{example}:LatePerson")
     demos = ("--demos", posterior.parents[1] / "some.nc")
-    small = ("--steps", "3", "--draws", "6", "--out", tmp_path)
+    small = ("--train-rounds", "0", "--explore", "0", "--draws", "6", "--out", tmp_path)
     assert command(fit, *demos, *small, *late) == 0
     capsys.readouterr()
     own = (

@@ -133,13 +133,14 @@ def test_posterior_opens_without_this_package_and_agrees_with_the_summary(folder
 
 
 def test_one_seed_gives_one_summary(folder):
+    assert command(fit, *short_fit(folder, "one", *RADIUS)) == 0
     torch.manual_seed(99)
-    assert command(fit, *short_fit(folder, "again")) == 0
-    assert summary_of(folder / "again") == summary_of(folder / "out")
-    assert command(fit, *short_fit(folder, "other"), "--seed", 1) == 0
+    assert command(fit, *short_fit(folder, "again", *RADIUS)) == 0
+    assert summary_of(folder / "again") == summary_of(folder / "one")
+    assert command(fit, *short_fit(folder, "other", *RADIUS), "--seed", 1) == 0
     other = summary_of(folder / "other")
     assert other.pop("seed") == 1
-    assert other["people"] != summary_of(folder / "out")["people"]
+    assert other["people"] != summary_of(folder / "one")["people"]
 
 
 def test_fit_says_what_it_found_and_where_it_lies(folder, capsys):

@@ -170,6 +170,7 @@ def test_fits_refuse_contradictions_and_count_those_allowed(tmp_path, capsys):
     save_demonstrations(tmp_path / "noisy.nc", noisy())
     out = tmp_path / "out"
     args = ("--demos", tmp_path / "noisy.nc", "--out", out, "--draws", 5, "--explore", 0)
+    args += ("--human-model", "one-radius")  # which is quick
     assert command(fit, *args) == 2
     assert "round 0, step 0: after action" in capsys.readouterr().err
     assert not out.exists()

@@ -12,16 +12,24 @@ import pytest
 import xarray as xr
 
 from mirror_ppl import netcdf
-from mirror_ppl.data import load_demonstrations, save_demonstrations
+from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.errors import DemonstrationsError, PosteriorError
 from mirror_ppl.netcdf import read_netcdf
 
 
+class Forgetful(set):
+    """A set that never holds anything."""
+
+    def add(self, element):
+        """Add nothing."""
+
+
 @pytest.fixture(autouse=True)
 def nothing_read(monkeypatch):
-    """Forget what earlier tests read, so that another process reads each file first."""
+    """Forget what was read or made, so that another process reads each file first."""
     monkeypatch.setattr(netcdf, "_READ", set())
+    monkeypatch.setattr(netcdf, "_MADE", Forgetful())
 
 
 def refused(path):
@@ -89,6 +97,55 @@ def test_another_process_reads_each_content_and_its_groups_once(tmp_path, monkey
     assert len(tried) == 2
     read_netcdf(path, PosteriorError, ("other",))
     assert len(tried) == 3
+
+
+def test_what_this_process_made_is_read_by_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(netcdf, "_MADE", set())
+    save_demonstrations(tmp_path / "a.nc", simple())
+    with monkeypatch.context() as patch:
+        patch.setattr(netcdf, "_ends", lambda read, content: pytest.fail("read by another"))
+        assert load_demonstrations(tmp_path / "a.nc").equals(simple())
+    content = bytearray((tmp_path / "a.nc").read_bytes())
+    content[-1] ^= 1
+    (tmp_path / "a.nc").write_bytes(content)
+    monkeypatch.setattr(netcdf, "_ends", lambda read, content: False)
+    with pytest.raises(DemonstrationsError, match="cannot be read to its end"):
+        load_demonstrations(tmp_path / "a.nc")
+
+
+def assert_read_as_by_xarray(path, *groups):
+    found = read_netcdf(path, PosteriorError, ("/", *groups))
+    assert set(found) == {"/", *groups}
+    for name, group in found.items():
+        with xr.open_dataset(path, engine="h5netcdf", group=name, decode_times=False) as expected:
+            assert group.identical(expected.load())
+            assert list(group.coords) == list(expected.coords)
+            for own, variable in group.variables.items():
+                assert variable.dtype == expected.variables[own].dtype
+
+
+@pytest.mark.parametrize("world", ["driving_fog", "search_rescue_smoke", "highway_clear"])
+def test_recordings_are_read_as_xarray_reads_them(world):
+    assert_read_as_by_xarray(asset_path(f"{world}_paper.nc"))
+
+
+def test_groups_of_any_types_are_read_as_xarray_reads_them(tmp_path):
+    data = xr.Dataset(
+        {
+            "packed": ("x", np.array([1.0, np.nan, 3.0])),
+            "flag": ("x", np.array([True, False, True])),
+            "word": ("x", np.array(["a", "", "çé"], dtype=object)),
+            "fixed": ("x", np.array([b"a", b"bc", b""])),
+            "nothing": ("y", np.zeros(0)),
+            "scalar": 3,
+        },
+        coords={"x": ["k", "l", "m"], "beside": ("x", [4, 5, 6])},
+        attrs={"title": "t", "many": [1, 2]},
+    )
+    packing = {"packed": {"dtype": "i2", "scale_factor": 0.5, "_FillValue": -1}}
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf", encoding=packing)
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf", mode="a", group="inner")
+    assert_read_as_by_xarray(tmp_path / "a.nc", "inner")
 
 
 def test_a_zeroed_heap_does_not_hang(tmp_path, monkeypatch):

@@ -133,7 +133,7 @@ def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
     for name in advises:
         status = command(
             assist, "--posterior", f"{name}/posterior.nc", "--human-model", name, "--rounds", 1,
-            "--communicator", "none", "mirror", "--jobs", 1, "--draws", 8,
+            "--communicator", "none", "mirror", "--jobs", 1, "--draws", 8, "--horizon", 2,
         )  # fmt: skip
         assert status == 0
 

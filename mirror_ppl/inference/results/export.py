@@ -31,6 +31,7 @@ from mirror_ppl.files import write_whole
 from mirror_ppl.inference.results.identifiability import Identifiability
 from mirror_ppl.inference.results.predictions import Predictions
 from mirror_ppl.models.implants import SIGHT, in_units
+from mirror_ppl.netcdf import made
 
 if TYPE_CHECKING:
     import arviz as az
@@ -190,7 +191,7 @@ def netcdf_content(inference_data: az.InferenceData) -> memoryview:
     }
     content = data.to_netcdf(engine="h5netcdf", encoding=encoding)
     assert isinstance(content, memoryview)  # as no path was given
-    return content
+    return made(content)
 
 
 def _constants(rounds: Demonstrations) -> dict[str, Any]:
