@@ -15,7 +15,7 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 DOMAIN = get_domain("driving")
 CHANNELS = Channels(DOMAIN)
-SIGHTS = sight_sites(DOMAIN)
+SIGHTS, ASSUMED = sight_sites(DOMAIN), assumption_sites(DOMAIN)
 BLIND, FULL_SIGHT = 0, len(DOMAIN.reach_bins) - 1
 
 
@@ -79,7 +79,7 @@ def implants(number=1, model=None, sight=BLIND, **values):
         values: of each draw, or one for all.
     """
     latent, actions = (model or human()).self_model.latent, len(DOMAIN.actions)
-    given = dict.fromkeys(SIGHTS, sight) | dict.fromkeys(assumption_sites(DOMAIN), 1)
+    given = dict.fromkeys(SIGHTS, sight) | dict.fromkeys(ASSUMED, 1)
     given |= {"consistency": 3.0, "lapse": 0.02}
     for name, value in values.items():
         given[SIGHT + name if name in DOMAIN.directions else name] = value

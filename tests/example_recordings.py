@@ -37,3 +37,19 @@ def fields(lengths, names="abcdefgh", seed=0):
 
 
 RAGGED = [[3, 1], [], [2, 4, 1]]
+
+
+def put(path, index, value):
+    """A change of one entry (index) or of a whole field (index None) of the arguments."""
+
+    def change(arguments):
+        place = arguments
+        for key in path[:-1]:
+            place = place[key]
+        if index is None:
+            place[path[-1]] = value
+        else:
+            place[path[-1]] = place[path[-1]].double()
+            place[path[-1]][index] = value
+
+    return change

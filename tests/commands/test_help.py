@@ -16,8 +16,9 @@ from paths import ROOT
 from running import command
 from tyro.conf import Positional
 
+from mirror_ppl import __main__
 from mirror_ppl.__main__ import script
-from mirror_ppl.commands import COMMANDS
+from mirror_ppl.commands import COMMANDS, assist, calibrate, evaluate, fit, simulate, train
 from mirror_ppl.console import run
 from mirror_ppl.option_help import WORDS, texts_of
 
@@ -158,3 +159,25 @@ def test_examples_are_real(name):
         for word in args:
             file = word.partition(":")[0]
             assert not file.startswith("docs/") or (ROOT / file).is_file()
+
+
+@pytest.mark.parametrize("module", [assist, calibrate, evaluate, fit, train, simulate])
+def test_help_explains_every_option(module, capsys):
+    assert command(module, "--help") == 0
+    out = " ".join(capsys.readouterr().out.split())
+    for name in module.Options.__dataclass_fields__:
+        if (module, name) != (evaluate, "study"):  # which is no option
+            assert f"--{name.replace('_', '-')} " in out
+    assert module.DESCRIPTION.split(".")[0].split("\n")[0].split(",")[0] in out
+    assert f"python -m {module.__name__.replace('.commands', '')}" == module.PROGRAM
+
+
+def test_overview_lists_every_command_there_is(capsys):
+    assert __main__.main([]) == 0
+    out = capsys.readouterr().out
+    package = Path(fit.__file__).parent
+    commands = {path.stem for path in package.glob("*.py")} - {"__init__"}
+    assert set(__main__.COMMANDS) == commands
+    assert all((package.parent / f"{name}.py").is_file() for name in commands)
+    for name in __main__.COMMANDS:
+        assert f"python -m mirror_ppl.{name}" in out

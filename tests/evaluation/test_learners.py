@@ -1,15 +1,27 @@
 """Learners that are compared: what they get to see of whom, and what they make of it."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
+from example_groups import FOG, worst
 
-from mirror_ppl.baselines import as_one_person, held_out_nll
-from mirror_ppl.domains import get_domain
+from mirror_ppl.baselines import NetworkPerson, as_one_person, held_out_nll
+from mirror_ppl.baselines.training import mean_nll
+from mirror_ppl.domains import DOMAINS, get_domain
+from mirror_ppl.domains.bomb_defusal.panel import OLD_RULES, RULES
 from mirror_ppl.errors import InputError
+from mirror_ppl.evaluation import learners
 from mirror_ppl.evaluation.known_sight import known_sight
-from mirror_ppl.evaluation.learners import Group, learn
-from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.evaluation.learned import SAME_DRAWS
+from mirror_ppl.evaluation.learners import TEST, Group, learn
+from mirror_ppl.evaluation.study import Prediction, predict
+from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer
+from mirror_ppl.inference.results.fitting import fit_people
 from mirror_ppl.models.implants import in_units
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.world_knowledge import planning_domain
 from mirror_ppl.people import simulate
 
 GROUP = Group("driving", "fog", "diverse", 3, 100)
@@ -79,3 +91,101 @@ def test_of_whom_it_is_not_known_what_they_see_is_refused():
     with pytest.raises(InputError) as error:
         known_sight(Group("bomb_defusal", "unlabelled", "paper", 1, 0).self_model, one)
     assert str(error.value) == "recordings of bomb_defusal lack the truth of what people see"
+
+
+def test_mirror_predicts_what_a_fit_predicts():
+    """The same draws of the same posterior, by the command's function and by the study's."""
+    human = load_human_model(None, FOG.self_model)
+    fit = fit_people(human, FOG.recordings(), InferenceOptions(), seed=3, train_rounds=2)
+    rows = predict(Prediction(FOG, "mirror", 2))
+    assert [row["person"] for row in rows] == ["person-01", "person-02"]
+    found = learn("mirror", FOG, 2, 3)
+    test = FOG.recordings().select_rounds(TEST)
+    own = found.log_predictive(test).gather(-1, test.actions[..., None]).squeeze(-1)
+    for number, person in enumerate(fit.summary["people"]):
+        assert -own[number].mean().item() == pytest.approx(person["test"]["nll"], abs=1e-5)
+    assert {row["floor"] for row in rows} == {p["test"]["floor"] for p in fit.summary["people"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "domain"),
+    [
+        # On the highway it takes minutes; tests/domains/highway infers a driver.
+        *(("perceptual-only", domain) for domain in DOMAINS if domain != "highway"),
+        *(("policy-only", domain) for domain in DOMAINS),
+        *(("no-implants", domain) for domain in DOMAINS),
+        *(("logistic", domain) for domain in DOMAINS),
+        *(("bc", domain) for domain in DOMAINS),
+        # Others take long, and share their code with these.
+        ("mirror-amortized", "driving"),
+        ("mirror-svi", "driving"),
+        ("mirror-svi", "search_rescue"),
+        ("sqil", "driving"),
+    ],
+)
+def test_everybody_learns_everywhere(name, domain):
+    """One person, one round (eight, where there is much to learn): probabilities of all actions of
+    held-out rounds, and better ones than if all were alike."""
+    group = Group(domain, worst(domain), "paper", 1, 0)
+    test, actions = group.recordings().select_rounds(slice(30, 32)), get_domain(domain).actions
+    few = 8 if name == "bc" or (name, domain) == ("logistic", "highway") else 1
+    found = learn(name, group, few, 0).log_predictive(test)
+    assert found.shape == (*test.shape, len(actions))
+    torch.testing.assert_close(found.exp().sum(-1), torch.ones(test.shape), rtol=0, atol=1e-4)
+    assert mean_nll(found, test.actions).item() < math.log(len(actions))
+
+
+@pytest.mark.parametrize(
+    ("name", "guide"),
+    [("mirror", "importance"), ("mirror-amortized", "amortized")]
+    + [(f"mirror-{guide}", guide) for guide in ("svi", "nuts")],
+)
+def test_mirror_is_inferred_by_the_guide_of_its_name(name, guide, monkeypatch):
+    asked = []
+
+    def noted(human, rounds, options, *args, **others):
+        asked.append(options.engine)
+        return Inferred({})
+
+    monkeypatch.setattr("mirror_ppl.evaluation.learners.infer", noted)
+    learn(name, FOG, 1, 0)
+    assert asked == [guide]
+
+
+def test_a_population_is_learned_from_others(monkeypatch):
+    """Of the same setting and number, and the same for all seeds; then it is everybody's prior."""
+    asked = []
+
+    def spying(human, rounds, options, seed, network=None, population=None):
+        asked.append((rounds, options.pooling, population))
+        return Inferred({}, population="theirs")  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(learners, "infer", spying)
+    learners.population_of.cache_clear()
+    try:
+        for seed in (4, 5):
+            learn("mirror-population", replace(FOG, seed=seed), 3, 0)
+    finally:
+        learners.population_of.cache_clear()
+    (others, pooling, unknown), *own = asked
+    assert (pooling, unknown) == ("partial", None)
+    assert others.shape[:2] == (2, 20) and others.setting == "fog"
+    for (rounds, pooling, known), seed in zip(own, (4, 5), strict=True):
+        assert (pooling, known) == ("none", "theirs")
+        expected = replace(FOG, seed=seed).recordings().select_rounds(slice(3))
+        assert torch.equal(rounds.actions, expected.actions)
+        assert not torch.equal(others.actions[:, :3], rounds.actions)
+
+
+def test_baselines_know_what_rewards_identify_of_the_world():
+    """Recorded rewards say that the robot's rules are out of date; each planner gets to know it."""
+    group = Group("bomb_defusal", "unlabelled", "paper", 2, 0)
+    person = learn("bc", group, 20, 0).person(1, 3)  # pyright: ignore[reportAttributeAccessIssue]
+    assert isinstance(person.human, NetworkPerson)
+    assert person.human.networks.people == ("person-02",)
+    assert person.number == 3
+    more = learn("bc", group, 1, 0).person(1, 64)  # pyright: ignore[reportAttributeAccessIssue]
+    assert more.number == SAME_DRAWS < 64
+    world = planning_domain(person.human, person.draws)
+    assert world.rules == RULES  # pyright: ignore[reportAttributeAccessIssue]
+    assert world.rules != OLD_RULES  # pyright: ignore[reportAttributeAccessIssue]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mirror_ppl.evaluation.study_report import REPORTS
 from mirror_ppl.evaluation.study_summary import (
     Interval,
     Place,
@@ -190,3 +191,20 @@ def test_floors_count_each_person_once():
     ]
     assert floors(rows) == {FOG: pytest.approx(0.25)}
     assert floors([*rows, row("mirror", 1, "c", floor=None)]) == {}
+
+
+def test_tables_say_where_a_person_is_missing():
+    """A cell of bc failed: its mean is of one person, and the advantage over it, too."""
+    rows = [
+        Place("driving", "fog", "paper")._asdict()
+        | {"seed": seed, "person": "a", "model": model, "rounds": 1}
+        | {"nll": nll, "accuracy": 0.5, "floor": 0.1}
+        for seed, model, nll in ((0, "mirror", 0.2), (1, "mirror", 0.4), (1, "bc", 0.5))
+    ]
+    nll, accuracy = REPORTS["prediction"](rows).tables
+    assert "mean over 2 people" in nll.caption
+    assert dict(nll.rows) == {
+        "mirror": "0.300",
+        "bc": "0.500 (1 of 2 people)\n+0.100\n[+0.100, +0.100]\n100%",
+    }
+    assert dict(accuracy.rows)["bc"] == "0.500 (1 of 2 people)\n+0.000\n[+0.000, +0.000]\n50%"

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from example_bomb import WAIT, course
 from example_course import go_through
-from test_bomb_defusal_human import WAIT, course
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains.base import RepeatedObservation, of_each

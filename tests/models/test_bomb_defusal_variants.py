@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from example_bomb import WORLD, course, implants
 from example_course import beliefs_of, gone_through, perceived
-from test_bomb_defusal_human import WORLD, course, implants
 
 from mirror_ppl.domains.bomb_defusal.human import RULE, BombDefusalHuman
 from mirror_ppl.domains.bomb_defusal.panel import RULES

@@ -1,0 +1,153 @@
+"""`python -m mirror_ppl.fit`: what it writes and says, and that a killed fit goes on."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from example_fits import RADIUS, RESULTS, RESULTS_OF_RADIUS, content, short_fit, two_people
+from running import command
+
+from mirror_ppl.commands import fit
+from mirror_ppl.data import save_demonstrations
+
+
+@pytest.fixture(scope="module")
+def some():
+    return two_people()
+
+
+@pytest.fixture(scope="module")
+def folder(some, tmp_path_factory):
+    """A folder with recordings, and the results of a short fit of them in out/."""
+    folder = tmp_path_factory.mktemp("cli")
+    save_demonstrations(folder / "some.nc", some)
+    assert command(fit, *short_fit(folder, "out")) == 0
+    return folder
+
+
+def summary_of(folder):
+    """The summary of results but for their times."""
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary.pop("seconds") > 0
+    spent = summary.pop("processor_seconds")
+    assert {"predict", "identify", "draw", "write"} <= set(spent)
+    assert all(each >= 0 for each in spent.values())
+    return summary
+
+
+def test_fit_writes_posterior_summary_and_picture(folder, some):
+    assert set(content(folder / "out")) == RESULTS
+    summary = summary_of(folder / "out")
+    assert {key: summary[key] for key in ("domain", "setting", "seed")} == {
+        "domain": "driving",
+        "setting": "fog",
+        "seed": 0,
+    }
+    assert summary["version"]
+    assert [person["id"] for person in summary["people"]] == list(some.people)
+    for index, person in enumerate(summary["people"]):
+        assert person["rounds"] == 3
+        for name, truth in some.truth.items():
+            implant = person["implants"][name]
+            assert implant["q05"] <= implant["median"] <= implant["q95"]
+            assert implant["truth"] == truth[index].item()
+        assert person["implants"]["lapse"]["truth"] is None
+        entropy = some.action_entropy[index, 3].mean().item()
+        assert person["test"]["floor"] == pytest.approx(entropy, rel=1e-5)
+        assert 0 < person["test"]["nll"] < 3
+        assert 0 <= person["test"]["accuracy"] <= 1
+    assert (folder / "out" / "sight.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+
+
+def test_posterior_opens_without_this_package_and_agrees_with_the_summary(folder):
+    path = folder / "out" / "posterior.nc"
+    summary = summary_of(folder / "out")
+    groups = xr.open_groups(path, engine="h5netcdf")
+    names = {name.strip("/") for name in groups} - {""}
+    assert {"posterior", "prior", "posterior_predictive", "log_likelihood"} <= names
+    assert {"observed_data", "constant_data", "predictions"} <= names
+    posterior = groups["/posterior"]
+    assert posterior.attrs["domain"] == "driving"
+    for index, person in enumerate(summary["people"]):
+        for name, implant in person["implants"].items():
+            draws = posterior[name].isel(person=index).values.ravel()
+            assert len(draws) == 10
+            # Of 10 draws, 0.5 * 10 or more are at most the fifth, and so on.
+            low, middle, high = np.sort(draws)[[0, 4, 9]]
+            expected = {"q05": low, "median": middle, "q95": high}
+            found = {key: implant[key] for key in expected}
+            assert found == pytest.approx(expected, rel=1e-5)
+    for group in groups.values():
+        group.close()
+
+
+def test_one_seed_gives_one_summary(folder):
+    assert command(fit, *short_fit(folder, "one", *RADIUS)) == 0
+    torch.manual_seed(99)
+    assert command(fit, *short_fit(folder, "again", *RADIUS)) == 0
+    assert summary_of(folder / "again") == summary_of(folder / "one")
+    assert command(fit, *short_fit(folder, "other", *RADIUS), "--seed", 1) == 0
+    other = summary_of(folder / "other")
+    assert other.pop("seed") == 1
+    assert other["people"] != summary_of(folder / "one")["people"]
+
+
+def test_fit_says_what_it_found_and_where_it_lies(folder, capsys):
+    assert command(fit, *short_fit(folder, "said"), "--train-rounds", 4) == 0
+    captured = capsys.readouterr()
+    for name in ("person-01", "person-04", "front own", "assumes clear", "consistency", *RESULTS):
+        assert name in captured.out
+    assert "Held-out actions" not in captured.out  # there are none
+    assert "fit: 4/4 negative ELBO" in captured.err  # plain lines: it is no terminal
+    assert "\x1b" not in captured.err
+    people = summary_of(folder / "said")["people"]
+    assert [(person["rounds"], person["test"]) for person in people] == [(4, None)] * 2
+
+
+def test_shipped_recordings_are_those_that_are_asked_for():
+    for setting in ("clear", "fog"):
+        for population in ("paper", "diverse"):
+            options = fit.Options(setting=setting, population=population)
+            recordings = fit._recordings(options)
+            assert recordings.setting == setting
+            assert recordings.provenance["population"] == population
+            assert recordings.shape == (10, 40, 15)
+
+
+def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, monkeypatch):
+    args = [str(arg) for arg in short_fit(folder, "killed", *RADIUS, steps=80)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mirror_ppl.fit", *args], stderr=subprocess.PIPE
+    )
+    checkpoint, deadline = folder / "killed" / "fit.checkpoint", time.monotonic() + 120
+    try:
+        while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert process.poll() is None, process.stderr.read().decode()
+        assert checkpoint.exists()
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert not RESULTS & set(content(folder / "killed"))
+
+    done = []
+    report = fit.Stages.report
+
+    def spy(self, name, step, total, message):
+        done.extend([step] * (name == "fit"))
+        report(self, name, step, total, message)
+
+    monkeypatch.setattr(fit.Stages, "report", spy)
+    assert command(fit, *args) == 0
+    assert done[0] in (26, 51, 76)  # from a checkpoint, of which there is one in 25 steps
+    assert set(content(folder / "killed")) >= RESULTS_OF_RADIUS
+    assert not checkpoint.exists()
+    assert command(fit, *short_fit(folder, "whole", *RADIUS, steps=80)) == 0
+    assert summary_of(folder / "killed") == summary_of(folder / "whole")

@@ -1,0 +1,103 @@
+"""Figures of studies: curves by rounds, their levels, and bars of what is told."""
+
+import pytest
+
+from mirror_ppl.evaluation.assistance import REFERENCES
+from mirror_ppl.evaluation.learners import LEARNERS
+from mirror_ppl.evaluation.study_report import REPORTS
+from mirror_ppl.evaluation.study_summary import (
+    Interval,
+    ModelResult,
+    Place,
+    Share,
+    means_table,
+    shares_table,
+)
+from mirror_ppl.plots.study import STYLES, plot_curves, plot_relevance
+
+
+def test_every_model_has_a_look_of_its_own():
+    models = {*LEARNERS, "mirror-kl", *REFERENCES}
+    assert models == set(STYLES)
+    assert len({STYLES[name] for name in LEARNERS}) == len(LEARNERS)
+
+
+def result(model, rounds, mean, place=Place("driving", "fog", "paper")):  # noqa: B008
+    return ModelResult(place, model, rounds, Interval(mean, mean - 0.1, mean + 0.1), 3, None)
+
+
+def test_relevance_has_a_panel_for_each_place(monkeypatch):
+    """Two settings of one domain: two tables, and two panels."""
+    rows = [
+        {"domain": "driving", "setting": setting, "population": "paper", "seed": 0}
+        | {"person": "a", "model": "bc", "rounds": 20, "items_visual": 2, "items_verbal": 0}
+        | {f"{n}_{m}": 1 for n in ("collision_course", "closing") for m in ("visual", "verbal")}
+        for setting in ("clear", "fog")
+    ]
+    picture = REPORTS["relevance"](rows).picture
+    assert [ax.get_title() for ax in picture.axes] == ["driving clear paper", "driving fog paper"]
+    assert [len(ax.patches) for ax in picture.axes] == [2, 2]
+
+
+def test_curves_by_ratio_are_numbered_as_they_are_read():
+    results = [result("mirror", 1, 0.2), result("mirror", 20, 0.18), result("bc", 1, 1.1)]
+    picture = plot_curves(means_table(results), "NLL", by_ratio=True)
+    (ax,) = picture.axes
+    assert ax.get_yscale() == "log"
+    low, high = ax.get_ylim()
+    shown = [tick for tick in ax.get_yticks() if low <= tick <= high]
+    assert [round(tick, 2) for tick in shown if tick > 0.19] == [0.2, 0.3, 0.4, 0.6, 0.8, 1.0]
+    picture.canvas.draw()
+    assert {"0.2", "0.3", "1"} <= {label.get_text() for label in ax.get_yticklabels()}
+
+
+def test_curves_have_a_panel_for_each_place_and_level_lines():
+    clear = Place("driving", "clear", "paper")
+    results = [result("mirror", 20, 0.1), result("mirror", 1, 0.3), result("none", 0, 0.5)]
+    picture = plot_curves(
+        means_table([*results, result("bc", 1, 0.4, clear)]), "NLL", {clear: 0.05}
+    )
+    fog, other = picture.axes
+    curve, level = fog.lines
+    assert list(curve.get_xdata()) == [1, 20] and list(curve.get_ydata()) == [0.3, 0.1]
+    assert set(level.get_ydata()) == {0.5}
+    assert [fog.get_title(), other.get_title()] == ["driving fog paper", "driving clear paper"]
+    assert {line.get_label() for line in other.lines} == {"bc", "people's own entropy"}
+    (legend,) = picture.legends
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "mirror",
+        "bc",
+        "none",
+        "people's own entropy",
+    ]
+
+
+def test_models_of_ones_own_are_called_by_file_and_class_unless_two_are_called_so():
+    names = ["mirror", "a/mine.py:Mine", "b/mine.py:Mine", "b/other.py:Mine"]
+    (ax,) = plot_curves(means_table([result(name, 1, 0.1) for name in names]), "NLL").axes
+    labels = ["mirror", "a/mine.py:Mine", "b/mine.py:Mine", "other.py:Mine"]
+    assert [line.get_label() for line in ax.lines] == labels
+    assert len({line.get_linestyle() for line in ax.lines[1:]}) == len(names) - 1
+
+
+def test_levels_that_would_flatten_the_curves_are_given_in_words():
+    """Curves from .1 to .5 with their intervals: a level at 1.9 is drawn, one at -90 is not."""
+    results = [result("mirror", 20, 0.2), result("bc", 1, 0.4)]
+    results += [result("none", 0, 1.9), result("all", 0, -90.0)]
+    (ax,) = plot_curves(means_table(results), "net return").axes
+    assert {line.get_label() for line in ax.lines} == {"mirror", "bc", "none"}
+    assert [text.get_text() for text in ax.texts] == ["all: -90.0, off the scale"]
+    assert ax.get_ylim()[0] > -1
+
+
+def test_bars_are_of_the_most_rounds_and_silence_is_named():
+    place = Place("driving", "fog", "paper")
+    shares = [
+        Share(place, "mirror", 1, "all", 5, Interval(0.9, 0.8, 1.0)),
+        Share(place, "mirror", 20, "all", 5, Interval(0.6, 0.5, 0.7)),
+        Share(place, "none", 0, "all", 0, None),
+    ]
+    (ax,) = plot_relevance(shares_table(shares)).axes
+    (bar,) = ax.patches
+    assert bar.get_height() == pytest.approx(60)  # pyright: ignore[reportAttributeAccessIssue]
+    assert [text.get_text() for text in ax.texts] == ["none: no messages"]
