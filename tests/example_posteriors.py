@@ -4,7 +4,8 @@ import numpy as np
 import xarray as xr
 
 from mirror_ppl.arviz import az
-from mirror_ppl.evaluation.comparison import compare_fits, read_fit
+from mirror_ppl.evaluation.compared_files import read_fit
+from mirror_ppl.evaluation.comparison import compare_fits
 from mirror_ppl.inference.results.export import save_inference_data
 
 # Of four people: three rounds, two of them shorter; one round; none; three.
@@ -28,6 +29,7 @@ def write(
     held_out=ACTIONS,
     ego=0.0,
     chains=1,
+    evidence=None,
     **changes,
 ):
     """A file as a fit writes it.
@@ -37,6 +39,7 @@ def write(
         right: probabilities ``[S, P, B, T]`` of what was done in held-out rounds.
         actions, held_out: what was done ``[P, B, T]``.
         ego: what there was to see.
+        evidence: log marginal likelihoods ``[P]`` and their errors; empty as in earlier versions.
         changes: other attributes than usual; ``None`` for none.
     """
     attributes = {"domain": "driving", "setting": "fog", "human_model": "HumanModel", **SOURCE}
@@ -70,6 +73,12 @@ def write(
         each = np.moveaxis(each, 0, -1)[None]
         groups["predictions"] = group(attributes, action_probability=(dims, each))
         groups["predictions_constant_data"] = group(attributes, observed_action=(out, held_out))
+    if evidence is not None:
+        checked = zip(
+            ("nll", "log_evidence", "evidence_error"), (np.zeros(4), *evidence), strict=False
+        )
+        variables = {name: ("person", value) for name, value in checked}
+        groups["model_check"] = group(attributes, **variables)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_inference_data(az.InferenceData(**groups), path)
     return path

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.compare`: which human model predicts the same people best."""
+"""`python -m mirror_ppl.compare`: which human model describes the same people best."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from mirror_ppl.errors import OptionError
 from mirror_ppl.limits import check_picture
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from mirror_ppl.evaluation.comparison import Comparison
+    from mirror_ppl.evaluation.evidence import EvidenceComparison
 
 WIDTH = 80
 PROGRAM = "python -m mirror_ppl.compare"
-DESCRIPTION = """Compare human models that were fitted to the same recordings by how well they
-predict rounds that they did not learn from, and print how far each is behind the best, with the
-standard error of the difference."""
+DESCRIPTION = """Compare human models that were fitted to the same recordings, by how well they
+predict rounds that they did not learn from or by their marginal likelihoods, and print how far each
+is behind the best, with the standard error of the difference."""
 EXAMPLES = {
     "two fits of the same recordings": "runs/demo runs/mine",
-    "by rounds that were held out, with a picture": (
-        "runs/demo runs/mine --by heldout --figure runs/compare.png"
+    "by marginal likelihoods, with a picture": (
+        "runs/demo runs/mine --by evidence --figure runs/compare.png"
     ),
 }
 """Arguments, by what they are for."""
@@ -38,8 +41,9 @@ class Options:
     posteriors: Positional[tuple[Path, ...]] = ()
     """Two or more posteriors of python -m mirror_ppl.fit: files, or the folders that hold them."""
     by: str = "loo"
-    """What is predicted: loo (each round learned from, as if it had been left out) or heldout (the
-    rounds that were held out)."""
+    """The measure: loo (predictions of each round learned from, as if it had been left out),
+    heldout (of the rounds that were held out) or evidence (marginal likelihoods of all rounds
+    learned from: log Bayes factors, and the share of people whom each model describes)."""
     labels: tuple[str, ...] = ()
     """What to call the models, in the same order; by their name and folder unless given."""
     json: Path | None = None
@@ -51,8 +55,8 @@ class Options:
         number = len(self.posteriors)
         if number < 2:  # noqa: PLR2004 - a comparison takes two
             raise OptionError(f"give at least two posteriors to compare, not {number}")
-        if self.by not in ("loo", "heldout"):
-            raise OptionError(f'--by must be loo or heldout, not "{self.by}"')
+        if self.by not in ("loo", "heldout", "evidence"):
+            raise OptionError(f'--by must be loo, heldout or evidence, not "{self.by}"')
         if self.labels:
             if len(self.labels) != number:
                 raise OptionError(
@@ -69,14 +73,20 @@ def main(options: Options) -> None:
     Raises:
         MirrorError: what was asked for cannot be done; nothing is written then.
     """
-    from mirror_ppl.evaluation.comparison import compare_fits, label_models, read_fit
+    from mirror_ppl.evaluation.compared_files import label_models, read_evidence, read_fit
+    from mirror_ppl.evaluation.comparison import compare_fits
+    from mirror_ppl.evaluation.evidence import compare_evidence
     from mirror_ppl.files import json_text, lock_of, output_folder, write_together
     from mirror_ppl.plots.comparison import plot_comparison
 
     _check_outputs(options)
     _require_different(options.posteriors)
-    files = [read_fit(path, options.by) for path in options.posteriors]
-    comparison = compare_fits(files, options.labels or label_models(files), options.by)
+    if options.by == "evidence":
+        held = [read_evidence(path) for path in options.posteriors]
+        comparison = compare_evidence(held, options.labels or label_models(held))
+    else:
+        files = [read_fit(path, options.by) for path in options.posteriors]
+        comparison = compare_fits(files, options.labels or label_models(files), options.by)
     contents = {}
     if options.json is not None:
         contents[options.json] = json_text({"command": PROGRAM} | comparison.as_data())
@@ -87,7 +97,7 @@ def main(options: Options) -> None:
         for path in contents:
             stack.enter_context(output_folder(path.parent, [path.name], lock_of(path)))
         write_together(contents)
-    _show(comparison)
+    console_for_tables(WIDTH).print(_table(comparison))
     what = ((options.json, "the numbers, also of each person"), (options.figure, "the differences"))
     for path, content in what:
         if path is not None:
@@ -96,7 +106,7 @@ def main(options: Options) -> None:
 
 def _require_different(posteriors: tuple[Path, ...]) -> None:
     """Refuse a posterior that is given twice, whose difference to itself says nothing."""
-    from mirror_ppl.evaluation.comparison import posterior_path
+    from mirror_ppl.evaluation.compared_files import posterior_path
 
     seen = set()
     for path in posteriors:
@@ -107,25 +117,81 @@ def _require_different(posteriors: tuple[Path, ...]) -> None:
 
 
 def _check_outputs(options: Options) -> None:
-    from mirror_ppl.evaluation.comparison import posterior_path
+    from mirror_ppl.evaluation.compared_files import posterior_path
     from mirror_ppl.files import require_files_of_their_own
 
     inputs = {"a posterior": [posterior_path(path) for path in options.posteriors]}
     require_files_of_their_own({"--json": options.json, "--figure": options.figure}, inputs)
 
 
-def _show(comparison: Comparison) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
+def _table(comparison: Comparison | EvidenceComparison) -> Table:
+    from mirror_ppl.evaluation.comparison import Comparison
+
+    if isinstance(comparison, Comparison):
+        return _predictions(comparison)
+    return _evidences(comparison)
+
+
+def _predictions(comparison: Comparison) -> Table:
     from rich.text import Text
 
     left_out = comparison.by == "loo"
-    rounds, attributes = comparison.models[0].total.rounds, comparison.attributes
+    rounds = comparison.models[0].total.rounds
     measured = f"leave-one-out, {rounds} rounds" if left_out else f"{rounds} held-out rounds"
     caption = "nats an action, higher is better; difference: to the best, ± standard error, paired"
     caption += " over rounds; weight: of each in the mixture that predicts best"
     if left_out:
         caption += "; doubtful: rounds whose estimate rests on few draws (Pareto k too high)"
+    columns = "log density", "difference", *(["doubtful"] if left_out else []), "weight"
+    table = _empty(comparison, measured, caption, columns)
+    for rank, model in enumerate(comparison.models, 1):
+        score = model.total
+        error = "" if score.difference_se is None else f" ±{score.difference_se:.4f}"
+        table.add_row(
+            f"{rank}",
+            Text(model.label),
+            f"{score.log_density:z.4f}",
+            # The best has no difference to itself, nor any error of it.
+            "-" if rank == 1 else f"{score.difference:z.4f}{error}",
+            *([] if score.doubtful is None else [f"{score.doubtful} of {score.rounds}"]),
+            f"{model.weight:.2f}",
+        )
+    return table
+
+
+def _evidences(comparison: EvidenceComparison) -> Table:
+    from rich.text import Text
+
+    caption = "log evidence: log marginal likelihood of what all people did, nats; difference: to "
+    caption += "the best (log Bayes factor if all people follow one model), ± standard error of "
+    caption += "the estimate; share: of people who follow the model if each follows one, with a "
+    caption += "90% interval"
+    columns = "log evidence", "difference", "share of people"
+    table = _empty(comparison, f"evidence, {comparison.rounds} rounds", caption, columns)
+    for rank, model in enumerate(comparison.models, 1):
+        low, high = model.share_interval
+        table.add_row(
+            f"{rank}",
+            Text(model.label),
+            f"{model.log_evidence:z.1f}",
+            "-" if rank == 1 else f"{model.difference:z.1f} ±{model.difference_error:.1f}",
+            f"{model.share:.2f} [{low:.2f}, {high:.2f}]",
+        )
+    return table
+
+
+def _empty(
+    comparison: Comparison | EvidenceComparison,
+    measured: str,
+    caption: str,
+    columns: tuple[str, ...],
+) -> Table:
+    """A table without rows."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    attributes = comparison.attributes
     table = Table(
         # As text: names in square brackets are no markup.
         title=Text(
@@ -140,18 +206,6 @@ def _show(comparison: Comparison) -> None:
     )
     table.add_column("", justify="right", no_wrap=True)
     table.add_column("model", overflow="fold")
-    for name in ("log density", "difference", *(["doubtful"] if left_out else []), "weight"):
+    for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
-    for rank, model in enumerate(comparison.models, 1):
-        score = model.total
-        error = "" if score.difference_se is None else f" ±{score.difference_se:.4f}"
-        table.add_row(
-            f"{rank}",
-            Text(model.label),
-            f"{score.log_density:z.4f}",
-            # The best has no difference to itself, nor any error of it.
-            "-" if rank == 1 else f"{score.difference:z.4f}{error}",
-            *([] if score.doubtful is None else [f"{score.doubtful} of {score.rounds}"]),
-            f"{model.weight:.2f}",
-        )
-    console_for_tables(WIDTH).print(table)
+    return table

@@ -158,6 +158,6 @@ def _command(options: Options) -> str:
     parts = [
         f"--{name.replace('_', '-')} {value}"
         for name, value in values.items()
-        if name not in unsaid
+        if name not in unsaid and value is not None
     ]
     return " ".join([PROGRAM, *parts])

@@ -20,9 +20,7 @@ padding.
 
 from __future__ import annotations
 
-import os
 import warnings
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,49 +31,8 @@ import pandas as pd
 import xarray as xr
 
 from mirror_ppl.arviz import az
-from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.results.posterior_file import read_results
-from mirror_ppl.models.loading import model_name
-
-FILE = "posterior.nc"
-"""File name of a fit's posterior."""
-GROUPS = {
-    "loo": ("log_likelihood", "observed_data", "constant_data"),
-    "heldout": ("predictions", "observed_data", "constant_data", "predictions_constant_data"),
-}
-"""Groups of a posterior file that each measure reads; the measure needs the first."""
-LACKS = {
-    "loo": "has no log-likelihoods of the rounds that were learned from (group log_likelihood)",
-    "heldout": "has no held-out rounds; leave some out of the fit (--train-rounds)",
-}
-"""The measures, and the message for a file without the data that they need."""
-SOURCE = "recorded_"
-"""Prefix of attributes that hold the provenance of recordings."""
-LEAST_DRAWS = 2
-"""Fewest draws for importance weights."""
-
-
-@dataclass(frozen=True)
-class FitFile:
-    """Content of a posterior file that is compared.
-
-    Attributes:
-        path: the file.
-        attributes: of the posterior.
-        people: ids of the P people.
-        recorded: arrays of the recordings, not of the model, by group and variable.
-        actions: of the rounds that are compared ``[P, B, T]``; -1 in padding.
-        draws: for leave-one-out log-likelihoods of whole rounds ``[S, P, B]``; for held-out rounds
-            probabilities of the actions taken ``[S, P, B, T]``.
-    """
-
-    path: Path
-    attributes: Mapping[str, str]
-    people: tuple[str, ...]
-    recorded: Mapping[str, np.ndarray]
-    actions: np.ndarray
-    draws: np.ndarray
+from mirror_ppl.evaluation.compared_files import FitFile, check_same, compared_model, source_of
 
 
 @dataclass(frozen=True)
@@ -129,7 +86,7 @@ class Comparison:
     """A comparison of models, from the best to the worst.
 
     Attributes:
-        by: the measure, a key of `LACKS`.
+        by: the measure, ``loo`` or ``heldout``.
         attributes: the domain, the setting and the provenance of the recordings.
         people: ids of the P people.
         models: M of them.
@@ -183,115 +140,18 @@ class _Rounds:
     good_k: float | None = None
 
 
-def posterior_path(path: Path) -> Path:
-    """Path of the posterior file, given the file or a fit's folder."""
-    return path / FILE if os.path.isdir(path) else path
-
-
-def read_fit(path: Path, by: str = "loo") -> FitFile:
-    """Read the compared content of a posterior file.
-
-    Args:
-        path: a file that ``python -m mirror_ppl.fit`` wrote, or the folder that holds it.
-        by: the measure, a key of `LACKS`.
-
-    Raises:
-        PosteriorError: the file is missing or damaged, or lacks the data of the measure.
-    """
-    path = posterior_path(path)
-    data = read_results(path, "posterior", *GROUPS[by])
-    try:
-        attributes = {str(key): str(value) for key, value in data["posterior"].attrs.items()}
-        file = _content(path, attributes, data, by) if GROUPS[by][0] in data else None
-    except Exception as error:
-        raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
-    if file is None or not (file.actions >= 0).any():
-        raise PosteriorError(f"{path}: {LACKS[by]}")
-    power = float(attributes.get("likelihood_power", 1))
-    if by == "loo" and power != 1:
-        raise PosteriorError(
-            f"{path}: each decision counts {power:g} times in it, so that no round can be left out "
-            "of it by weighting; compare held-out rounds with --by heldout"
-        )
-    if len(file.draws) < (least := LEAST_DRAWS if by == "loo" else 1):
-        raise PosteriorError(f"{path}: holds {len(file.draws)} draws, expected {least} or more")
-    return file
-
-
-def _content(
-    path: Path, attributes: Mapping[str, str], data: Mapping[str, xr.Dataset], by: str
-) -> FitFile:
-    learned = data["observed_data"]["action"].transpose("person", "round", "step")
-    recorded = {"observed_data action": learned.values} | _constants(data, "constant_data")
-    if by == "loo":
-        actions = learned.values
-        values = data["log_likelihood"]["action"].transpose("chain", "draw", "person", "round")
-        draws, rounds = _joined(values), actions.shape[:2]
-    else:
-        constants, order = data["predictions_constant_data"], ("person", "test_round", "step")
-        actions = constants["observed_action"].transpose(*order).values
-        recorded |= _constants(data, "predictions_constant_data")
-        values = data["predictions"]["action_probability"]
-        probability = _joined(values.transpose("chain", "draw", *order, "action_name"))
-        chosen = np.maximum(actions, 0)[None, ..., None].astype(int)
-        draws, rounds = np.take_along_axis(probability, chosen, -1)[..., 0], actions.shape
-    if draws.shape[1:] != rounds:
-        raise ValueError(f"rounds have shape {draws.shape[1:]}, expected {rounds}")
-    people = tuple(map(str, data["observed_data"]["person"].values))
-    return FitFile(path, attributes, people, recorded, actions, draws)
-
-
-def _joined(values: xr.DataArray) -> np.ndarray:
-    """Draws of all chains, one after the other, in double precision."""
-    return values.values.reshape(-1, *values.shape[2:]).astype(float)
-
-
-def _constants(data: Mapping[str, xr.Dataset], group: str) -> dict[str, np.ndarray]:
-    """Recorded observations, messages and actions, without the truth of simulated people."""
-    if group not in data:
-        return {}
-    return {
-        f"{group} {name}": value.values
-        for name, value in data[group].data_vars.items()
-        if not str(name).startswith(TRUTH) and name != "action_entropy"
-    }
-
-
-def label_models(files: Sequence[FitFile]) -> tuple[str, ...]:
-    """Label models by their names in commands and as much of their paths as distinguishes them."""
-    models = [_model(file) for file in files]
-    paths = [file.path.resolve() for file in files]
-    # A fit's folder is used in place of the file in it, whose name is always the same.
-    shown = [(path.parent if path.name == FILE else path).parts[1:] for path in paths]
-    alike, labels = Counter(models), models
-    for depth in range(1, 1 + max(map(len, shown))):
-        if len(set(labels)) == len(set(paths)):
-            break
-        labels = [
-            f"{model} {'/'.join(parts[-depth:])}" if alike[model] > 1 else model
-            for model, parts in zip(models, shown, strict=True)
-        ]
-    # Only the same file, given more than once, still has no label of its own.
-    again = Counter(labels)
-    return tuple(
-        f"{label} ({1 + labels[:place].count(label)})" if again[label] > 1 else label
-        for place, label in enumerate(labels)
-    )
-
-
 def compare_fits(files: Sequence[FitFile], labels: Sequence[str], by: str = "loo") -> Comparison:
     """Rank models by how well they predict rounds that they did not learn from.
 
     Args:
         files: one of each model, read for the same measure.
         labels: distinct names of the models.
-        by: the measure, a key of `LACKS`.
+        by: the measure, ``loo`` or ``heldout``.
 
     Raises:
         PosteriorError: files are of different recordings, or give recorded actions probability 0.
     """
-    for file in files[1:]:
-        _check_same(files[0], file)
+    check_same(files)
     first = files[0]
     steps = (first.actions >= 0).sum(-1)
     real = steps > 0
@@ -309,56 +169,14 @@ def compare_fits(files: Sequence[FitFile], labels: Sequence[str], by: str = "loo
         return RankedModel(
             label,
             file.path,
-            _model(file),
+            compared_model(file),
             weight,
             rounds.good_k,
             _score(rounds, best, actions, np.full(len(person), True)),
             tuple(_score(rounds, best, actions, own) if own.any() else None for own in people),
         )
 
-    return Comparison(by, _source(first), first.people, tuple(map(standing, order, weights)))
-
-
-def _model(file: FitFile) -> str:
-    return model_name(file.attributes.get("human_model", "unknown"))
-
-
-def _source(file: FitFile) -> dict[str, str]:
-    return {
-        name: value
-        for name, value in file.attributes.items()
-        if name in ("domain", "setting") or name.startswith(SOURCE)
-    }
-
-
-def _check_same(first: FitFile, other: FitFile) -> None:
-    expected, given = _source(first), _source(other)
-    # The shortest difference is reported, rather than that of the command that recorded.
-    # Where domains differ, everything else does, too.
-    names = sorted(
-        {*expected, *given},
-        key=lambda name: (name != "domain", len(expected.get(name, "")), name),
-    )
-    different = f"{other.path}: is of other recordings than {first.path}:"
-    for name in names:
-        if given.get(name) != expected.get(name):
-            raise PosteriorError(
-                f"{different} {name} is {given.get(name)}, expected {expected.get(name)}"
-            )
-    if other.people != first.people:
-        raise PosteriorError(
-            f"{different} people are {', '.join(other.people)}, expected {', '.join(first.people)}"
-        )
-    for name, value in first.recorded.items():
-        # A variable that one of the files lacks cannot contradict the other.
-        own = other.recorded.get(name, value)
-        if own.shape != value.shape:
-            raise PosteriorError(
-                f"{different} {name} has shape {own.shape}, expected {value.shape}; fit them with "
-                "the same --train-rounds"
-            )
-        if not np.array_equal(own, value, equal_nan=value.dtype.kind == "f"):
-            raise PosteriorError(f"{different} {name} differs")
+    return Comparison(by, source_of(first), first.people, tuple(map(standing, order, weights)))
 
 
 def _check_possible(file: FitFile, values: np.ndarray, real: np.ndarray) -> None:

@@ -32,6 +32,7 @@ class Inferred:
         log_evidence: log marginal likelihood ``[P]`` of each person's recorded actions under the
             model's own prior, nats, if the engine estimates it; NaN with factors or observed sites,
             where it is not defined, and with sampled attention, which adds noise to it.
+        evidence_error: approximate standard error of it ``[P]``, nats.
         losses: negative ELBO at each step in nats, if one was optimized.
         population: posterior of the population, if people were pooled.
         effective: effective number ``[P]`` of each person's draws after pooling, if pooled.
@@ -42,6 +43,7 @@ class Inferred:
     draws: Mapping[str, Tensor]
     pareto_k: Tensor | None = None
     log_evidence: Tensor | None = None
+    evidence_error: Tensor | None = None
     losses: tuple[float, ...] = field(default=())
     population: Population | None = None
     effective: Tensor | None = None

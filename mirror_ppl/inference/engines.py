@@ -55,6 +55,10 @@ ENGINES: Mapping[str, Engine] = {
 """The registry; a new engine is a file of its own and its name here."""
 
 
+WEIGHED = ("pareto_k", "log_evidence", "evidence_error")
+"""Fields of :class:`Inferred` that importance weights give."""
+
+
 def engine_name(name: str, frames: int = 1) -> str:
     """Current name of an engine, which may be given by its former name.
 
@@ -213,6 +217,7 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         own,
         draws=pooled.draws,
         log_evidence=None,
+        evidence_error=None,
         population=population,
         effective=pooled.effective,
     )
@@ -252,10 +257,14 @@ def _in_parts(engine: Engine, job: Job) -> Inferred:
     seconds: dict[str, float] = {}
     for part in parts:
         add_seconds(seconds, part["seconds"])
+    pareto_k, log_evidence, evidence_error = (
+        torch.cat([part[name] for part in parts]) for name in WEIGHED
+    )
     return Inferred(
         draws,
-        torch.cat([part["pareto_k"] for part in parts]),
-        torch.cat([part["log_evidence"] for part in parts]),
+        pareto_k,
+        log_evidence,
+        evidence_error,
         engines=tuple(name for part in parts for name in part["engines"]),
         seconds=seconds,
     )
@@ -266,14 +275,13 @@ def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
         found = engine.run(part)
     return {
         "draws": narrowed(found.draws),
-        "pareto_k": found.pareto_k,
-        "log_evidence": found.log_evidence,
+        **{name: getattr(found, name) for name in WEIGHED},
         "engines": list(found.engines) or [engine.name] * part.rounds.num_people,
         "seconds": seconds,
     }
 
 
-FORMAT = 2
+FORMAT = 3
 """Version of stored runs; raised whenever they change, so that older runs are not resumed."""
 
 

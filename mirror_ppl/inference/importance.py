@@ -56,14 +56,16 @@ def infer_by_importance(
             draws = own.sample(job.draws, builder.grid)
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)
-            found.append((own.pareto_k, own.log_evidence if estimated else nan, engine))
+            evidence = (own.log_evidence, own.evidence_error) if estimated else (nan, nan)
+            found.append((own.pareto_k, *evidence, engine))
             drawn.append(draws)
         order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
     # Site by site, so that the many draws of pooled people are not in memory twice.
     joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
-    pareto_k, log_evidence, engines = zip(*found, strict=True)
-    return Inferred(joined, torch.tensor(pareto_k), torch.tensor(log_evidence), engines=engines)
+    pareto_k, evidence, error, engines = zip(*found, strict=True)
+    weighed = (torch.tensor(pareto_k), torch.tensor(evidence), torch.tensor(error))
+    return Inferred(joined, *weighed, engines=engines)
 
 
 def has_evidence(human: HumanModel) -> bool:

@@ -63,7 +63,8 @@ def infer_kinds(
         found.append(infer(replace(job, human=model, report=report)))
     with torch.random.fork_rng(devices=[]):
         probabilities = sample_sites(job.human, 1)[KIND]["fn"].probs.flatten()
-    evidences = torch.stack([_evidence(one) for one in found], -1)  # [P, K]
+    evidences = torch.stack([_given(one.log_evidence) for one in found], -1)  # [P, K]
+    errors = torch.stack([_given(one.evidence_error) for one in found], -1)
     log_joint = evidences + probabilities.log().to(evidences)
     shares = log_joint.softmax(-1)
     drawn = []
@@ -77,11 +78,12 @@ def infer_kinds(
                 own[site][rows] = value[rows, person : person + 1].to(own[site])
         drawn.append(own)
     joined = {name: torch.cat([own[name] for own in drawn], 1) for name in drawn[0]}
-    weights = torch.stack([_pareto(one) for one in found], -1)
+    weights = torch.stack([_given(one.pareto_k) for one in found], -1)
     return Inferred(
         joined,
         weights.masked_fill(shares < LITTLE, -torch.inf).amax(-1),
         log_joint.logsumexp(-1),
+        (shares * errors).square().sum(-1).sqrt(),
         engines=found[0].engines,
     )
 
@@ -92,14 +94,9 @@ def _report(
     report(what, place * of + done, models * of, unit)
 
 
-def _evidence(found: Inferred) -> Tensor:
-    assert found.log_evidence is not None
-    return found.log_evidence.double()
-
-
-def _pareto(found: Inferred) -> Tensor:
-    assert found.pareto_k is not None
-    return found.pareto_k
+def _given(numbers: Tensor | None) -> Tensor:
+    assert numbers is not None
+    return numbers.double()
 
 
 def _kinds(shares: Tensor, number: int, seed: int) -> Tensor:

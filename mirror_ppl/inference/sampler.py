@@ -61,8 +61,7 @@ class Weighted:
             draw, ``[S, G]``, up to a common constant.
         log_weights: normalized and Pareto-smoothed, ``[S]``.
         pareto_k: Pareto k of the weights.
-        log_evidence: estimated log marginal likelihood of the recorded actions, nats; its standard
-            error is about ``(1 / effective - 1 / S) ** 0.5``.
+        log_evidence: estimated log marginal likelihood of the recorded actions, nats.
         proposed_residual: True if the residual was proposed by its Laplace approximation.
     """
 
@@ -78,6 +77,11 @@ class Weighted:
     def effective(self) -> float:
         """Effective number of draws."""
         return float(1 / self.log_weights.exp().square().sum())
+
+    @property
+    def evidence_error(self) -> float:
+        """Approximate standard error of ``log_evidence``, nats."""
+        return max(1 / self.effective - 1 / len(self.log_weights), 0.0) ** 0.5
 
     def tempered(self, effective: float) -> Weighted:
         """Temper the weights until this many draws, at most a quarter of all, are effective.

@@ -17,7 +17,7 @@ WRAP = 30
 """Characters in a line of a model's name."""
 LINE, GAP, PERSON, MOST = 0.24, 0.2, 0.13, 3.0
 """Inches: of a line of text, between models, from person to person, and of all people at most."""
-MEASURES = {"loo": "leave-one-out", "heldout": "held-out rounds"}
+MEASURES = {"loo": "leave-one-out", "heldout": "held-out rounds", "evidence": "log evidence"}
 
 
 def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
@@ -28,8 +28,9 @@ def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
 
     Args:
         table: a row for each ``model``, the best first, over all rounds (``person`` is missing) and
-            for each person, in one order: number of ``rounds``, ``log_density``, ``difference`` to
-            the best and its standard error ``difference_se``, NaN where there is none.
+            for each person, in one order: number of ``rounds``, ``log_density`` (or log evidence),
+            ``difference`` to the best and its standard error ``difference_se``, NaN where there is
+            none.
         by: the measure, a key of `MEASURES`.
     """
     totals = table.loc[table["person"].isna()].set_index("model")
@@ -60,21 +61,23 @@ def plot_comparison(table: pd.DataFrame, by: str = "loo") -> Picture:
         shown = [label_of(person) for person in people] * (len(models) - 1)
         ax.set_yticks(places, shown, minor=True, fontsize=7)
     ax.set_ylim(down - GAP / 2, -GAP - LINE / 2)
+    digits, name = (1, "log evidence") if by == "evidence" else (4, "log density")
     for log_density, top in zip(totals["log_density"], tops, strict=True):
-        _column(ax, f"{log_density:z.4f}", top)
-    _column(ax, "log density", -GAP - LINE / 2, weight="bold")
-    _finish(
-        figure, ax, f"{MEASURES[by]}, {totals.loc[best, 'rounds']} rounds of {len(people)} people"
-    )
+        _column(ax, f"{log_density:z.{digits}f}", top)
+    _column(ax, name, -GAP - LINE / 2, weight="bold")
+    _finish(figure, ax, by, f"{totals.loc[best, 'rounds']} rounds of {len(people)} people")
     return figure
 
 
-def _finish(figure: Picture, ax: Axes, what: str) -> None:
+def _finish(figure: Picture, ax: Axes, by: str, of: str) -> None:
     """Labels, title and legend."""
-    ax.set_xlabel("difference to the best in nats an action; further left is worse")
+    unit, error = "nats an action", "± standard error, paired"
+    if by == "evidence":
+        unit, error = "nats", "± standard error of the estimate"
+    ax.set_xlabel(f"difference to the best in {unit}; further left is worse")
     ax.spines[["top", "right", "left"]].set_visible(False)
     ax.tick_params(axis="y", which="both", length=0, pad=8)
-    title = f"How much worse than the best model: {what}"
+    title = f"How much worse than the best model: {MEASURES[by]}, {of}"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     handles = [
         Line2D([], [], ls="", marker="s", color=BLACK, ms=8),
@@ -82,7 +85,7 @@ def _finish(figure: Picture, ax: Axes, what: str) -> None:
         Line2D([], [], ls="", marker="o", color=GREY, ms=4.5),
         Line2D([], [], color=BLACK, lw=1.4),
     ]
-    words = ["the best", "all rounds", "a person's rounds", "± standard error, paired"]
+    words = ["the best", "all rounds", "a person's rounds", error]
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False)
 
 

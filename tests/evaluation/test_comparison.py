@@ -17,7 +17,7 @@ from example_posteriors import (
 )
 
 from mirror_ppl.arviz import az
-from mirror_ppl.evaluation.comparison import label_models, read_fit
+from mirror_ppl.evaluation.compared_files import label_models, read_fit
 
 
 @pytest.fixture

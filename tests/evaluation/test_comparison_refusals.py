@@ -11,7 +11,7 @@ from running import command
 from mirror_ppl.commands import compare
 from mirror_ppl.data import asset_path
 from mirror_ppl.errors import OptionError, PosteriorError
-from mirror_ppl.evaluation.comparison import read_fit
+from mirror_ppl.evaluation.compared_files import read_fit
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_a_posterior_given_twice_is_refused(paths, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"by": "waic"}, '--by must be loo or heldout, not "waic"'),
+        ({"by": "waic"}, '--by must be loo, heldout or evidence, not "waic"'),
         ({"labels": ("a",)}, "--labels must be as many as posteriors, 2, not 1"),
         ({"labels": ("a", "a ")}, "--labels must be different from each other and not empty"),
         ({"labels": ("a", "")}, "--labels must be different from each other and not empty"),

@@ -35,6 +35,9 @@ def test_kinds_are_weighed_by_evidence_and_implants_are_those_of_each(job):
     prior = torch.tensor([0.6, 0.1, 0.1, 0.1, 0.1], dtype=torch.double)
     joint = evidence + prior.log()
     torch.testing.assert_close(found.log_evidence, joint.logsumexp(-1), atol=1e-6, rtol=1e-6)
+    errors = torch.stack([one.evidence_error for one in alone.values()], -1)  # pyright: ignore
+    expected = (joint.softmax(-1) * errors).square().sum(-1).sqrt()
+    torch.testing.assert_close(found.evidence_error, expected, atol=1e-6, rtol=1e-6)
     for person, shares in enumerate(joint.softmax(-1)):
         kinds = found.draws[KIND][:, person].flatten()
         often = torch.bincount(kinds, minlength=5)

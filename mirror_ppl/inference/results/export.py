@@ -137,33 +137,31 @@ def add_check(
     people: Sequence[Mapping[str, Any]],
     attributes: Mapping[str, str | int | float],
 ) -> None:
-    """Add the group ``model_check`` to those of a fit: verdicts and p-values of each person.
+    """Add the group ``model_check`` to those of a fit: verdicts, p-values, evidence of each person.
 
     Args:
         data: groups of the fit.
-        people: their parts of the summary, with ``check`` and ``test``.
+        people: their parts of the summary, with ``check``, ``test`` and perhaps ``log_evidence``.
         attributes: attributes of the file.
     """
     checks = [person["check"] for person in people]
     names = list(dict.fromkeys(name for check in checks for name in check["p_values"]))
     values = [[check["p_values"].get(name, math.nan) for name in names] for check in checks]
+    nats: dict[str, list[float | None]] = {
+        "nll": [(one["test"] or {}).get("nll") for one in people],
+        **{name: [one[name] for one in checks] for name in ("nll_base_rate", "nll_no_implants")},
+        **{name: [one.get(name) for one in people] for name in ("log_evidence", "evidence_error")},
+    }
     group = xr.Dataset(
         {
             "verdict": (("person",), [check["verdict"] for check in checks]),
             "p_value": (("person", "check"), np.array(values).reshape(len(checks), len(names))),
-            "nll": (("person",), [(one["test"] or {}).get("nll", math.nan) for one in people]),
-            **{
-                name: (
-                    ("person",),
-                    [math.nan if one[name] is None else one[name] for one in checks],
-                )
-                for name in ("nll_base_rate", "nll_no_implants")
-            },
+            **{name: (("person",), np.array(own, dtype=float)) for name, own in nats.items()},
         },
         {"person": data["posterior"]["person"].values, "check": names},
         {key: str(value) for key, value in attributes.items()},
     )
-    for name in ("nll", "nll_base_rate", "nll_no_implants"):
+    for name in nats:
         group[name].attrs["units"] = "nats"
     data.add_groups({"model_check": group})
 

@@ -185,10 +185,12 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         if posterior.pareto_k is not None:
             value = float(posterior.pareto_k[number])
             person["pareto_k"] = value if isfinite(value) else None
-        if posterior.log_evidence is not None:
+        if posterior.log_evidence is not None and posterior.evidence_error is not None:
             value = float(posterior.log_evidence[number])
+            error = float(posterior.evidence_error[number])
             known = isfinite(value) and human.likelihood_power == 1
             person["log_evidence"] = round(value, 3) if known else None
+            person["evidence_error"] = round(error, 3) if known else None
         if posterior.effective is not None:
             person["effective_draws"] = round(float(posterior.effective[number]), 1)
         person["check"] = predicted.checks[number]
