@@ -231,9 +231,14 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     if recordings is None:
         raise InputError("recordings are None; leave them out to fit the people that ship")
     world = None if domain is None else domain_of(domain).name
-    if not isinstance(recordings, Demonstrations):
+    if isinstance(recordings, str | Path):
         path = None if recordings == SHIPPED else recordings
         recordings = load_recordings(path, domain=world)
+    elif not isinstance(recordings, Demonstrations):
+        raise InputError(
+            f"recordings are of the class {type(recordings).__name__}, expected Demonstrations or "
+            "the path of a file; mirror_ppl.data.from_dataset makes them of an xarray.Dataset"
+        )
     if world not in (None, recordings.domain):
         raise InputError(f"domain is {world}, but the recordings are of {recordings.domain}")
     where = usable_device(device)

@@ -268,7 +268,8 @@ pd.DataFrame(rows).T.rename_axis("NLL above the floor, nats an action")
 
 # %%
 from mirror_ppl.errors import UnreliableWeights
-from mirror_ppl.evaluation.comparison import compare_fits, read_fit
+from mirror_ppl.evaluation.compared_files import read_fit
+from mirror_ppl.evaluation.comparison import compare_fits
 from mirror_ppl.plots.comparison import plot_comparison
 
 names = ["mirror", "perceptual-only", "policy-only", "no-implants"][:: 3 if quick else 1]

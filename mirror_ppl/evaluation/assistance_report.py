@@ -51,7 +51,7 @@ def print_assistance(
     worth = table(
         f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
         "rewards a round; ±: standard error; [90% interval], paired; -: needs none, and an oracle "
-        "ahead of it",
+        "ahead of it in every bootstrap sample",
         ["task", "cost", "net", "above none", "way to oracle"],
     )
     said = table(

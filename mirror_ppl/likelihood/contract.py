@@ -21,7 +21,7 @@ from mirror_ppl.likelihood.agreement import check_agreement
 from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
-from mirror_ppl.models.human import HumanModel, Implants, has_own_program
+from mirror_ppl.models.human import HumanModel, Implants, has_own_program, overrides
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
 from mirror_ppl.shapes import broadcast_shapes
 from mirror_ppl.user_code import describe, is_of_package
@@ -96,8 +96,11 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
             knowledge: Any = domain.nothing_known(people, device=device)
             for step, now in enumerate(observed):
                 with WithoutSites(BELIEVING):
-                    method = "perceive"
                     readable = Readable(discrete | latents, implants.keys())
+                    if overrides(human, "sees"):
+                        method = "sees"
+                        _check_sees(domain, human.sees(readable, now, step), people)
+                    method = "perceive"
                     view, knowledge = human.perceive(readable, knowledge, now, told, step)
                     method = "evidence"
                     evidence = human.evidence(view, now)
@@ -110,6 +113,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                         f"believe returned shape {tuple(belief.shape)}, expected "
                         f"({people}, {human.belief_size}) for {people} beliefs"
                     )
+                _check_dtype(human, "believe", belief)
                 method = "act"
                 _check_act(human, implants, belief)
         _check_names(domain, [*latent_sites(trace.trace), *latents])
@@ -126,6 +130,39 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
         where = describe(error, None if file is None else Path(file))
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
+
+
+def _check_sees(domain: Domain, masks: Any, people: int) -> None:
+    """Check the masks of items that people see ``[P, K]``, by modality."""
+    names = [modality.name for modality in domain.modalities]
+    if not isinstance(masks, Mapping) or set(masks) != set(names):
+        given = ", ".join(map(str, masks)) if isinstance(masks, Mapping) else type(masks).__name__
+        raise HumanModelError(
+            f"sees returned {given or 'nothing'}, expected a dict with a mask of each modality: "
+            f"{', '.join(names)}"
+        )
+    for modality in domain.modalities:
+        mask, expected = masks[modality.name], (people, len(modality.items))
+        if not torch.is_tensor(mask) or mask.dtype != torch.bool:
+            own = mask.dtype if torch.is_tensor(mask) else type(mask).__name__
+            raise HumanModelError(
+                f'sees returned {own} for "{modality.name}", expected a tensor of torch.bool'
+            )
+        sizes = zip(reversed(mask.shape), reversed(expected), strict=False)
+        if mask.dim() > len(expected) or any(own not in (1, size) for own, size in sizes):
+            raise HumanModelError(
+                f'sees returned shape {tuple(mask.shape)} for "{modality.name}", expected '
+                f"{expected} for (people, items)"
+            )
+
+
+def _check_dtype(human: HumanModel, method: str, found: Tensor) -> None:
+    expected = next(human.parameters()).dtype
+    if found.dtype != expected:
+        raise HumanModelError(
+            f"{method} returned {found.dtype}, expected {expected}; numpy's numbers make tensors "
+            "of 64 bits: convert them, or end with .float()"
+        )
 
 
 def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
@@ -150,6 +187,7 @@ def _check_act(human: HumanModel, implants: Implants, belief: Tensor) -> None:
             f"act returned shape {tuple(found.shape)}, expected {expected} for (people, rounds, "
             "actions)"
         )
+    _check_dtype(human, "act", found)
     if bool(found.isnan().any()):
         raise HumanModelError(f"{type(human).__name__}.act returns nan")
     total = found.exp().sum(-1)

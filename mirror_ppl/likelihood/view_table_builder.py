@@ -39,6 +39,7 @@ from mirror_ppl.likelihood.round_views import (
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.telling import MANY, some_of, telling_first
 from mirror_ppl.likelihood.view_table import NO_VIEW, Attention, ViewTable
+from mirror_ppl.limits import require_memory
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, random_keys
@@ -187,6 +188,11 @@ class ViewTableBuilder:
             candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
             values = attended.values.items()
             candidates |= {name: value.repeat(len(alive)) for name, value in values}
+            require_memory(
+                len(alive) * each * rounds.actions.shape[1] * _bytes_of_a_view(self.human),
+                f"views of {len(alive):,} combinations of discrete sites with {each} values of "
+                "round_latents each (fewer sites take less)",
+            )
         number = len(alive) * each
         row = torch.arange(len(rounds), device=alive.device).repeat_interleave(number)
         candidates = {name: value.repeat(len(rounds)) for name, value in candidates.items()}
@@ -364,6 +370,12 @@ class ViewTableBuilder:
         """Log prior probability of each combination under each policy, ``[policies, M]``."""
         others = {name: policy for name, policy in self.policies.items() if name not in self.grid}
         return log_priors(self.human, self.grid, others, 1)[:, 0]
+
+
+def _bytes_of_a_view(human: HumanModel) -> int:
+    """Memory for what is perceived at a step, about; masks, assumed numbers, and copies."""
+    numbers = sum(len(m.items) * (1 + len(m.features)) for m in human.domain.modalities)
+    return 4 * 4 * numbers  # copies as measured in driving
 
 
 def _number_of(values: Mapping[str, Tensor]) -> int:

@@ -9,10 +9,14 @@ import torch
 from example_attention import NOTICED, NOTICES, STEPS, drawn, geometric
 from example_course import perceived
 
+from mirror_ppl import limits
+from mirror_ppl.errors import OptionError
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.likelihood.attention import choose_values, site_probabilities
 from mirror_ppl.likelihood.densities import log_weighted_latents
+from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
+from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.implants import first_success
 from mirror_ppl.models.simulation import play_rounds
 
@@ -53,6 +57,20 @@ def test_an_item_is_seen_from_when_it_is_noticed(per_item, recordings):
     steps = torch.arange(STEPS)
     for place, first in enumerate((0, 4, 14, 15)):
         assert torch.equal(seen[:, place], steps >= first)
+
+
+def test_views_that_do_not_fit_into_memory_are_refused(per_item, recordings, monkeypatch):
+    monkeypatch.setattr(limits, "free_memory", lambda: 2**20)
+    builder = ViewTableBuilder(per_item, Screening())
+    # 4 combinations of assumptions and 512 values, 15 steps; 4 items with 2 and 4 with 3 numbers
+    # and a mask each, 16 bytes.
+    needed = 4 * 512 * 15 * (4 * 3 + 4 * 4) * 16 / 2**30
+    with pytest.raises(OptionError) as error:
+        builder.add(rounds_of(recordings, 0))
+    assert str(error.value) == (
+        "views of 4 combinations of discrete sites with 512 values of round_latents each (fewer "
+        f"sites take less) would need about {needed:.1f} GB of memory, 0.0 GB are free"
+    )
 
 
 def test_attention_differs_between_rounds_and_people_and_follows_its_seed(per_item):

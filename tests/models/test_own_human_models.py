@@ -170,6 +170,36 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
             r"believe returned shape \(2, 96\), expected \(2, 48\) for 2 beliefs",
         ),
         (
+            "sees(self, implants, observation, step)",
+            'return {"vision": observation["visual"][..., 0] > 0}',
+            "sees returned vision, expected a dict with a mask of each modality: visual, verbal",
+        ),
+        (
+            "sees(self, implants, observation, step)",
+            "return None",
+            "sees returned NoneType, expected a dict with a mask of each modality",
+        ),
+        (
+            "sees(self, implants, observation, step)",
+            'return {name: observation[name][..., 0] for name in ("visual", "verbal")}',
+            'sees returned torch.float32 for "visual", expected a tensor of torch.bool',
+        ),
+        (
+            "sees(self, implants, observation, step)",
+            'return {name: observation[name] > 0 for name in ("visual", "verbal")}',
+            r'sees returned shape \(2, 4, 2\) for "visual", expected \(2, 4\) for',
+        ),
+        (
+            "act(self, implants, belief, values)",
+            "return values.double().log_softmax(-1)",
+            r"act returned torch\.float64, expected torch\.float32; numpy's numbers make",
+        ),
+        (
+            "believe(self, belief, evidence, action, still=None)",
+            "return belief.double()",
+            r"believe returned torch\.float64, expected torch\.float32",
+        ),
+        (
             "act(self, implants, belief, values)",
             "return values[..., 0]",
             r"act returned shape \(2, 1\), expected \(2, 1, 2\)",

@@ -281,6 +281,14 @@ def test_nothing_is_no_recordings():
         mirror_ppl.infer(None)
 
 
+@pytest.mark.parametrize(
+    "data", [xr.Dataset({"action": ("step", [1, 0])}), np.zeros((2, 3)), 3, ["a.nc"]]
+)
+def test_other_data_are_no_recordings(data):
+    with pytest.raises(InputError, match=f"recordings are of the class {type(data).__name__}, exp"):
+        mirror_ppl.infer(data)
+
+
 def test_unreliable_weights_are_reported(fit, recordings, monkeypatch):
     monkeypatch.setattr("mirror_ppl.fitted.HIGH_PARETO_K", -9.0)
     with pytest.warns(UnreliableWeights, match="weights of person-01 are not to be relied on"):

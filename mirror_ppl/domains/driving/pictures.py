@@ -11,7 +11,7 @@ PICTURES = {
     "samples.png": SightPicture(
         samples.has_sight,
         samples.samples_picture,
-        "posterior samples of that road, beside what they really see",
+        "posterior samples of that road, beside what they really see where that is known",
     ),
     "notices.png": NOTICES_PICTURE,
 }
