@@ -383,6 +383,6 @@ class Driving(World):
 
         for lane, position in zip(CAR_LANES, state.position.reshape(-1).tolist(), strict=True):
             if abs(position) < ROAD_END:
-                block(lane, position, (200, 60, 50))
-        block(int(state.lane), 0, (40, 90, 200))
+                block(lane, position, (230, 159, 0))
+        block(int(state.lane), 0, (0, 90, 160))  # darker, so that grey tells them apart
         return picture
