@@ -115,9 +115,7 @@ def made(content: memoryview) -> memoryview:
 def _import_libraries() -> None:
     """Import libraries in this process, or each other process would import them again."""
     import h5netcdf  # noqa: F401
-    from xarray.backends import list_engines
 
-    list_engines()
     with suppress(ImportError):  # which xarray imports where it is installed
         import dask.array  # noqa: F401 # pyright: ignore[reportMissingImports]
 

@@ -82,8 +82,8 @@ def main(options: Options) -> None:
     _check_outputs(options)
     _require_different(options.posteriors)
     if options.by == "evidence":
-        held = [read_evidence(path) for path in options.posteriors]
-        comparison = compare_evidence(held, options.labels or label_models(held))
+        files = [read_evidence(path) for path in options.posteriors]
+        comparison = compare_evidence(files, options.labels or label_models(files))
     else:
         files = [read_fit(path, options.by) for path in options.posteriors]
         comparison = compare_fits(files, options.labels or label_models(files), options.by)
@@ -167,7 +167,7 @@ def _evidences(comparison: EvidenceComparison) -> Table:
     caption += "the estimate; share: of people who follow the model if each follows one, with a "
     caption += "90% interval"
     columns = "log evidence", "difference", "share of people"
-    table = _empty(comparison, f"evidence, {comparison.rounds} rounds", caption, columns)
+    table = _empty(comparison, f"evidence, {sum(comparison.rounds)} rounds", caption, columns)
     for rank, model in enumerate(comparison.models, 1):
         low, high = model.share_interval
         table.add_row(

@@ -152,7 +152,7 @@ def _command(options: Options) -> str:
     values = {part.name: getattr(options, part.name) for part in fields(options)}
     if options.setting is None:
         values["setting"] = get_domain(options.domain).settings[-1]
-    unsaid = {"out", "population" if options.human_model else "human_model"}
+    unsaid = {"out", "population"} if options.human_model else {"out"}
     if not options.told:
         unsaid.add("told")
     parts = [

@@ -116,7 +116,7 @@ def read_evidence(path: Path) -> EvidenceFile:
         path: a file that ``python -m mirror_ppl.fit`` wrote, or the folder that holds it.
 
     Raises:
-        PosteriorError: the file is missing or damaged, or lacks the evidence of somebody.
+        PosteriorError: the file is missing or damaged, or lacks the evidence of a person.
     """
     file = _read(posterior_path(path), "evidence", _evidence)
     power = float(file.attributes.get("likelihood_power", 1))
@@ -143,7 +143,7 @@ Found = TypeVar("Found", bound=ComparedFile)
 
 
 def _read(
-    path: Path, by: str, content: Callable[[ComparedFile, Mapping[str, xr.Dataset]], Found]
+    path: Path, by: str, content: Callable[[ComparedFile, Mapping[str, xr.Dataset]], Found | None]
 ) -> Found:
     data = read_results(path, "posterior", *GROUPS[by])
     try:
@@ -153,8 +153,6 @@ def _read(
         people = tuple(map(str, data["observed_data"]["person"].values))
         shared = ComparedFile(path, attributes, people, recorded, learned)
         file = content(shared, data) if GROUPS[by][0] in data else None
-    except PosteriorError as error:
-        raise PosteriorError(f"{path}: {error}") from error
     except Exception as error:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     if file is None or not (file.actions >= 0).any():
@@ -162,10 +160,10 @@ def _read(
     return file
 
 
-def _evidence(shared: ComparedFile, data: Mapping[str, xr.Dataset]) -> EvidenceFile:
+def _evidence(shared: ComparedFile, data: Mapping[str, xr.Dataset]) -> EvidenceFile | None:
     check = data["model_check"]
     if "log_evidence" not in check:  # in files of earlier versions
-        raise PosteriorError(LACKS["evidence"])
+        return None
     evidence, error = (check[name].values for name in ("log_evidence", "evidence_error"))
     if not evidence.shape == error.shape == (len(shared.people),):
         raise ValueError(f"evidences have shapes {evidence.shape} and {error.shape}")

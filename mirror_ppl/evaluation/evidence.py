@@ -128,13 +128,13 @@ class EvidenceComparison:
     Attributes:
         attributes: the domain, the setting and the provenance of the recordings.
         people: ids of the P people.
-        rounds: number of rounds that were learned from, of all people.
+        rounds: number of rounds of each person that were learned from ``[P]``.
         models: M of them.
     """
 
     attributes: Mapping[str, str]
     people: tuple[str, ...]
-    rounds: int
+    rounds: tuple[int, ...]
     models: tuple[ModelEvidence, ...]
 
     by = "evidence"
@@ -146,13 +146,18 @@ class EvidenceComparison:
                 {
                     "model": model.label,
                     "person": person,
-                    "rounds": self.rounds,
+                    "rounds": number,
                     "log_density": one.log_evidence,
                     "difference": one.difference,
                     "difference_se": one.difference_error,
                 }
                 for model in self.models
-                for person, one in zip((None, *self.people), (model, *model.people), strict=True)
+                for person, one, number in zip(
+                    (None, *self.people),
+                    (model, *model.people),
+                    (sum(self.rounds), *self.rounds),
+                    strict=True,
+                )
             ]
         )
 
@@ -206,6 +211,6 @@ def compare_evidence(files: Sequence[EvidenceFile], labels: Sequence[str]) -> Ev
             tuple(PersonEvidence(*map(float, one)) for one in zip(*numbers, strict=True)),
         )
 
-    rounds = int((first.actions >= 0).any(-1).sum())
+    rounds = tuple((first.actions >= 0).any(-1).sum(-1).tolist())
     models = tuple(map(standing, range(len(order))))
     return EvidenceComparison(source_of(first), first.people, rounds, models)

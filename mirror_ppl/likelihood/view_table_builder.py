@@ -188,11 +188,12 @@ class ViewTableBuilder:
             candidates = {name: value.repeat_interleave(each) for name, value in candidates.items()}
             values = attended.values.items()
             candidates |= {name: value.repeat(len(alive)) for name, value in values}
-            require_memory(
-                len(alive) * each * rounds.actions.shape[1] * _bytes_of_a_view(self.human),
-                f"views of {len(alive):,} combinations of discrete sites with {each} values of "
-                "round_latents each (fewer sites take less)",
-            )
+            if alive.device.type == "cpu":
+                require_memory(
+                    len(alive) * each * rounds.actions.shape[1] * _bytes_of_a_view(self.human),
+                    f"views of {len(alive):,} combinations of discrete sites with {each} values of "
+                    "round_latents each (fewer sites take less)",
+                )
         number = len(alive) * each
         row = torch.arange(len(rounds), device=alive.device).repeat_interleave(number)
         candidates = {name: value.repeat(len(rounds)) for name, value in candidates.items()}

@@ -63,7 +63,7 @@ def test_what_percepts_saw_before_keeps_their_beliefs_apart():
 
 @pytest.mark.parametrize("assumption", ASSUMED)
 def test_assumptions_change_beliefs(assumption):
-    """Of one car seen and three out of sight, until all are spoken of."""
+    """One car is seen and three are out of sight, until there are messages about all."""
     past = begun(0, [4, 9, -5, -9], [-1, 1, -1, -1])
     someone = person(2, front_own=4, **{assumption: [0, 1]})
     beliefs, which = look_around(someone, past, flags()[None])

@@ -1,4 +1,4 @@
-"""Figures of studies: curves by rounds, their levels, and bars of what is told."""
+"""Figures of studies: curves by rounds, their levels, and bars of messages."""
 
 import pytest
 
