@@ -25,12 +25,12 @@ ASPHALT: Colour = (58, 62, 68)
 SHOULDER_GREY: Colour = (112, 116, 120)
 GRASS: Colour = (196, 208, 180)
 LINE: Colour = (240, 240, 236)
-EGO: Colour = (64, 132, 214)
-CAR: Colour = (214, 96, 70)
+EGO: Colour = (52, 116, 216)
+CAR: Colour = (246, 182, 112)
 BRAKE_LIGHT: Colour = (255, 40, 40)
 GLASS: Colour = (206, 226, 240)
 PAPER: Colour = (250, 250, 248)
-UNSEEN: Colour = (166, 170, 178)
+UNSEEN: Colour = (140, 144, 152)
 SHADOW: Colour = (234, 236, 238)
 RING: Colour = (214, 216, 220)
 
@@ -122,7 +122,7 @@ def _polar(distance: np.ndarray, visible: np.ndarray) -> np.ndarray:
     canvas = np.full((PLOT, PLOT, 3), PAPER, np.uint8)
     canvas[radius <= RANGE] = SHADOW
     share = np.clip(distance / RANGE, 0, 1)[:, None]
-    far, near = np.array([214, 232, 214.0]), np.array([214, 96, 70.0])
+    far, near = np.array([184, 218, 184.0]), np.array([214, 96, 70.0])
     colours = np.where(visible[:, None], share * far + (1 - share) * near, UNSEEN).astype(np.uint8)
     inside = radius <= np.where(visible, distance, RANGE)[sector]
     canvas[inside] = colours[sector[inside]]
