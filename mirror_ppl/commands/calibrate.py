@@ -36,7 +36,7 @@ EXAMPLES = {
 REJECTED = 1
 WIDTH = 80
 FEW_PEOPLE = 100
-"""Of fewer, tests of uniformity have little power."""
+"""Number of people below which tests of uniformity have little power."""
 
 
 @dataclass(frozen=True)

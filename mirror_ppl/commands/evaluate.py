@@ -37,7 +37,7 @@ FAILED = 1
 QUICK = ("driving",)
 """Worlds of short rounds, of which more is learned in the same time."""
 SEEDS, FEW_SEEDS = (5, 2), (2, 1)
-"""Of prediction and of the others, in those worlds and otherwise."""
+"""Default numbers of seeds in those worlds and in others: for prediction, other studies."""
 ROUNDS, OTHER_ROUNDS = {"prediction": (1, 2, 5, 10, 20)}, (0, 1, 5, 20)
 """Numbers of rounds that are learned from unless they are asked for."""
 TOLD = 0.03

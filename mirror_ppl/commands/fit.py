@@ -21,7 +21,7 @@ PROGRAM = "python -m mirror_ppl.fit"
 CHECKPOINT = "fit.checkpoint"
 CHECKPOINTS = re.compile(r"fit\.checkpoint(\.\d+)?")
 COPIES = 4
-"""Of log-probabilities of actions, while they are worked out and drawn from."""
+"""Number of copies of log-probabilities of actions in memory while they are drawn from."""
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ

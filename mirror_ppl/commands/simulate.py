@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "python -m mirror_ppl.simulate"
 COPIES = 4
-"""Of recordings in memory: while they are made, checked and packed into a file."""
+"""Number of copies of recordings in memory while they are made, checked and saved."""
 DESCRIPTION = """Record rounds of simulated people, whose sight and consistency are known, in a file
 for python -m mirror_ppl.fit. docs/people.md describes the people."""
 EXAMPLES = {

@@ -43,7 +43,7 @@ class Strip:
 
 @dataclass(frozen=True)
 class Film:
-    """The same round with two communicators.
+    """One round, played once with each of two communicators.
 
     Attributes:
         domain: the world.

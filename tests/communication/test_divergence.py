@@ -64,7 +64,7 @@ def test_divergence_is_that_of_two_gaussians(generator, time, measure, weight):
 @torch.no_grad()
 @pytest.mark.parametrize("time", [0, 3])
 def test_expected_values_are_those_of_the_next_action(generator, time):
-    """Of each draw: probabilities of actions after the message, times the robot's values."""
+    """Utility is the robot's values weighted by each draw's probabilities of actions."""
     past, _ = random_round(time, generator)
     someone = Person(human(), varied_draws(4, generator))
     candidates = candidates_of(past, generator, 2)

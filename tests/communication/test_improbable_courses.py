@@ -53,7 +53,7 @@ def test_at_branch_one_each_draw_follows_a_single_course():
 
 
 def test_what_could_be_gained_beyond_the_steps_looked_at_counts_if_asked_for():
-    """Of courses that end at path 0 to 3 with 100 more than that to gain: the mean of all."""
+    """``terminal_value`` adds the mean, 101.5, of what is to gain after the four courses."""
     rewards = [torch.zeros(1, 2), torch.zeros(1, 4)]
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
     someone = person(3, consistency=0.0)

@@ -161,7 +161,7 @@ def test_utilities_are_those_of_every_course(
 def test_items_that_cannot_be_communicated_at_their_step_change_only_the_cost(
     clear, closing, name, car, places
 ):
-    """The same message a step earlier does, but where everybody sees the car; and so do others."""
+    """Late, an item changes the cost alone; a step earlier it has value, unless all see the car."""
     positions, speeds, index = [3, 5, -3, -3], [-1, -1, 1, 1], CARS.index(car)
     positions[index], speeds[index] = places[0], places[1] - places[0]
     past = begun(0, positions, speeds)

@@ -41,7 +41,7 @@ TAUGHT = TABLE | {
     ("B", "cross"): GREEN,
     ("B", "frame"): YELLOW,
 }
-"""The same as the robot was taught it."""
+"""The action that the robot was taught to be right, by type and symbol."""
 
 
 def start(number=8, scenario=None, seed=0):

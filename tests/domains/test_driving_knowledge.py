@@ -348,7 +348,7 @@ def stacked(states, messages):
 
 
 def implants(index):
-    """Of people with thresholds ``[B, 4]``, as indices, who assume whatever there is to assume."""
+    """Implants of people with these thresholds ``[B, 4]`` (indices) and every assumption."""
     values = dict(zip(SIGHTS, index.unbind(-1), strict=True))
     return values | dict.fromkeys(ASSUMED, torch.ones(len(index)))
 

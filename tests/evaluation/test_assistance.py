@@ -300,7 +300,7 @@ def test_communicators_that_are_not_there_are_refused():
 
 
 def decision(chosen):
-    """Of three candidates at one step: silence, front-left shown, front-left said."""
+    """A decision for one of three candidates: silence, front-left shown, front-left said."""
     state = DrivingState(torch.tensor(0), torch.tensor([3, 9, -9, -9]), torch.tensor([-1, 1, 1, 1]))
     candidates = torch.zeros(3, 1, len(CHANNELS), dtype=torch.bool)
     candidates[1, 0, 0] = candidates[2, 0, 4] = True

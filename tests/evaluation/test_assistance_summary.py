@@ -118,7 +118,7 @@ def test_one_seed_gives_one_summary_that_is_plain_data():
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say(rng):
-    """Of 90% intervals of a difference, 150 times, at least three quarters hold it.
+    """At least three quarters of 150 intervals at 90% hold the true difference.
 
     Percentile intervals of 2 x 12 rounds are a little narrow (about 87%); fewer than 75% of 150
     would be over 4 standard deviations off.

@@ -131,7 +131,7 @@ def test_the_oracle_considers_every_pair_of_items(name):
 
 
 def test_intervals_of_summaries_hold_nine_tenths():
-    """Of 0 to 100 the values at 5, 50 and 95 percent."""
+    """Draws 0 to 100 have quantiles 5, 50 and 95."""
     rounds = GROUP.recordings().select_rounds(slice(1)).select_people([0])
     (found,) = summarize({"site": torch.arange(101.0)[:, None]}, rounds, None)
     implant = found["implants"]["site"]

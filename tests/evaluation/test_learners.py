@@ -94,7 +94,7 @@ def test_of_whom_it_is_not_known_what_they_see_is_refused():
 
 
 def test_mirror_predicts_what_a_fit_predicts():
-    """The same draws of the same posterior, by the command's function and by the study's."""
+    """NLL and floor of the study agree with the summary of `fit_people` with the same seed."""
     human = load_human_model(None, FOG.self_model)
     fit = fit_people(human, FOG.recordings(), InferenceOptions(), seed=3, train_rounds=2)
     rows = predict(Prediction(FOG, "mirror", 2))
@@ -153,7 +153,7 @@ def test_mirror_is_inferred_by_the_guide_of_its_name(name, guide, monkeypatch):
 
 
 def test_a_population_is_learned_from_others(monkeypatch):
-    """Of the same setting and number, and the same for all seeds; then it is everybody's prior."""
+    """One population, of as many people in the same setting, is the prior for all seeds."""
     asked = []
 
     def spying(human, rounds, options, seed, network=None, population=None):

@@ -100,7 +100,7 @@ def test_who_pools_is_compared_with_mirror_pooled():
 
 
 def test_the_way_to_the_oracle_and_what_was_learned_of_people_on_it():
-    """Of 4 between silence and the oracle: 2 with nothing learned, 3 after five rounds."""
+    """Mirror gains 2 of the 4 between silence and the oracle unlearned, 3 after five rounds."""
     rows = []
     for person in "ab":
         for model, rounds, net in (

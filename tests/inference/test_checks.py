@@ -42,7 +42,7 @@ def by_hand(actions):
 
 @pytest.mark.parametrize("recorded", list(itertools.product([0, 1], repeat=3)))
 def test_p_values_are_those_of_all_courses(recorded):
-    """Of two thousand replicates a share has a standard deviation of at most .012."""
+    """Estimated p-values are within four standard errors of those from all courses of actions."""
     found = p_values(steps(recorded), ACTIONS, torch.Generator().manual_seed(1))
     expected = dict.fromkeys(by_hand(recorded), 0.0)
     own = by_hand(recorded)

@@ -21,7 +21,7 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
 def test_a_p_value_near_0_or_1_makes_suspect():
-    """Of five checks one may be at .01 two-sided: .005 to either side."""
+    """With five checks a person is suspect if a p-value is below .005 or above .995."""
     fine = {"delayed": 0.3, "switches": 0.01, "reward": 0.9, "surprise": 0.5, "share of stay": 0.99}
     assert verdict(fine, None) == criticism.Verdict("ok")
     found = verdict(fine | {"switches": 0.004, "reward": 0.9999}, None)
@@ -81,7 +81,7 @@ def test_without_rounds_before_the_robot_is_as_its_prior(recordings):
 
 @pytest.fixture(scope="module")
 def late():
-    """Of two people of the prior, seed 100, one always acts on the belief of the step before."""
+    """Rounds of two people from the prior, of whom the second nearly always acts a step late."""
     self_model = robot_of_few_reaches()
     human = load_human_model(f"{ROOT}/docs/examples/late_reactions.py:LatePerson", self_model)
     implants = {name: value[0] for name, value in draw_prior(human, 2, 1, 100).items()}

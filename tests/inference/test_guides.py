@@ -122,7 +122,7 @@ def test_hamiltonian_draws_are_of_the_exact_posterior(toy, recordings):
 
 
 def test_the_exact_posterior_by_hand(toy, recordings):
-    """Of one person, by running the program for every bin and many rates."""
+    """The program, run for every bin and a grid of rates, gives one person's exact posterior."""
     one = recordings.select_people([2]).select_rounds([0, 1])
     table = build_view_table(toy, one)
     exact = toy_posterior(toy, one)

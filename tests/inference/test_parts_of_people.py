@@ -75,7 +75,7 @@ def test_what_is_kept_makes_no_difference(quick, recordings, tmp_path):
 
 
 def test_no_person_depends_on_the_other_people(fit, recordings):
-    """Of the first people; seeds of later ones are by their number."""
+    """A fit of the first three people equals their part of the fit of all."""
     some = mirror_ppl.infer(recordings.part(range(3)), **SMALL)
     for name, values in some.data.posterior.data_vars.items():
         own = fit.data.posterior[name].isel(person=slice(0, 3))

@@ -219,7 +219,7 @@ def test_damaged_populations_are_refused(folder, toy, change, message):
 
 
 def test_reaches_of_a_population_are_in_the_unit_of_distance(toy):
-    """Of the package's own human model; nobody is fitted, so the population is the prior."""
+    """Stored bins of the package's human model are distances; assumptions are 0 and 1."""
     from mirror_ppl.inference.population.pooling import Population
     from mirror_ppl.inference.results.population_file import add_population
 

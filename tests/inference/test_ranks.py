@@ -106,7 +106,7 @@ def test_numbers_by_hand(rng):
 
 
 def test_right_posteriors_are_rejected_as_rarely_as_said(rng):
-    """Of 200 posteriors at a rate of 10%; a bit fewer, because the two tests often agree."""
+    """At a rate of 10%, from 5% to 10% of 200 correct posteriors are rejected, but for chance."""
     sites = [f"x{number}" for number in range(200)]
     data = replace(gaussian(rng, 200, sites=sites), failure_rate=0.1)
     assert binom.cdf(len(data.rejected), 200, 0.05) > RARELY

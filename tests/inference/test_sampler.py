@@ -177,7 +177,7 @@ def test_sites_that_depend_on_others_are_found(toy):
 
 
 def test_a_relative_gaussian_is_the_density_of_what_it_draws(toy):
-    """Of the logit of a rate given ``evenness``: a Gaussian with the prior's first two moments."""
+    """A rate's logit is Gaussian after division by a scale that depends on ``evenness``."""
     sites = scalar_sites(toy)
     drawn = draw_prior(toy, 1, 400, 0)
     place = unconstrained(sites, drawn)

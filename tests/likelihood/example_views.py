@@ -83,7 +83,7 @@ def policies(human, number, people):
 
 
 def log_likelihoods_by_hand(human, rounds, person, number, values, policy):
-    """Of one round ``[M]``: each combination by itself, one step after the other.
+    """Log-likelihoods of one round ``[M]``, each combination by itself, step by step.
 
     Args:
         values: the discrete implants ``[M]`` by name.

@@ -125,7 +125,7 @@ def test_every_implant_of_noticing_has_a_gradient(per_item, recordings):
 
 
 def test_the_posterior_is_the_exact_one(self_model):
-    """Of a probability on a grid, all else known; draws are weighted, so errors are theirs."""
+    """Mean and spread of a probability of noticing agree with a grid, all else being known."""
     human = Fixed(self_model)
     generator = torch.Generator().manual_seed(3)
     truth = {NOTICES[0]: torch.tensor([[0.15]])}

@@ -190,7 +190,7 @@ def test_people_of_different_rounds_are_joined(defuser):
 
 
 def test_what_is_given_up_changes_nothing_of_the_rest(defuser):
-    """Of those who read the type and those who do not, after the first are given up."""
+    """Giving up people who read the type leaves likelihoods of those who do not unchanged."""
     rounds = recorded()
     draws = draw_prior(defuser, 1, 3, 2)
     table = build_view_table(defuser, rounds)

@@ -28,7 +28,7 @@ from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 STEPS = {"driving": 3, "search_rescue": 3, "bomb_defusal": 4, "highway": 3}
-"""Of the longest round, by world."""
+"""Number of steps of the longest round, by world."""
 HORIZONS = {("search_rescue", "per-item"): 1, ("bomb_defusal", "per-item"): 2}
 """Where that of the longest round would be too much to go through: nine and six items, each of
 which is noticed at one of so many steps or never."""
@@ -106,7 +106,7 @@ def enumerated(human, rounds, draws):
 
 
 def gone_through(human, rounds, draws):
-    """The same by going through all values of round latents; TraceEnum has one scale for all."""
+    """`enumerated`, but by summing over round latents here; TraceEnum has one scale for all."""
     program = config_enumerate(poutine.condition(human.model, data=draws), "parallel")
     with poutine.enum(first_available_dim=-3), poutine.trace() as trace:
         program(rounds)

@@ -85,7 +85,7 @@ def test_the_program_of_a_user_is_run(engine, recordings):
 
 
 def test_pyro_infers_it_too(recordings):
-    """Of a model without discrete sites, by Pyro's own tools alone."""
+    """Pyro's own SVI infers a rate of a model without discrete sites."""
 
     class Sighted(ToyHuman):
         def prior(self):

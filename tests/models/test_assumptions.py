@@ -57,7 +57,7 @@ def rounds_seen(plan, start, actions):
 
 
 def marks(mask, car):
-    """Of one car in the only round, by step."""
+    """One car's mask in the only round, by step, as 0 and 1."""
     return mask[0, :, car].int().tolist()
 
 

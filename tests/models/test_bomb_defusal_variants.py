@@ -97,7 +97,7 @@ def test_what_rewards_identify_of_the_world_needs_no_implant(robot):
 
 
 def test_draws_of_rules_go_before_what_was_learned(robot):
-    """Of the drawn permutation, not of the likeliest one."""
+    """The planning domain has the rules of a draw, not the most probable ones."""
     human = variant("mirror", robot)
     other = torch.full((3, 1, 1), 5)
     drawn = human.planning_domain({RULE + kind: other for kind in human.kinds})

@@ -45,7 +45,7 @@ def test_buttons_are_exchanged_by_the_rule_of_the_type_believed_in(defuser, monk
 
 
 def test_rules_are_learned_from_rewards_and_planned_with():
-    """Of forty rounds or so there is one set of rules that explains all rewards."""
+    """Rewards of 60 rounds identify the rules, with probability above .99 of each type."""
     torch.manual_seed(0)
     human = BombDefusalHuman(SelfModel(WORLD))
     torch.testing.assert_close(human.rule_logits.exp().sum(-1), torch.ones(2))

@@ -80,7 +80,7 @@ def test_who_knows_what_counts_has_exact_values_to_learn_from(generator):
 
 
 def test_errors_that_all_actions_share_count_once(generator):
-    """The same for all: nothing more. One action alone of five: 4 / 5 of its square."""
+    """The weight adds nothing if all errors are equal, 4 / 5 of the mean square if one errs."""
     _, _, full = lived(generator)
     torch.manual_seed(0)
     self_model = SelfModel(WORLD)

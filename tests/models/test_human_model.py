@@ -241,7 +241,7 @@ def test_a_model_may_say_what_is_visible_and_no_more(human, recordings):
 
 
 def emptied(observation):
-    """The same lane and an empty road: every car beyond its visible end."""
+    """The observation with an empty road: every car beyond its visible end."""
     empty = {name: value.clone() for name, value in observation.items()}
     for name in ("visual", "verbal"):
         empty[name][..., 0] = ROAD_END

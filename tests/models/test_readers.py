@@ -31,7 +31,7 @@ def linear_sizes(module):
 
 
 def convolution(reader, image, pixels, stride):
-    """The same by torch's own convolution."""
+    """What the reader should return, by torch's own convolution."""
     rows, columns, colours = image
     kernel = reader.convolution.weight.view(-1, 3, 3, colours).permute(0, 3, 1, 2)
     maps = conv2d(

@@ -35,7 +35,7 @@ def test_a_memory_that_is_not_used_leaves_rounds_as_they_are(self_model):
 
 @pytest.mark.parametrize("kind", [HumanModel, Averaging])
 def test_actions_are_those_of_beliefs_along_whole_rounds(self_model, kind):
-    """Of two people who always do what they think best."""
+    """Two people who nearly always choose the best action act on their beliefs at each step."""
     human, rounds = kind(self_model), 12
     implants = {site: torch.zeros(2, 1, dtype=torch.long) for site in sight_sites(human.domain)}
     implants |= {"sight_front_own": torch.tensor([[3], [6]])}

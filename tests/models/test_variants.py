@@ -116,7 +116,7 @@ def test_variants_are_special_cases(self_model, rounds):
 
 @pytest.mark.parametrize("guide", ["importance", "svi"])
 def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
-    """Of the smallest, which has nothing discrete, of one that attends, and of one radius."""
+    """``no-implants``, ``per-item`` and ``one-radius`` are fitted; the last two also advise."""
     monkeypatch.chdir(tmp_path)
     assert command(simulate, "--people", 1, "--rounds", 2, "--out", "people.nc") == 0
     advises = ("per-item", "one-radius") if guide == "importance" else ("one-radius",)

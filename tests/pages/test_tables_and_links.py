@@ -130,7 +130,7 @@ def test_tables_of_settings_are_the_defaults(name, heading, options):
 
 
 def test_settings_of_other_worlds_are_those_of_their_records():
-    """Of self-models: what differs from driving's."""
+    """The table holds each setting of a self-model that differs from driving's."""
     rows = table_of(page("docs/self_model.md"), "Setting elsewhere")
     ours = asdict(SelfModelOptions())
     for column, world in enumerate(("search_rescue", "bomb_defusal", "highway"), start=1):

@@ -186,7 +186,7 @@ def test_an_oracle_communicates_what_gains():
 
 
 def test_the_mean_of_noticing_is_learned_from_rounds(seed):
-    """Of 36 rounds: within 4.5 standard errors, about 1 / sqrt(times found) on a logarithm."""
+    """Log means from 36 rounds are within 4.5 standard errors, 1 / sqrt(times found) each."""
     truth = participants(20, seed)
     start = draw_starts(20, 36, seed, "test", domain=WORLD, mind_noises=truth.mind_noises)
     recording = record(truth, start)

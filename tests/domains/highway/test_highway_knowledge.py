@@ -48,7 +48,7 @@ def looked(knowledge, observation, sees, clear=1):
 
 
 def test_people_in_the_model_remember_as_simulated_drivers_do(monkeypatch):
-    """Of drivers who differ, in recorded rounds: the same cars, as far as there are any."""
+    """Knowledge and memory hold the same cars, at the same places, in rounds of ten drivers."""
     plans = torch.zeros(10, 1, 12)  # which do not matter here
     monkeypatch.setattr(expert, "values", lambda state, weights: plans)
     recordings = load_demonstrations(asset_path("highway_fog_diverse.nc"))
