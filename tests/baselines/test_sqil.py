@@ -103,7 +103,7 @@ def test_played_rounds_have_as_many_messages_as_recorded_ones():
 
 
 def test_recorded_and_played_rounds_are_learned_from_as_each_by_itself(generator):
-    """The loss is the weighted sum of both parts' own, though rounds differ in number and length."""
+    """The loss is the weighted sum of both parts' own, though their rounds differ in shape."""
     domain = get_domain("driving")
     networks, target = (untrained(domain, ("a", "b"), seed=seed) for seed in (0, 1))
     with torch.no_grad():
