@@ -33,6 +33,9 @@ class Inferred:
             model's own prior, nats, if the engine estimates it; NaN with factors or observed sites,
             where it is not defined, and with sampled attention, which adds noise to it.
         evidence_error: approximate standard error of it ``[P]``, nats.
+        combinations: for each person, numbers ``[C]`` of the combinations of the discrete sites
+            that perception reads which have all but a negligible part of the posterior
+            probability, if the engine marginalizes over them.
         losses: negative ELBO at each step in nats, if one was optimized.
         population: posterior of the population, if people were pooled.
         effective: effective number ``[P]`` of each person's draws after pooling, if pooled.
@@ -44,6 +47,7 @@ class Inferred:
     pareto_k: Tensor | None = None
     log_evidence: Tensor | None = None
     evidence_error: Tensor | None = None
+    combinations: tuple[Tensor, ...] = ()
     losses: tuple[float, ...] = field(default=())
     population: Population | None = None
     effective: Tensor | None = None

@@ -218,6 +218,7 @@ def infer(  # noqa: PLR0913 - everything that inference can depend on
         draws=pooled.draws,
         log_evidence=None,
         evidence_error=None,
+        combinations=(),
         population=population,
         effective=pooled.effective,
     )
@@ -265,6 +266,7 @@ def _in_parts(engine: Engine, job: Job) -> Inferred:
         pareto_k,
         log_evidence,
         evidence_error,
+        tuple(one for part in parts for one in part["combinations"]),
         engines=tuple(name for part in parts for name in part["engines"]),
         seconds=seconds,
     )
@@ -276,12 +278,13 @@ def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
     return {
         "draws": narrowed(found.draws),
         **{name: getattr(found, name) for name in WEIGHED},
+        "combinations": list(found.combinations),
         "engines": list(found.engines) or [engine.name] * part.rounds.num_people,
         "seconds": seconds,
     }
 
 
-FORMAT = 3
+FORMAT = 4
 """Version of stored runs; raised whenever they change, so that older runs are not resumed."""
 
 

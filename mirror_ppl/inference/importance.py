@@ -57,15 +57,15 @@ def infer_by_importance(
             if job.rounds.measurements:
                 draws |= measured_draws(job.rounds.select_people([person]), job.draws)
             evidence = (own.log_evidence, own.evidence_error) if estimated else (nan, nan)
-            found.append((own.pareto_k, *evidence, engine))
+            found.append((own.pareto_k, *evidence, engine, own.probable))
             drawn.append(draws)
         order = sample_sites(job.human, 1)
     job.report("infer", people, people, "people")
     # Site by site, so that the many draws of pooled people are not in memory twice.
     joined = {name: torch.cat([own.pop(name) for own in drawn], 1) for name in order}
-    pareto_k, evidence, error, engines = zip(*found, strict=True)
+    pareto_k, evidence, error, engines, combinations = zip(*found, strict=True)
     weighed = (torch.tensor(pareto_k), torch.tensor(evidence), torch.tensor(error))
-    return Inferred(joined, *weighed, engines=engines)
+    return Inferred(joined, *weighed, combinations, engines=engines)
 
 
 def has_evidence(human: HumanModel) -> bool:

@@ -46,6 +46,9 @@ RESIDUAL_DRAWS = 64
 """Draws from which the proposal of the residual is fitted."""
 HIGH_PARETO_K = 0.7
 """Pareto k above which importance weights are unreliable (Vehtari et al., 2015)."""
+NEGLIGIBLE = 1e-4
+"""Posterior probability of the combinations of discrete sites that `Weighted.probable` leaves out.
+"""
 HALVINGS = 20
 """Bisection steps for the power to which weights are raised."""
 
@@ -82,6 +85,16 @@ class Weighted:
     def evidence_error(self) -> float:
         """Approximate standard error of ``log_evidence``, nats."""
         return max(1 / self.effective - 1 / len(self.log_weights), 0.0) ** 0.5
+
+    @property
+    def probable(self) -> Tensor:
+        """The combinations that together have all but `NEGLIGIBLE` of the probability, sorted."""
+        given = torch.softmax(self.log_joint.double(), -1)
+        probability = self.log_weights.double().exp() @ given  # [G]
+        best, order = probability.sort(descending=True)
+        kept = torch.zeros_like(order, dtype=torch.bool)
+        kept[order] = best.cumsum(0) - best < 1 - NEGLIGIBLE
+        return self.combinations.kept(kept).members.sort().values
 
     def tempered(self, effective: float) -> Weighted:
         """Temper the weights until this many draws, at most a quarter of all, are effective.

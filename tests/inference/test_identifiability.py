@@ -11,7 +11,12 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.calibration.study import prior_people
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.population.pooling import Population
-from mirror_ppl.inference.results.identifiability import POLICIES, _entropy_and_shared, identify
+from mirror_ppl.inference.results.identifiability import (
+    NEGLIGIBLE,
+    POLICIES,
+    _entropy_and_shared,
+    identify,
+)
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.toy import RATES, ToyHuman
@@ -179,6 +184,22 @@ def test_few_draws_do_not_make_a_posterior_narrow(toy, rounds):
     draws = infer(human, nobody, InferenceOptions(draws=20), 0).draws
     found = identify(human, nobody, draws, 0, rounds=0)
     assert float(found.all_entropy[0]) == pytest.approx(math.log(9604), rel=1e-3)
+
+
+def test_probable_combinations_are_all_that_matters(toy, rounds):
+    human = HumanModel(toy.self_model)
+    one = rounds.select_people([0])
+    posterior = infer(human, one, InferenceOptions(draws=POLICIES), 0)
+    (probable,) = posterior.combinations
+    assert 64 < len(probable) < 9604
+    found, known = (
+        identify(human, one, posterior.draws, 0, combinations=some, rounds=0)
+        for some in ((), posterior.combinations)
+    )
+    for name in ("entropy", "shared", "all_entropy", "all_shared"):
+        torch.testing.assert_close(
+            getattr(known, name), getattr(found, name), rtol=0, atol=NEGLIGIBLE
+        )
 
 
 def test_the_population_shares_no_information_with_the_policy(toy, rounds):

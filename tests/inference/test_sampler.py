@@ -15,6 +15,7 @@ from mirror_ppl.inference import sampler as sampler_module
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
 from mirror_ppl.inference.sampler import Sampler, Weighted
+from mirror_ppl.likelihood.combination_sets import EquivalentCombinations
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.prior import draw_prior, scalar_sites, unconstrained
@@ -155,6 +156,25 @@ def test_weights_are_toned_down_until_enough_draws_count():
     found = weighted(impossible).tempered(64.0)
     assert found.effective == pytest.approx(2, rel=0.01)
     assert (found.log_weights[2:] == -torch.inf).all()
+
+
+def test_probable_combinations_have_all_but_a_negligible_probability():
+    """Sets of 2, 1 and 1 combinations under two draws, of which one set has 0.00004 on average."""
+    sets = EquivalentCombinations(
+        first=torch.tensor([7, 1, 4]),
+        log_prior=torch.zeros(3),
+        fixed=True,
+        members=torch.tensor([7, 2, 1, 4]),
+        share=torch.tensor([0.5, 1.0, 2.0, 3.0]),
+        end=torch.tensor([2, 3, 4]),
+    )
+    given = torch.tensor([[0.5, 0.49992, 0.00008], [0.2, 0.8, 0.0]])
+    found = Weighted({}, sets, given.log(), torch.tensor([0.5, 0.5]).log(), 0.0, 0.0)
+    assert found.probable.tolist() == [1, 2, 7]
+    rarer = replace(found, log_weights=torch.tensor([0.0, -torch.inf]))
+    assert rarer.probable.tolist() == [1, 2, 7]
+    likelier = torch.tensor([[0.5, 0.4998, 0.0002], [0.2, 0.8, 0.0]]).log()
+    assert replace(rarer, log_joint=likelier).probable.tolist() == [1, 2, 4, 7]
 
 
 def test_what_is_proposed_has_heavy_tails_and_these_moments():

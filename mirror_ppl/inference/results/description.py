@@ -5,7 +5,7 @@ Each person is described separately, so that people can be distributed over proc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -71,12 +71,14 @@ class Part:
         train: training rounds.
         test: held-out rounds, if there are any.
         draws: posterior draws ``[S, P, 1, ...]``.
+        combinations: see :func:`describe`.
     """
 
     first: int
     train: Demonstrations
     test: Demonstrations | None
     draws: Mapping[str, Tensor]
+    combinations: Sequence[Tensor]
 
 
 def describe(
@@ -84,6 +86,7 @@ def describe(
     train: Demonstrations,
     test: Demonstrations | None,
     draws: Mapping[str, Tensor],
+    combinations: Sequence[Tensor] = (),
     workers: Workers = Workers(),  # noqa: B008 - frozen
     identity: str = "",
 ) -> Described:
@@ -94,6 +97,8 @@ def describe(
         train: training rounds.
         test: held-out rounds, if there are any.
         draws: posterior draws ``[S, P, 1, ...]``.
+        combinations: probable combinations of each person's discrete implants, if known; see
+            :class:`~mirror_ppl.inference.engine.Inferred`.
         workers: processes to use.
         identity: identifies everything that the result depends on.
     """
@@ -105,6 +110,7 @@ def describe(
             train.part(people.range),
             None if test is None else test.part(people.range),
             {name: value[:, some].clone() for name, value in draws.items()},
+            combinations[some],
         )
 
     parts = workers.run("describe", train.num_people, partial(_describe, how), given, identity)
@@ -134,6 +140,7 @@ def _describe(how: Description, part: Part) -> dict[str, Any]:
                 part.draws,
                 how.seed,
                 how.population,
+                part.combinations,
                 rounds=how.explore,
                 first=part.first,
             )

@@ -154,7 +154,9 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     how = Description(human, seed, explore, posterior.population, every_draw)
     if checkpoint is not None and test is not None:
         identity += f"{_recorded(test)} {explore} {every_draw}"
-    described = describe(how, train, test, posterior.draws, workers, identity)
+    described = describe(
+        how, train, test, posterior.draws, posterior.combinations, workers, identity
+    )
     # Results are on the CPU.
     learned = train
     train, test = train.to("cpu"), None if test is None else test.to("cpu")

@@ -121,6 +121,7 @@ def identify(
     draws: Mapping[str, Tensor],
     seed: int,
     population: Population | None = None,
+    combinations: Sequence[Tensor] = (),
     report: Report = silent,
     rounds: int = 8,
     first: int = 0,
@@ -133,6 +134,8 @@ def identify(
         draws: posterior draws ``[S, P, 1, ...]``, not autocorrelated.
         seed: seed of the simulated rounds.
         population: posterior of the population, if people were pooled.
+        combinations: probable combinations of each person's discrete implants, if inference found
+            them. They are found anew otherwise, which takes most of the time.
         report: called with the number of people done.
         rounds: simulated rounds in each scenario; 0 for none.
         first: number of the first of these people among all.
@@ -154,8 +157,9 @@ def identify(
         report("identify", person, people, "people")
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
         drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes)
-        candidates, one = drawn.unique(), train.select_people([person])
-        if len(candidates) <= FEW and ENOUGH * len(candidates) <= held:
+        one = train.select_people([person])
+        candidates = combinations[person] if combinations else drawn.unique()
+        if combinations or (len(candidates) <= FEW and ENOUGH * len(candidates) <= held):
             table = build_view_table(human, one, [candidates], likely=own, values=VALUES)
         else:  # too few draws to estimate the support
             table = build_view_table(human, one, screening=Screening(), likely=own, values=VALUES)
