@@ -39,7 +39,6 @@ from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.simulation import play_rounds
-from mirror_ppl.progress import Report, silent
 
 NEGLIGIBLE = 0.005
 """Nats below which entropies and information gains count as 0; printed as 0.00."""
@@ -122,7 +121,6 @@ def identify(
     seed: int,
     population: Population | None = None,
     combinations: Sequence[Tensor] = (),
-    report: Report = silent,
     rounds: int = 8,
     first: int = 0,
 ) -> Identifiability | None:
@@ -136,7 +134,6 @@ def identify(
         population: posterior of the population, if people were pooled.
         combinations: probable combinations of each person's discrete implants, if inference found
             them. They are found anew otherwise, which takes most of the time.
-        report: called with the number of people done.
         rounds: simulated rounds in each scenario; 0 for none.
         first: number of the first of these people among all.
 
@@ -154,7 +151,6 @@ def identify(
     found: list[tuple[Tensor, ...]] = []
     pooling = None if population is None else Pooling(human)
     for person in range(people):
-        report("identify", person, people, "people")
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
         drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes)
         one = train.select_people([person])
@@ -195,7 +191,6 @@ def identify(
                 generator,
             )
         found.append((*_entropies(weights, grid), *told))
-    report("identify", people, people, "people")
     return Identifiability(tuple(sizes), *(torch.stack(part) for part in zip(*found, strict=True)))
 
 
