@@ -23,8 +23,8 @@ from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 
-CHUNK = 2**21
-"""Views and moments, summed over draws, that are computed at once; bounds memory."""
+CHUNK = 2**19
+"""Views and moments, summed over draws, that are computed at once: what a cache holds."""
 
 
 def combination_values(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:

@@ -249,11 +249,11 @@ class HumanModel(nn.Module):
     def evidence(self, view: View, observation: Observation) -> Tensor:
         """Return the encoder's evidence ``[..., H]`` in a view ``[..., K]`` of an observation."""
         encoder, domain = self.self_model.encoder, self.domain
-        embedded = encoder.embed(domain.symbols(observation))
+        symbols = domain.symbols(observation)
         if not view.taken:
-            return encoder.combine(embedded, view.visible)
-        imagined = encoder.embed(domain.symbols({**observation, **view.imagined}))
-        return encoder.combine(embedded, view.visible, imagined, view.taken)
+            return encoder.evidence(symbols, view.visible)
+        imagined = domain.symbols({**observation, **view.imagined})
+        return encoder.evidence(symbols, view.visible, imagined, view.taken)
 
     def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None

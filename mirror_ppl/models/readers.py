@@ -54,6 +54,23 @@ class ItemEmbedding(Reader):
         """Return contributions ``[..., K, H]`` of ``symbols`` ``[..., K, D]``."""
         return torch.einsum("...kd,kdh->...kh", symbols, self.weight) + self.bias
 
+    def read(self, sources: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+        """Return the sum ``[..., H]`` of the items in the view.
+
+        Where every view is of an observation of its own, the items of a view are a single row.
+
+        Args:
+            sources: symbols ``[..., K, D]`` and masks ``[..., K]``; no item is in two of them.
+        """
+        symbols, mask = sources[0]
+        for other, there in sources[1:]:
+            symbols, mask = torch.where(there[..., None], other, symbols), mask | there
+        if symbols.dim() - 1 != mask.dim() or symbols.shape[:-1] != mask.shape:
+            return self.join(self.embed(symbols), mask)
+        weights = mask.to(symbols.dtype)
+        items = (weights[..., None] * symbols).flatten(-2)
+        return items @ self.weight.flatten(0, 1) + weights @ self.bias
+
     @staticmethod
     def join(embedded: Tensor, mask: Tensor) -> Tensor:
         """Return the sum ``[..., H]`` of the items in the view."""

@@ -115,7 +115,14 @@ class Knowing(SelfModel):
             lit = WORLD.sought({"ego": ego, **symbols})
             return {"ego": torch.cat(values, -1), "visual": lit, "verbal": symbols["verbal"]}
 
-        def combine(self, embedded, visible, imagined=None, taken=None):
+        def combine(self, embedded, visible):
+            return self.joined(embedded, visible, None)
+
+        def evidence(self, symbols, visible, imagined=None, taken=None):
+            guess = None if imagined is None else self.embed(imagined)
+            return self.joined(self.embed(symbols), visible, guess)
+
+        def joined(self, embedded, visible, imagined):
             kind = embedded["verbal"][..., 0, 1:]
             known = visible["verbal"].float()
             if imagined is not None:

@@ -129,7 +129,7 @@ def test_imagined_items_are_read_as_if_they_were_seen():
     }
     both = {name: masks[name] | taken[name] for name in masks}
     torch.testing.assert_close(
-        network.combine(network.embed(values), masks, network.embed(imagined), taken),
+        network.evidence(values, masks, imagined, taken),
         network.combine(network.embed(overlaid | {"ego": values["ego"]}), both),
     )
 
