@@ -40,7 +40,24 @@ def gone_through(human, implants, observation, told, actions):
 
 def perceived(human, implants, observation, told):
     """Views of rounds, masks ``[..., T, K]``."""
-    return View.stack(list(views(human, implants, observation, told)))
+    steps = list(views(human, implants, observation, told))
+
+    def stacked(parts, behind):
+        return {
+            name: torch.stack(
+                torch.broadcast_tensors(*(part[name] for part in parts)),
+                -2 if name.rpartition(": ")[2] == "ego" else -1 - behind,
+            )
+            for name in parts[0]
+        }
+
+    still = [step.still for step in steps if step.still is not None]
+    return View(
+        stacked([step.visible for step in steps], 1),
+        stacked([step.taken for step in steps], 1),
+        stacked([step.imagined for step in steps], 2),
+        torch.stack(torch.broadcast_tensors(*still), -1) if still else None,
+    )
 
 
 def go_through(human, implants, observation, told, actions):

@@ -141,20 +141,31 @@ class BeliefState:
 
     def _through(self, transitions: Sequence[Transition]) -> list[BeliefState]:
         number, steps = len(self.belief), len(transitions)
-        view, knowledge = self.perceive(transitions)
+        views, knowledge = self.perceive(transitions)
+        # Step by step, since all steps of many people do not fit into a cache.
+        numbers = [one.numbers().expand(number) for one in views]
         row, observed = self._observed(transitions)
-        key = torch.stack([view.numbers().expand(number, steps), observed], -1)
-        if view.still is not None:
-            key = torch.where(view.still[..., None], NOT_SHOWN, key)
+        key = torch.stack([torch.stack(numbers, -1), observed], -1)
+        stills = [one.still.expand(number) for one in views if one.still is not None]
+        still = torch.stack(stills, -1) if stills else None
+        if still is not None:
+            key = torch.where(still[..., None], NOT_SHOWN, key)
         key = row_numbers(key)  # [n, T]
         action = torch.stack([one.action for one in transitions], -1)
         # People with equal beliefs, actions and evidence are tracked as one.
         one, same = distinct_rows(torch.cat([self.belief[:, None], action, key], -1))
         first, shown = distinct_rows(key[one].view(-1, 1))
-        person, step = one[first // steps], first % steps
+        step, order = (first % steps).sort(stable=True)
+        person, shown = one[first[order] // steps], order.argsort()[shown]
         observation = [each.observation for each in transitions]
+        counts = torch.bincount(step, minlength=steps).tolist()
         evidence = self.human.evidence(
-            view.map(lambda part: part[person, step]),
+            View.joined(
+                [
+                    view.map(lambda part, own=own: part.expand(number, *part.shape[1:])[own])
+                    for view, own in zip(views, person.split(counts), strict=True)
+                ]
+            ),
             {
                 name: (torch.cat([each[name] for each in observation]) if steps > 1 else value)[
                     row[person, step]
@@ -162,7 +173,7 @@ class BeliefState:
                 for name, value in observation[0].items()
             },
         )
-        still = None if view.still is None else view.still[one]
+        still = None if still is None else still[one]
         parts = torch.stack([action[one], key[one], shown.view(-1, steps)])
         state, states = replace(self, belief=self.belief[one]), []
         for place in range(steps):
@@ -172,8 +183,8 @@ class BeliefState:
             states.append(replace(state, belief=state.belief[same], knowledge=knowledge[place]))
         return states
 
-    def perceive(self, transitions: Sequence[Transition]) -> tuple[View, list[Any]]:
-        """Return views of several steps ``[n, T, K]``, and the knowledge after each.
+    def perceive(self, transitions: Sequence[Transition]) -> tuple[list[View], list[Any]]:
+        """Return the views of several steps, ``[n, K]`` each, and the knowledge after each.
 
         They do not depend on beliefs.
         """
@@ -187,7 +198,7 @@ class BeliefState:
             knowledge = map_state(lambda part: part.expand(number, *part.shape[1:]), knowledge)
             views.append(view)
             known.append(knowledge)
-        return View.stack(views).map(lambda part: part.expand(number, *part.shape[1:])), known
+        return views, known
 
     def _observed(self, transitions: Sequence[Transition]) -> tuple[Tensor, Tensor]:
         """Return the row of each observation at each step ``[n, T]``, and keys of these."""

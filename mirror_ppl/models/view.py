@@ -40,29 +40,18 @@ class View:
         )
 
     @classmethod
-    def stack(cls, steps: Sequence[View]) -> View:
-        """Stack the views of the steps of a round into one view ``[..., T, K]``."""
+    def joined(cls, parts: Sequence[View]) -> View:
+        """Concatenate views ``[n, K]`` of different people."""
 
-        def joined(parts: Sequence[Tensor], place: int) -> Tensor:
-            if len(parts) == 1:
-                return parts[0].unsqueeze(place)  # no copy
-            return torch.stack(torch.broadcast_tensors(*parts), place)
+        def cat(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+            return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
-        def stacked(parts: Sequence[Mapping[str, Tensor]], behind: int) -> dict[str, Tensor]:
-            return {
-                name: joined(
-                    [part[name] for part in parts],
-                    -2 if name.rpartition(": ")[2] == "ego" else -1 - behind,
-                )
-                for name in parts[0]
-            }
-
-        still = [step.still for step in steps if step.still is not None]
+        still = [part.still for part in parts if part.still is not None]
         return cls(
-            stacked([step.visible for step in steps], 1),
-            stacked([step.taken for step in steps], 1),
-            stacked([step.imagined for step in steps], 2),
-            joined(still, -1) if still else None,
+            cat([part.visible for part in parts]),
+            cat([part.taken for part in parts]),
+            cat([part.imagined for part in parts]),
+            torch.cat(still) if still else None,
         )
 
     def numbers(self) -> Tensor:

@@ -88,9 +88,8 @@ def test_a_belief_that_stays_is_as_sure_as_it_was(case):
     stayed = 0
     for step, (before, after) in enumerate(zip(states, states[1:], strict=False), 1):
         assert len(after.scale) == len(after.mean)
-        some = torch.zeros(PEOPLE, dtype=torch.bool)
-        if views.still is not None:
-            some = views.still[:, step]
+        still = views[step].still
+        some = torch.zeros(PEOPLE, dtype=torch.bool) if still is None else still
         stayed += int(some.sum())
         assert torch.equal(after.scale[after.belief][some], before.scale[before.belief][some])
     # Each person alone has the same density, whoever else comes to the same mean.

@@ -55,9 +55,9 @@ def share_known(person: Person, past: RoundSoFar) -> Tensor:
     }
     whole = past.then(nothing, 0, past.now)  # no message at the present step
     state = BeliefState.initial(person.human, person.percept_count)
-    view, _ = state.perceive(transitions(person, whole))
-    visible = view.visible
-    observed = torch.stack(list(visible.values())).any(0).long().cummax(1).values
+    views, _ = state.perceive(transitions(person, whole))
+    seen = [torch.stack(list(view.visible.values())).any(0) for view in views]
+    observed = torch.stack(seen, 1).long().cummax(1).values
     return observed[person.percept].float().mean(0)
 
 
@@ -85,9 +85,9 @@ def share_seen(person: Person, lane: int) -> Tensor:
     nothing = {m.name: torch.zeros_like(position, dtype=torch.bool) for m in domain.modalities}
     action = torch.zeros_like(percepts)
     transition = person.transition(percepts, action, observation, nothing, rows)
-    view, _ = BeliefState.initial(person.human, len(percepts)).perceive([transition])
+    (view,), _ = BeliefState.initial(person.human, len(percepts)).perceive([transition])
     seen = view.visible["visual"]
-    share = seen.unflatten(0, (person.percept_count, places))[person.percept].float().mean((0, 2))
+    share = seen.unflatten(0, (person.percept_count, places))[person.percept].float().mean(0)
     return share[:, [CAR_LANES.index(side) for side in range(len(MIDDLES))]].T
 
 
