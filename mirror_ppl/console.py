@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from mirror_ppl.errors import HumanModelError, MirrorError, OptionError, UnknownNameError
+from mirror_ppl.errors import HumanModelError, MirrorError, OptionError
 from mirror_ppl.user_code import describe, passed_user_code
 
 if TYPE_CHECKING:
@@ -213,20 +213,6 @@ def _use_threads(threads: int) -> None:
         import torch
 
         torch.set_num_threads(threads)
-
-
-def usable_device(name: str) -> str:
-    """The name of a device that torch can compute on here.
-
-    Raises:
-        UnknownNameError: there is none of that name; lists those there are.
-    """
-    import torch
-
-    known = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
-    if name not in known and not (name == "cuda" and len(known) > 1):
-        raise UnknownNameError.of("device", name, known)
-    return name
 
 
 def console_for_tables(width: int) -> "Console":

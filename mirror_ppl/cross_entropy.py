@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mirror_ppl.errors import InputError
+
 
 @dataclass(frozen=True)
 class CrossEntropyOptions:
@@ -30,7 +32,7 @@ class CrossEntropyOptions:
         start_probability: of action 1 at every step, in the first iteration.
 
     Raises:
-        ValueError: a number is out of its range.
+        InputError: a number is out of its range.
     """
 
     samples: int = 256
@@ -41,13 +43,13 @@ class CrossEntropyOptions:
 
     def __post_init__(self) -> None:
         if not 1 <= self.elites <= self.samples:
-            raise ValueError(f"elites must be from 1 to samples={self.samples}, not {self.elites}")
+            raise InputError(f"elites must be from 1 to samples={self.samples}, not {self.elites}")
         if self.iterations < 1:
-            raise ValueError(f"iterations must be at least 1, not {self.iterations}")
+            raise InputError(f"iterations must be at least 1, not {self.iterations}")
         if not 0.0 <= self.smoothing <= 1.0:
-            raise ValueError(f"smoothing must be from 0 to 1, not {self.smoothing}")
+            raise InputError(f"smoothing must be from 0 to 1, not {self.smoothing}")
         if not 0.0 < self.start_probability < 1.0:
-            raise ValueError(
+            raise InputError(
                 f"start_probability must be between 0 and 1, not {self.start_probability}"
             )
 
@@ -79,7 +81,7 @@ def best_sequences(
         equally good it is one of those that were found in the earliest iteration.
 
     Raises:
-        ValueError: ``value`` returned another shape.
+        InputError: ``value`` returned another shape.
     """
     options = options or CrossEntropyOptions()
     device, dtype = generator.device, torch.get_default_dtype()
@@ -94,7 +96,7 @@ def best_sequences(
             sequences[..., 0] = first[..., None]
         values = value(sequences)
         if values.shape != shape:
-            raise ValueError(f"value must return shape {shape}, not {tuple(values.shape)}")
+            raise InputError(f"value must return shape {shape}, not {tuple(values.shape)}")
         elite_values, index = values.topk(options.elites, dim=-1)
         elites = sequences.gather(-2, index[..., None].expand(*index.shape, horizon))
         if best_value is None:

@@ -9,6 +9,7 @@ import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
+from copy import deepcopy
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,9 @@ from mirror_ppl.communication.companion import Companion
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PlannerOptions, planner_of
 from mirror_ppl.communication.rounds import RoundSoFar
-from mirror_ppl.console import usable_device
 from mirror_ppl.data import Demonstrations, asset_path, load_demonstrations
 from mirror_ppl.data.recorder import Recorder
+from mirror_ppl.devices import usable_device
 from mirror_ppl.domains import DOMAINS as worlds
 from mirror_ppl.domains import World, add_domain, domain_of, get_domain, require_known
 from mirror_ppl.errors import InputError, UnreliableWeights
@@ -44,6 +45,7 @@ from mirror_ppl.models.loading import (
 )
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.models.world_knowledge import WorldKnowledge
 from mirror_ppl.people import populations_of
 from mirror_ppl.progress import Report, Stages, silent
 from mirror_ppl.training.guide_file import network_for
@@ -328,7 +330,8 @@ def _human(
     if isinstance(human, HumanModel):
         if self_model is not None:
             raise InputError("self_model is for a human model that is to be made; this one has one")
-        return human
+        # What one fit learns about the world must not change the model of another.
+        return deepcopy(human) if isinstance(human, WorldKnowledge) else human
     of_class = isinstance(human, type) and issubclass(human, HumanModel)
     if not (human is None or isinstance(human, str) or of_class):
         raise InputError(f"human must be a human model, its class or its name, not {human!r}")

@@ -1,4 +1,4 @@
-"""Timing: seconds of this process by stage of work."""
+"""Timing: processor seconds of this process by stage of work."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from time import perf_counter
+from time import process_time
 
 
 @dataclass
 class Clock:
-    """Measures seconds by stage; those of a nested stage count once, for the inner one.
+    """Measures processor seconds by stage; those of a nested stage count once, for the inner one.
 
     Attributes:
         seconds: by name of the stage.
@@ -22,7 +22,7 @@ class Clock:
     _since: float = 0.0
 
     def _turn(self) -> None:
-        now = perf_counter()
+        now = process_time()
         if self._stages:
             name = self._stages[-1]
             self.seconds[name] = self.seconds.get(name, 0.0) + now - self._since

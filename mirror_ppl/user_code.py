@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import os
 import sys
@@ -33,7 +34,9 @@ def class_in_file(path: Path, name: str, base: type[Base], error: type[MirrorErr
     if not os.path.isfile(path):
         there = "is not a regular file" if os.path.exists(path) else "there is no such file"
         raise error(f"{path}: {there}")
-    module_name = f"_{base.__name__.lower()}_of_{path.stem}"
+    # Files of the same name in different folders are different modules.
+    folder = hashlib.blake2b(os.fsencode(path.resolve()), digest_size=4).hexdigest()
+    module_name = f"_{base.__name__.lower()}_of_{path.stem}_{folder}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
         raise error(f"{path}: not a Python file")
@@ -43,6 +46,7 @@ def class_in_file(path: Path, name: str, base: type[Base], error: type[MirrorErr
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as fault:
+        del sys.modules[module_name]
         raise error(f"{path} does not import: {describe(fault, path)}") from fault
     chosen = getattr(module, name, None)
     if isinstance(chosen, type) and issubclass(chosen, base):

@@ -45,7 +45,7 @@ from mirror_ppl.baselines.training import (
 )
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
-from mirror_ppl.people.base import derived_generator
+from mirror_ppl.randomness import derived_generator
 
 
 @dataclass(frozen=True)

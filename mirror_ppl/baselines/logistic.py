@@ -24,7 +24,7 @@ from mirror_ppl.baselines.inputs import SIGHTS, Sight, recorded_inputs
 from mirror_ppl.baselines.training import check_parts, mean_nll
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import Domain, get_domain, require_known
-from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.errors import DemonstrationsError, InputError
 
 ITERATIONS, ENOUGH = 200, 1e-5
 """Most iterations of the optimizer, and the change of the loss in nats below which it stops."""
@@ -48,7 +48,7 @@ class LogisticOptions:
         require_known(self.sight, "sight", SIGHTS)
         for name in ("shared", "own"):
             if not getattr(self, name) or min(getattr(self, name)) <= 0:
-                raise ValueError(f"{name} must be positive numbers, not {getattr(self, name)}")
+                raise InputError(f"{name} must be positive numbers, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,8 @@ from mirror_ppl.baselines.training import (
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.people.base import derived_generator
+from mirror_ppl.errors import InputError
+from mirror_ppl.randomness import derived_generator
 
 SAMPLED = 0.0
 """Reward of steps in sampled rounds."""
@@ -87,9 +88,9 @@ class SoftQOptions(TrainingOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.reward > 0:
-            raise ValueError(f"reward must be positive, not {self.reward}")
+            raise InputError(f"reward must be positive, not {self.reward}")
         if not 0 <= self.discount < 1:
-            raise ValueError(f"discount must be at least 0 and below 1, not {self.discount}")
+            raise InputError(f"discount must be at least 0 and below 1, not {self.discount}")
 
 
 class SoftQ(RecurrentNetworks):

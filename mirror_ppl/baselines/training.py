@@ -13,7 +13,7 @@ from mirror_ppl.baselines.inputs import SIGHTS, Sight, StepInputs
 from mirror_ppl.baselines.recurrent import RecurrentNetworks
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import get_domain, require_known
-from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.errors import DemonstrationsError, InputError
 
 Report = Callable[[int, str], None]
 """Called at each validation with the number of gradient steps done and a message."""
@@ -64,11 +64,11 @@ class TrainingOptions:
         require_known(self.sight, "sight", SIGHTS)
         for name in self.COUNTS:
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate must be positive, not {self.learning_rate}")
+            raise InputError(f"learning_rate must be positive, not {self.learning_rate}")
         if not 0 <= self.weight_decay * self.learning_rate < 1:
-            raise ValueError(
+            raise InputError(
                 "weight_decay must not be negative, and below 1 / learning_rate, "
                 f"not {self.weight_decay}"
             )

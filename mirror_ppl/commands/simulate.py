@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mirror_ppl.console import usable_device
+from mirror_ppl.devices import usable_device
 from mirror_ppl.errors import OptionError
 from mirror_ppl.limits import check_numbers, require_memory
 from mirror_ppl.progress import Progress

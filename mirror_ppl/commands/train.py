@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from mirror_ppl.console import usable_device
+from mirror_ppl.devices import usable_device
 from mirror_ppl.errors import OptionError
 from mirror_ppl.limits import check_numbers
 from mirror_ppl.progress import Progress, Stages

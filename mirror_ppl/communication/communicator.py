@@ -314,7 +314,7 @@ class Communicator:
         over = steps_left < 1 or bool(domain.over(domain.state_behind(now)))
         if over or not allowed.any():
             return self._silence(now, allowed, over)
-        context = PlanningContext.of(self.person, past)
+        context = PlanningContext.of(self.person, past, self.seed)
         allowed = context.telling(allowed)
         if not allowed.any():
             return self._silence(now, allowed)

@@ -58,11 +58,11 @@ class HearingPerson(Person):
         self.ladder = self.ladder.to(own.device)
         super().__init__(_open(human), own.draws | self._drawn(self.log_hears))
 
-    def in_round(self, past: RoundSoFar) -> Person:
+    def in_round(self, past: RoundSoFar, seed: int = 0) -> Person:
         """Return the person in this round, with channels drawn given their actions so far."""
         found = copy(self)
         found._take(self._drawn(self._after(past)))
-        return super(HearingPerson, found).in_round(past)
+        return super(HearingPerson, found).in_round(past, seed)
 
     @torch.no_grad()
     def after(self, past: RoundSoFar) -> HearingPerson:

@@ -20,7 +20,7 @@ from mirror_ppl.communication.person import PlanningContext
 from mirror_ppl.communication.rollouts import RolloutTree, World, robot_belief
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import Observation
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models.human import HumanModel
@@ -111,9 +111,9 @@ class ExpectedUtility:
         require_methods(self.world, ["rollouts"], "world", "a world such as SimulatorWorld(domain)")
         object.__setattr__(self, "horizon", whole_number(self.horizon, "horizon", 1))
         if not 0 < self.discount <= 1:
-            raise ValueError(f"discount must be above 0 and at most 1, not {self.discount}")
+            raise InputError(f"discount must be above 0 and at most 1, not {self.discount}")
         if not 0 <= self.enumerate_above <= 1:
-            raise ValueError(f"enumerate_above must be from 0 to 1, not {self.enumerate_above}")
+            raise InputError(f"enumerate_above must be from 0 to 1, not {self.enumerate_above}")
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
         """Return the function that values candidates; see :class:`Objective`."""
@@ -357,9 +357,9 @@ class Divergence:
 
     def __post_init__(self) -> None:
         if self.measure not in ("kl", "squared"):
-            raise ValueError(f'measure must be kl or squared, not "{self.measure}"')
+            raise InputError(f'measure must be kl or squared, not "{self.measure}"')
         if not self.weight > 0:
-            raise ValueError(f"weight must be positive, not {self.weight}")
+            raise InputError(f"weight must be positive, not {self.weight}")
 
     def at(self, context: PlanningContext, steps_left: int, seed: int) -> Value:
         """Return the function that values candidates; steps left and seed are not used.

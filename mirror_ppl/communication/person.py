@@ -29,6 +29,7 @@ from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.prior import checked_draws
+from mirror_ppl.randomness import forked
 from mirror_ppl.row_hashing import distinct_rows
 
 COUNTED = 3
@@ -86,7 +87,7 @@ class Person:
         return {name: value[first] for name, value in values.items()}, which
 
     @torch.no_grad()
-    def in_round(self, past: RoundSoFar) -> Person:
+    def in_round(self, past: RoundSoFar, seed: int = 0) -> Person:
         """Return the person in this round, with attention drawn given their actions so far.
 
         Each draw gets one value of attention from ``p(m | psi, actions so far)``, among all values
@@ -97,8 +98,8 @@ class Person:
             return self
         values, log_prior = self._attending(past)
         log_probabilities = self._log_probabilities(values, past) + log_prior
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(past.time)
+        with forked():
+            torch.manual_seed(seed * 1_000_003 + past.time)
             chosen = torch.multinomial(log_probabilities.softmax(-1), 1).squeeze(-1)
         own = {name: value[chosen] for name, value in values.items()}
         person = copy(self)
@@ -249,9 +250,9 @@ class PlanningContext:
     own: Tensor
 
     @classmethod
-    def of(cls, person: Person, past: RoundSoFar) -> PlanningContext:
-        """Return the context of a person at this point of a round."""
-        person = person.in_round(past)
+    def of(cls, person: Person, past: RoundSoFar, seed: int = 0) -> PlanningContext:
+        """Return the context of a person at this point of a round; the seed is of attention."""
+        person = person.in_round(past, seed)
         states = person.states(past)
         state = states[-1] if states else BeliefState.initial(person.human, person.percept_count)
         return cls(person, past, *state.distinct())

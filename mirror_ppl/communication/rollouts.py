@@ -22,6 +22,7 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind, require_methods, whole_number
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import FUTURES, Domain, Observation, map_state, total_reward
+from mirror_ppl.errors import InputError
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
 
@@ -81,14 +82,14 @@ class RolloutTree:
         horizon: maximum number of steps.
 
     Raises:
-        ValueError: there are too many paths.
+        InputError: there are too many paths.
     """
 
     def __init__(
         self, dynamics: Dynamics, state: Any, now: Observation, actions: int, horizon: int
     ):
         if actions**horizon > NAMES:
-            raise ValueError(
+            raise InputError(
                 f"of {actions} actions at most {int(62 / math.log2(actions))} steps can be looked "
                 f"ahead, not {horizon}"
             )

@@ -14,6 +14,7 @@ from torch import Tensor
 from mirror_ppl.communication.messages import count_messages, every_message
 from mirror_ppl.communication.objectives import Value, Valued
 from mirror_ppl.cross_entropy import CrossEntropyOptions, best_sequences
+from mirror_ppl.errors import InputError
 from mirror_ppl.row_hashing import distinct_rows
 
 MOST_CANDIDATES = 4096
@@ -78,7 +79,7 @@ class Patient:
 
     def __post_init__(self) -> None:
         if self.steps < 1:
-            raise ValueError(f"steps must be at least 1, not {self.steps}")
+            raise InputError(f"steps must be at least 1, not {self.steps}")
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """Return candidates with their values; the seed is not used, see :class:`Search`."""
@@ -139,7 +140,7 @@ class CrossEntropy:
 
     def __post_init__(self) -> None:
         if self.steps < 1:
-            raise ValueError(f"steps must be at least 1, not {self.steps}")
+            raise InputError(f"steps must be at least 1, not {self.steps}")
 
     def __call__(self, value: Value, allowed: Tensor, seed: int) -> Found:
         """Return candidates with their values, see :class:`Search`."""

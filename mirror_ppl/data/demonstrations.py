@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.checks import as_tensor, listed, require_keys, whole_number
-from mirror_ppl.console import usable_device
 from mirror_ppl.data import schema
 from mirror_ppl.data.provenance import checked_provenance
 from mirror_ppl.data.schema import MEASURED, NO_INDEX, TOLD, TRUTH
+from mirror_ppl.devices import usable_device
 from mirror_ppl.domains import Observation, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, is_name, shown
 

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from mirror_ppl.domains.controls import Control
 from mirror_ppl.domains.record import Record
-from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.errors import InputError, UnknownNameError
 
 Observation = Mapping[str, Tensor]
 """Values by name: ``"ego"`` ``[..., E]`` and one entry ``[..., K, F]`` for each modality."""
@@ -104,19 +104,19 @@ class Modality:
 
     def __post_init__(self) -> None:
         if not len(self.features) == len(self.units) == len(self.scales):
-            raise ValueError(f"modality {self.name!r}: each feature needs a unit and a scale")
+            raise InputError(f"modality {self.name!r}: each feature needs a unit and a scale")
         if self.image is not None and math.prod(self.image) != len(self.features):
-            raise ValueError(f"modality {self.name!r}: an image's features are its pixels")
+            raise InputError(f"modality {self.name!r}: an image's features are its pixels")
         if self.utterances and len(self.utterances) != len(self.items):
-            raise ValueError(
+            raise InputError(
                 f"modality {self.name!r}: each item needs a tuple of its utterances, expected "
                 f"{len(self.items)}, found {len(self.utterances)}"
             )
         grouped = sorted(place for _, places in self.groups for place in places)
         if self.groups and grouped != list(range(len(self.items))):
-            raise ValueError(f"modality {self.name!r}: each item belongs in exactly one group")
+            raise InputError(f"modality {self.name!r}: each item belongs in exactly one group")
         if len({name for name, _ in self.groups}) < len(self.groups):
-            raise ValueError(f"modality {self.name!r}: groups need different names")
+            raise InputError(f"modality {self.name!r}: groups need different names")
 
     @property
     def communicated(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.world import World, offers
 from mirror_ppl.errors import DomainError
+from mirror_ppl.randomness import forked
 from mirror_ppl.user_code import describe
 
 ROUNDS = 6
@@ -84,7 +85,7 @@ def faults_of(world: World) -> list[str]:
     if faults:
         return faults
     try:
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             for check in (_begins, _goes_on, _of_its_own, _looks):
                 faults += check(world)
                 if faults:

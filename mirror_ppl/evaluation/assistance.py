@@ -26,8 +26,9 @@ from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.evaluation.played import Played, Tally
 from mirror_ppl.evaluation.reachable_oracle import ReachableOracle
 from mirror_ppl.people import draw_starts, people_of
-from mirror_ppl.people.base import SimulatedPeople, act, derived_generator
+from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.people.recordings import Start
+from mirror_ppl.randomness import derived_generator
 
 COMMUNICATORS = (
     *PLANNERS,

@@ -13,6 +13,7 @@ import torch
 from pyro.distributions import MultivariateStudentT
 from torch import Tensor
 
+from mirror_ppl.checks import real_number, whole_number
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
 from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted
 from mirror_ppl.likelihood.view_table import ViewTable
@@ -55,9 +56,11 @@ class ImportanceOptions:
     prune_margin: float = 12.0
 
     def __post_init__(self) -> None:
-        for name, least in (("proposals", 1), ("stages", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        # Proposals are fitted to the spread of draws.
+        for name, least in (("proposals", 2), ("stages", 0)):
+            object.__setattr__(self, name, whole_number(getattr(self, name), name, least))
+        for name in ("enough", "wider", "prune_margin"):
+            object.__setattr__(self, name, real_number(getattr(self, name), name, 0))
 
 
 @torch.no_grad()

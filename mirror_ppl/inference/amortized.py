@@ -25,6 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mirror_ppl.checks import require_kind, whole_number
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, adapt, near_to
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening
 from mirror_ppl.inference.engine import Engine, Inferred, Job
@@ -54,8 +55,9 @@ class AmortizedOptions:
     refine: int = 0
 
     def __post_init__(self) -> None:
-        if self.proposals < 1:
-            raise ValueError(f"proposals must be at least 1, not {self.proposals}")
+        object.__setattr__(self, "proposals", whole_number(self.proposals, "proposals", 2))
+        object.__setattr__(self, "refine", whole_number(self.refine, "refine", 0))
+        require_kind(self.adaptation, ImportanceOptions, "adaptation")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from mirror_ppl.checks import real_number, require_kind
 from mirror_ppl.inference import amortized, importance
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
@@ -33,6 +34,12 @@ class AutomaticOptions:
     importance: ImportanceOptions = ImportanceOptions()
     enough: float = 200.0
     pareto_k: float = HIGH_PARETO_K
+
+    def __post_init__(self) -> None:
+        require_kind(self.amortized, AmortizedOptions, "amortized")
+        require_kind(self.importance, ImportanceOptions, "importance")
+        object.__setattr__(self, "enough", real_number(self.enough, "enough", 0))
+        object.__setattr__(self, "pareto_k", real_number(self.pareto_k, "pareto_k", 0))
 
 
 def infer_automatically(job: Job) -> Inferred:

@@ -22,6 +22,7 @@ from torch import Tensor
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.randomness import forked
 
 
 def dependent_sites(human: HumanModel, sites: Mapping[str, Any]) -> tuple[str, ...]:
@@ -31,7 +32,7 @@ def dependent_sites(human: HumanModel, sites: Mapping[str, Any]) -> tuple[str, .
     together with the scalar ones. So are sites without moments.
     """
     parents = dependencies(human).prior
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         nodes = sample_sites(human, 1)
     return tuple(
         name
@@ -77,7 +78,7 @@ class RelativeProposal:
         (number,) = sample_shape
         relative = self.density.sample(sample_shape)
         placed = _Placed(self, relative)
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             sample_sites(self.human, 1, number, handler=placed)
         return torch.stack([placed.place[name] for name in self.sites], -1)
 
@@ -94,7 +95,7 @@ class RelativeProposal:
             name: site(column).view(number, 1, 1)
             for (name, site), column in zip(self.sites.items(), columns, strict=True)
         }
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             nodes = sample_sites(self.human, 1, number, given)
         relative, log_scale = [], place.new_zeros(number)
         for (name, site), column in zip(self.sites.items(), columns, strict=True):

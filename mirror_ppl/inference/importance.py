@@ -19,6 +19,7 @@ from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.measured import measured_draws
 from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.randomness import forked
 from mirror_ppl.timing import stage
 
 
@@ -39,7 +40,7 @@ def infer_by_importance(
         return infer_kinds(job, models, infer_by_importance)
     first_pass = first_pass or _by_importance
     people, found, drawn = job.rounds.num_people, [], []
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         builders = person_builders(job.human, job.rounds, job.screening)
         for person in range(people):
             job.report("infer", person, people, "people")

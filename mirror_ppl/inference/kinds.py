@@ -26,6 +26,7 @@ from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior, sample_sites
 from mirror_ppl.progress import Report
+from mirror_ppl.randomness import forked
 
 LITTLE = 0.01
 """Posterior probability of a kind below which its Pareto k is ignored."""
@@ -61,7 +62,7 @@ def infer_kinds(
         # Progress counts each person once per model, so that it only increases.
         report = partial(_report, job.report, place, len(models))
         found.append(infer(replace(job, human=model, report=report)))
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         probabilities = sample_sites(job.human, 1)[KIND]["fn"].probs.flatten()
     evidences = torch.stack([_given(one.log_evidence) for one in found], -1)  # [P, K]
     errors = torch.stack([_given(one.evidence_error) for one in found], -1)

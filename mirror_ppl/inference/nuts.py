@@ -16,6 +16,7 @@ from mirror_ppl.likelihood.compiled import Compiled
 from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.randomness import forked
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def sample_nuts(
         done += 1
         report("sample", min(done, total), total, "")
 
-    with torch.random.fork_rng(devices=[]), pyro.validation_enabled(False):
+    with forked(), pyro.validation_enabled(False):
         torch.manual_seed(seed)
         kernel = NUTS(
             compiled.program,

@@ -24,6 +24,7 @@ from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites
 from mirror_ppl.models.recorded import check_rounds
+from mirror_ppl.randomness import forked
 
 AT_ONCE = AmortizedOptions(adaptation=ImportanceOptions(128, enough=64.0))
 """Settings with fewer effective draws, for a fast answer."""
@@ -79,7 +80,7 @@ class OnlinePosterior:
         self._screening = Screening() if network is None else guide_screening()
         self._builder = ViewTableBuilder(human, self._screening)
         self._sites = scalar_sites(human)
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             self._order = tuple(sample_sites(human, 1))
 
     @property
@@ -130,7 +131,7 @@ class OnlinePosterior:
                 "there was no round yet; what is known is the prior: expected one round or more"
             )
         began = monotonic()
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             torch.manual_seed(self.seed * 1_000_003 + self.rounds)
             found = self._last = self._weighted()
             drawn = found.sample(number, self._builder.grid)

@@ -38,6 +38,7 @@ from mirror_ppl.likelihood.tables import restricted
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
+from mirror_ppl.randomness import forked
 
 DEFENSIVE_SHARE = 0.1
 """Share of draws of the residual and of discrete sites from a defensive proposal near the prior.
@@ -425,7 +426,7 @@ def complete(
 
 def _policy_supports(human: HumanModel, table: ViewTable) -> dict[str, Tensor]:
     """Supports ``[n]`` of discrete sites that perception does not read."""
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         return {
             name: node["fn"].enumerate_support(expand=False).flatten()
             for name, node in sample_sites(human, 1).items()

@@ -39,6 +39,7 @@ from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.sites import sample_nodes
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.randomness import forked
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100
@@ -130,7 +131,7 @@ def continuous_guide(compiled: Compiled, without: Collection[str] = ()) -> Prior
 @contextmanager
 def own_parameters(seed: int) -> Iterator[None]:
     """Context with its own random state and parameter store."""
-    with torch.random.fork_rng(devices=[]), pyro.get_param_store().scope():
+    with forked(), pyro.get_param_store().scope():
         torch.manual_seed(seed)
         yield
 
@@ -220,7 +221,7 @@ def _refuse_scales(compiled: Compiled) -> None:
     """Refuse scales of enumerated sites: Pyro's TraceEnum_ELBO moves them out of the sum."""
     program = cast(Callable[[], None], config_enumerate(compiled.program, "parallel"))
     with (
-        torch.random.fork_rng(devices=[]),
+        forked(),
         poutine.block(),
         poutine.enum(first_available_dim=-1 - PLATES),
         poutine.trace() as trace,

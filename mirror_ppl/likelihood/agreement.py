@@ -28,10 +28,12 @@ from mirror_ppl.likelihood.densities import (
     log_prob,
     prior_nodes,
 )
+from mirror_ppl.likelihood.enumeration import conditioned
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, at_step, messages_at, recorded_covariates
 from mirror_ppl.models.prior import Draws, draw_prior
 from mirror_ppl.models.sites import latent_sites, sample_nodes
+from mirror_ppl.randomness import forked
 
 DRAWS, ROUNDS, STEPS = 6, 2, 4
 SEED = 0
@@ -115,7 +117,7 @@ def _said_by_site(
     values = human.action_values(belief)
     done = torch.zeros(people, 1, dtype=torch.long, device=like.device)
     with (
-        torch.random.fork_rng(devices=[]),
+        forked(),
         poutine.block(),
         Given(dict(draws)),
         pyro.plate("draw", number, dim=-3),
@@ -181,7 +183,7 @@ def log_densities(
     """
     found, latents = [], []
     number = len(next(iter(draws.values()), (0,)))
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         torch.manual_seed(SEED)
         for draw in range(number):
             own = {name: value[draw] for name, value in draws.items()}
@@ -224,12 +226,7 @@ def _put_together(
         if prior is None:
             prior = log_priors(human, grid, policy, 1)[:, 0].expand(number, -1)[every, every]
         total = total + prior
-    with (
-        poutine.block(),
-        poutine.condition(data=dict(draws)),
-        pyro.plate("draw", number, dim=-3),
-        pyro.plate("person", 1, dim=-2),
-    ):
+    with conditioned(draws, number, 1):
         implants = human.prior()
         if human.has_round_latents:
             values = {name: value[:, 0].T[None] for name, value in latents.items()}

@@ -31,6 +31,7 @@ from torch import Tensor
 
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.randomness import forked
 
 VALUES, KEPT = 512, 96
 """Number of sampled values of attention per round, and how many are kept given the actions."""
@@ -73,7 +74,7 @@ def attention_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of the sites of a human model's ``round_latents``, by name."""
     if not human.has_round_latents:
         return {}
-    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
+    with forked(), pyro.plate("person", 1, dim=-2):
         nodes = attention_nodes(human, human.prior())
     return {
         name: node["fn"].enumerate_support(expand=False).flatten() for name, node in nodes.items()
@@ -103,7 +104,7 @@ def site_probabilities(
     """
     number = len(next(iter(policies.values())))
     with (
-        torch.random.fork_rng(devices=[]),
+        forked(),
         poutine.block(),
         poutine.condition(data=dict(policies)),
         pyro.plate("policy", number, dim=-3),

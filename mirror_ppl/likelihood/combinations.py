@@ -26,6 +26,7 @@ from mirror_ppl.models.dependencies import Sites, dependencies
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
+from mirror_ppl.randomness import forked
 from mirror_ppl.user_code import is_of_package
 
 MAX_COMBINATIONS = 100_000
@@ -33,7 +34,7 @@ MAX_COMBINATIONS = 100_000
 
 def discrete_sites(human: HumanModel) -> dict[str, Tensor]:
     """Supports ``[n]`` of the discrete sites of a human model's prior, by name."""
-    with torch.random.fork_rng(devices=[]), pyro.plate("person", 1, dim=-2):
+    with forked(), pyro.plate("person", 1, dim=-2):
         trace = poutine.trace(human.prior).get_trace()
     sites = latent_sites(trace)
     return {

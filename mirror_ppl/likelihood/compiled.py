@@ -33,6 +33,7 @@ from mirror_ppl.models.human import ACTION, HumanModel, has_own_program
 from mirror_ppl.models.measured import with_measurements
 from mirror_ppl.models.prior import Draws, draw_prior, values_of
 from mirror_ppl.models.sites import discrete_names, latent_sites, sample_nodes
+from mirror_ppl.randomness import forked
 
 
 class Compiled(ABC):
@@ -68,7 +69,7 @@ class Compiled(ABC):
     @cached_property
     def discrete(self) -> set[str]:
         """Names of the sites that are enumerated."""
-        with torch.random.fork_rng(devices=[]), poutine.block():
+        with forked(), poutine.block():
             return discrete_names(poutine.trace(self.program).get_trace())
 
     @torch.no_grad()
@@ -260,7 +261,7 @@ class Sequential(Compiled):
     def _check(self) -> list[str]:
         """Refuse programs that cannot be inferred; returns sites outside of the plate of people."""
         kind = type(self.human).__name__
-        with torch.random.fork_rng(devices=[]), poutine.block():
+        with forked(), poutine.block():
             nodes = sample_nodes(poutine.trace(self.program).get_trace())
         expected = draw_prior(self.human, 1, 1, 0)
         latent = {name: node for name, node in nodes.items() if not node["is_observed"]}

@@ -20,6 +20,7 @@ from torch import Tensor
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models.human import ACTION, HumanModel, require_standard_program
 from mirror_ppl.models.sites import sample_nodes
+from mirror_ppl.randomness import forked
 
 BATCH = 3
 """Dimensions of draws, people and rounds; combinations of discrete values are to their left."""
@@ -130,7 +131,7 @@ def prior_nodes(
 ) -> dict[str, Any]:
     """Trace nodes of ``prior`` for ``number`` draws, given values of sites."""
     with (
-        torch.random.fork_rng(devices=[]),
+        forked(),
         poutine.block(),
         poutine.trace() as trace,
         Given(dict(given)),

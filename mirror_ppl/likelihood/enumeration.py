@@ -22,6 +22,7 @@ from mirror_ppl.likelihood.tables import combination_scores
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.randomness import forked
 
 CHUNK = 2**19
 """Views and moments, summed over draws, that are computed at once: what a cache holds."""
@@ -76,7 +77,7 @@ def log_joints(
 def conditioned(draws: Mapping[str, Tensor], number: int, people: int) -> Iterator[None]:
     """Condition the program on S draws ``[S, P, 1, ...]``; missing sites are sampled."""
     with (
-        torch.random.fork_rng(devices=[]),
+        forked(),
         poutine.block(),
         poutine.condition(data=dict(draws)),
         pyro.plate("draw", number, dim=-3),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mirror_ppl.errors import InputError
+
 
 @dataclass(frozen=True)
 class Screening:
@@ -34,4 +36,4 @@ class Screening:
             ("merge_policies", 1),
         ):
             if not getattr(self, name) >= least:
-                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+                raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")

@@ -27,6 +27,7 @@ from torch.overrides import TorchFunctionMode
 
 from mirror_ppl.models.human import ACTION, HumanModel
 from mirror_ppl.models.sites import latent_sites, latent_values, sample_nodes
+from mirror_ppl.randomness import forked
 
 Sites = frozenset[str]
 TRIED = 32
@@ -82,7 +83,7 @@ def _run(human: HumanModel) -> Dependencies:
     belief = like.new_zeros(1, 1, human.belief_size)
     values, action = human.action_values(belief), torch.zeros(1, 1, dtype=torch.long)
     with (
-        torch.random.fork_rng(devices=[]),
+        forked(),
         pyro.validation_enabled(False),
         poutine.block(),
         _Followed(),
@@ -121,7 +122,7 @@ def _changed(node: Mapping[str, Any]) -> bool:
 def _as_drawn(seed: int, given: Mapping[str, Tensor]) -> Iterator[None]:
     """Run the program for one person, with draws that depend on the seed."""
     with (
-        torch.random.fork_rng(devices=[]),
+        forked(),
         pyro.validation_enabled(False),
         poutine.block(),
         poutine.condition(data=dict(given)),
@@ -159,7 +160,7 @@ def _hidden_causes(
     Provenance may have lost them. Each site is tried at its values, with all others fixed.
     """
     like = next(human.parameters())
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         torch.manual_seed(0)
         belief = torch.randn(1, 1, human.belief_size).to(like)
     values, action = human.action_values(belief), torch.zeros(1, 1, dtype=torch.long)

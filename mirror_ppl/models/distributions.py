@@ -13,6 +13,7 @@ from pyro.distributions import Categorical, TorchDistribution
 from torch import Tensor
 from torch.distributions import Distribution, Normal, constraints
 
+from mirror_ppl.errors import InputError
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.shapes import broadcast_shapes
 
@@ -77,7 +78,7 @@ class GaussianChain(TorchDistribution):
     def expand(self, batch_shape: torch.Size, _instance: object = None) -> GaussianChain:
         """Return itself; only its own batch shape is allowed."""
         if torch.Size(batch_shape) != self.batch_shape:
-            raise ValueError("a GaussianChain has one trajectory for each of its inputs")
+            raise InputError("a GaussianChain has one trajectory for each of its inputs")
         return self
 
     def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008

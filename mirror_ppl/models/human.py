@@ -46,6 +46,7 @@ from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
 from mirror_ppl.models.view import View
 from mirror_ppl.models.world_program import first_state, next_state, reward
+from mirror_ppl.randomness import forked
 from mirror_ppl.shapes import broadcast_shapes
 
 Implants = Mapping[str, Tensor]
@@ -201,7 +202,7 @@ class HumanModel(nn.Module):
         if not overrides(self, "round_latents"):
             return False
         with (
-            torch.random.fork_rng(devices=[]),
+            forked(),
             poutine.block(),
             pyro.plate("person", 1, dim=-2),
             pyro.plate("round", 1, dim=-1),

@@ -13,6 +13,7 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
+from mirror_ppl.randomness import forked
 
 
 def require_measurable(human: HumanModel, rounds: Demonstrations) -> None:
@@ -21,7 +22,7 @@ def require_measurable(human: HumanModel, rounds: Demonstrations) -> None:
     Raises:
         InputError: they are not.
     """
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         sites = sample_sites(human, 1)
     for name, values in rounds.measurements.items():
         if name not in sites or sites[name]["fn"].event_dim:

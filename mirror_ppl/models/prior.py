@@ -17,6 +17,7 @@ from mirror_ppl.checks import as_tensor, require_kind, seed_number, whole_number
 from mirror_ppl.errors import HumanModelError, InputError, shown
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
+from mirror_ppl.randomness import forked
 
 Draws = dict[str, Tensor]
 """Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
@@ -78,7 +79,7 @@ def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
     require_kind(human, HumanModel, "human")
     people, number = whole_number(people, "people", 1), whole_number(number, "number", 1)
     seed = seed_number(seed)
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         torch.manual_seed(seed)
         return values_of(sample_sites(human, people, number))
 
@@ -93,7 +94,7 @@ def draw_prior_of_each(human: HumanModel, people: range, number: int, seed: int)
         seed: of everything random.
     """
     each = []
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         for person in people:
             torch.manual_seed(seed * 1_000_003 + person)
             each.append(values_of(sample_sites(human, 1, number)))
@@ -116,7 +117,7 @@ def checked_draws(human: HumanModel, draws: Any, people: int) -> Draws:
     """
     if not isinstance(draws, Mapping):
         raise InputError(f"draws must be a dict of arrays by site, not {shown(draws)}")
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         sites = sample_sites(human, people)
     if missing := [name for name in sites if name not in draws]:
         raise HumanModelError(f"there are no draws of the site {', '.join(missing)}")
@@ -171,7 +172,7 @@ def _possible(support: Constraint, value: Tensor) -> Tensor:
 
 def scalar_sites(human: HumanModel) -> dict[str, Any]:
     """Return the continuous scalar sites, each with its transform from unconstrained space."""
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         return {
             name: biject_to(node["fn"].support)
             for name, node in sample_sites(human, 1).items()

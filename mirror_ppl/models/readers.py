@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from mirror_ppl.errors import InputError
 from mirror_ppl.models.sizes import Sizes
 
 KERNEL = 3
@@ -149,11 +150,11 @@ def image_patches(image: tuple[int, int, int], stride: int) -> tuple[Tensor, int
         Indices of pixels ``[places, 3 * 3 * colours]``, and the number of pixels per place.
 
     Raises:
-        ValueError: the kernel does not cover the image evenly.
+        InputError: the kernel does not cover the image evenly.
     """
     rows, columns, colours = image
     if (rows - KERNEL) % stride or (columns - KERNEL) % stride or min(rows, columns) < KERNEL:
-        raise ValueError(f"kernels of {KERNEL} at stride {stride} do not cover {rows} x {columns}")
+        raise InputError(f"kernels of {KERNEL} at stride {stride} do not cover {rows} x {columns}")
     numbers = torch.arange(rows * columns * colours).view(image)
     places = numbers.unfold(0, KERNEL, stride).unfold(1, KERNEL, stride)
     places = places.movedim(2, -1).flatten(2).flatten(0, 1)

@@ -25,6 +25,7 @@ from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.implants import in_units
 from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.randomness import forked
 from mirror_ppl.version import __version__
 
 PRIOR_OF = "prior of "
@@ -87,7 +88,7 @@ def play_rounds(
     own = torch.Generator(device)
     own.set_state(generator.get_state())
     seed = int(torch.randint(2**31, (), generator=own, device=device))
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         torch.manual_seed(seed)
         with poutine.condition(data=dict(implants)), pyro.plate("person", people, dim=-2):
             drawn = human.prior()
@@ -95,7 +96,7 @@ def play_rounds(
         under_way &= ~domain.over(state)
         lengths += under_way
         heard.append(_told(domain, observed[-1], under_way, told, generator))
-        with torch.random.fork_rng(devices=[]), pyro.plate("person", people, dim=-2):
+        with forked(), pyro.plate("person", people, dim=-2):
             latents = _round_latents(human, drawn, observed, seed + 1) if varies else {}
             last = actions[..., step - 1] if step else actions.new_full((), len(domain.actions))
             beliefs = beliefs.after(

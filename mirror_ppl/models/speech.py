@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from mirror_ppl.domains.base import Modality
 from mirror_ppl.errors import AssetError
+from mirror_ppl.randomness import forked
 
 Embedding = Callable[[Sequence[str]], Tensor]
 """Maps N sentences to vectors ``[N, D]``."""
@@ -112,7 +113,7 @@ def compress(vectors: Tensor, code: int, seed: int = 0) -> Autoencoder:
         code: dimensions C of the code.
         seed: of its initial weights.
     """
-    with torch.random.fork_rng(devices=[]), torch.enable_grad():
+    with forked(), torch.enable_grad():
         torch.manual_seed(seed)
         network = Autoencoder(vectors.shape[-1], code)
         optimizer = torch.optim.Adam(network.parameters(), 0.01)

@@ -10,7 +10,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
@@ -22,6 +21,7 @@ from mirror_ppl.errors import AssetError, MirrorError, StaleSelfModel
 from mirror_ppl.files import json_text, read_whole, write_whole
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
+from mirror_ppl.randomness import forked
 
 FORMAT = "mirror_ppl self-model 1"
 CHECKSUM = "checksum"
@@ -162,7 +162,7 @@ def load_self_model(path: Path, domain: str | None = None) -> tuple[SelfModel, d
                 stacklevel=2,
             )
         sizes = Sizes(**json.loads(metadata["sizes"])) if "sizes" in metadata else None
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             self_model = SelfModel(world, sizes, embedding=None)
         self_model.load_state_dict(tensors)
         card = json.loads(metadata["card"])

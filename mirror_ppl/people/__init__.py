@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 
 from mirror_ppl.checks import real_number, seed_number, whole_number
-from mirror_ppl.console import usable_device
 from mirror_ppl.data.demonstrations import Demonstrations
+from mirror_ppl.devices import usable_device
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import require_known
 from mirror_ppl.models.weights import load_self_model, shipped_weights

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -193,16 +192,3 @@ def act(probability: Tensor, action_noise: Tensor) -> Tensor:
 def each(value: Tensor, dimensions: int) -> Tensor:
     """Insert dimensions after the first, so that people broadcast over later dimensions."""
     return value.reshape(value.shape[0], *[1] * dimensions, *value.shape[1:])
-
-
-def derived_generator(
-    seed: int, *purpose: str | int, device: torch.device | str = "cpu"
-) -> torch.Generator:
-    """Return a separate generator for each seed and purpose.
-
-    Seeds are hashed rather than added, so that neighbouring seeds are independent.
-    """
-    text = "/".join(map(str, (seed, *purpose)))
-    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
-    # Torch's seeds are signed.
-    return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)

@@ -12,8 +12,9 @@ from torch import Tensor
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, total_reward
 from mirror_ppl.domains.registry import get_domain
-from mirror_ppl.people.base import SimulatedPeople, act, derived_generator
+from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.progress import Progress
+from mirror_ppl.randomness import derived_generator
 from mirror_ppl.version import __version__
 
 

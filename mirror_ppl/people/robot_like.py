@@ -30,7 +30,8 @@ from mirror_ppl.models.implants import (
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import fingerprint
-from mirror_ppl.people.base import SimulatedPeople, derived_generator
+from mirror_ppl.people.base import SimulatedPeople
+from mirror_ppl.randomness import derived_generator
 
 SELF_MODEL = "self_model"
 """Key in recordings' provenance of the fingerprint of the people's self-model."""

@@ -15,6 +15,7 @@ from mirror_ppl.communication.communicator import Decision, gain_over_silence
 from mirror_ppl.communication.messages import Channels, Message
 from mirror_ppl.communication.search import Found
 from mirror_ppl.domains.base import require_known
+from mirror_ppl.errors import InputError
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.reading import BLACK, BLUE, GREY
 
@@ -39,10 +40,10 @@ def plot_utilities(decision: Decision, most: int = MOST) -> Picture:
         most: most candidates that are drawn, at least 2.
 
     Raises:
-        ValueError: the decision has no candidates to choose from, or ``most`` is below 2.
+        InputError: the decision has no candidates to choose from, or ``most`` is below 2.
     """
     if most < 2:  # noqa: PLR2004 - silence and the chosen one
-        raise ValueError(f"at least 2 candidates have to be drawn, not {most}")
+        raise InputError(f"at least 2 candidates have to be drawn, not {most}")
     found = _found(decision)
     gains = [gain_over_silence(found.valued, index) for index in range(len(found.candidates))]
     order = sorted(range(len(gains)), key=lambda index: -gains[index].mean)
@@ -146,12 +147,12 @@ def plot_action(decision: Decision, action: str = "switch") -> Picture:
 
     Raises:
         UnknownNameError: there is no such action.
-        ValueError: the decision has no candidates, or the objective predicts no actions.
+        InputError: the decision has no candidates, or the objective predicts no actions.
     """
     found, actions = _found(decision), decision.domain.actions
     number = actions.index(require_known(action, "action", actions))
     if found.valued.actions is None:
-        raise ValueError("the objective of this decision predicts no actions")
+        raise InputError("the objective of this decision predicts no actions")
     probabilities = found.valued.actions / found.valued.actions.sum(-1, keepdim=True)
     name = candidate_name(Channels(decision.domain), found.candidates[decision.chosen])
     lines = [(0, "silence", GREY, "s", "--")]
@@ -196,5 +197,5 @@ def in_words(message: Message) -> str:
 
 def _found(decision: Decision) -> Found:
     if decision.found is None:
-        raise ValueError("there was nothing to choose from in this decision")
+        raise InputError("there was nothing to choose from in this decision")
     return decision.found

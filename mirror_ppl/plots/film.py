@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mirror_ppl.domains.base import Domain
+from mirror_ppl.errors import InputError
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLUE, GREY
 
@@ -71,10 +72,10 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
         frames: most frames of each communicator, at least 2.
 
     Raises:
-        ValueError: there are fewer than 2 frames.
+        InputError: there are fewer than 2 frames.
     """
     if frames < 2:  # noqa: PLR2004 - one where rounds differ, and the last
-        raise ValueError(f"a film has at least 2 frames, not {frames}")
+        raise InputError(f"a film has at least 2 frames, not {frames}")
     steps = _steps(film, frames)
     height, width = np.asarray(film.domain.render(film.strips[0].states[0])).shape[:2]
     side_by_side = width > WIDE * height

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.errors import InputError
 from mirror_ppl.inference.amortized import log_evidence
 from mirror_ppl.inference.amortized_guide import (
     DROPOUT,
@@ -43,6 +44,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import sample_sites, scalar_sites, unconstrained
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.randomness import forked
 from mirror_ppl.training.guide_elbo import ELBOTraining, Group, simulated_groups
 
 
@@ -78,11 +80,11 @@ class GuideOptions:
         least_of = {"people": 10, "steps": 1, "elbo_steps": 0, "batch": 1, "together": 1}
         for name, least in least_of.items():
             if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+                raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
         if not 0 <= self.dropout < 1:
-            raise ValueError(f"dropout must be at least 0 and below 1, not {self.dropout}")
+            raise InputError(f"dropout must be at least 0 and below 1, not {self.dropout}")
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
-            raise ValueError(f"rounds must be positive and increase, not {self.rounds}")
+            raise InputError(f"rounds must be positive and increase, not {self.rounds}")
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ def train_guide(
     require_compilable(human)
     require_acting_on_beliefs(human, perceived_sites(human))
     examples = simulate_examples(human, options, seed, report, checkpoint)
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed * 1_000_003 + options.people)
         groups = simulated_groups(human, options.rounds, generator)
@@ -260,7 +262,7 @@ def _prior_loss(human: HumanModel, examples: Examples, learned: int) -> float:
         for column, (name, site) in enumerate(scalar_sites(human).items())
     }
     number = len(examples) - learned
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         nodes = sample_sites(human, 1, number, given)
     total = sum(nodes[name]["fn"].log_prob(value).sum() for name, value in given.items())
     return -float(total) / number

@@ -9,6 +9,7 @@ from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.record import settings_of
 from mirror_ppl.domains.registry import get_domain
 from mirror_ppl.domains.world import World, offers
+from mirror_ppl.errors import InputError
 from mirror_ppl.training.views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES, KINDS
 
 
@@ -99,21 +100,21 @@ class SelfModelOptions:
     def __post_init__(self) -> None:
         for name in ("phases", "rounds", "steps", "batch", "stride"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 < self.learning_rate <= 1:
-            raise ValueError(
+            raise InputError(
                 f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
             )
         if self.window < 0 or self.length < 0:
-            raise ValueError("window and length must not be negative")
+            raise InputError("window and length must not be negative")
         if self.distil and self.exact:
-            raise ValueError("distil and exact are two ways to learn a planner's values")
+            raise InputError("distil and exact are two ways to learn a planner's values")
         if self.choice_weight and not self.distil:
-            raise ValueError("choice_weight needs distil: choices are those at a planner's values")
+            raise InputError("choice_weight needs distil: choices are those at a planner's values")
         if self.distil and not self.window:
-            raise ValueError("distil needs a window: values are kept with the states of rounds")
+            raise InputError("distil needs a window: values are kept with the states of rounds")
         if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:
-            raise ValueError(
+            raise InputError(
                 f"kinds must be {len(KINDS)} numbers, not negative and not all 0, not {self.kinds}"
             )
         for name in (
@@ -126,21 +127,21 @@ class SelfModelOptions:
             "assumed",
         ):
             if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+                raise InputError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
 
 
 def require_fitting(domain: Domain, options: SelfModelOptions) -> None:
     """Refuse options that do not fit a world.
 
     Raises:
-        ValueError: a window is longer than rounds, or ends where nothing is known to follow; or
+        InputError: a window is longer than rounds, or ends where nothing is known to follow; or
             assumptions are to be learned that the world does not work out.
     """
     rounds = options.length or domain.horizon
     if options.window > rounds:
-        raise ValueError(f"window is {options.window}, longer than rounds of {rounds} steps")
+        raise InputError(f"window is {options.window}, longer than rounds of {rounds} steps")
     if options.window and domain.over_at_horizon and not options.distil:
-        raise ValueError(f"with a window, values of {domain.name} can only be distilled")
+        raise InputError(f"with a window, values of {domain.name} can only be distilled")
     works_out = not isinstance(domain, World) or offers(domain, "supposed")
     if options.assumed and domain.assumptions and not works_out:
-        raise ValueError(f"assumed must be 0, as {domain.name} has no supposed()")
+        raise InputError(f"assumed must be 0, as {domain.name} has no supposed()")

@@ -17,13 +17,13 @@ from mirror_ppl.domains.driving.populations import (
     REACHES_AHEAD,
     REACHES_BEHIND,
     consistencies,
-    derived_generator,
     reaches,
 )
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.people import populations_of, simulate
 from mirror_ppl.people.recordings import draw_starts, record
+from mirror_ppl.randomness import derived_generator
 
 DOMAIN = Driving()
 

@@ -269,6 +269,7 @@ class BombDefusalHuman(HumanModel, WorldKnowledge):
             demonstrations: rounds with rewards; without rewards nothing is learned.
         """
         if demonstrations.rewards is None:
+            self.rule_logits.copy_(self._prior_of_rules())
             return
         observation = demonstrations.observation()
         steps = demonstrations.shape[2]

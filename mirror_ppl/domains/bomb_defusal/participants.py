@@ -15,8 +15,9 @@ from mirror_ppl.domains.base import require_known
 from mirror_ppl.domains.bomb_defusal.panel import STAGES, TERMINALS, read_panel
 from mirror_ppl.domains.bomb_defusal.people import SimulatedDefusers
 from mirror_ppl.domains.bomb_defusal.world import WAIT, BombDefusal
-from mirror_ppl.people.base import DomainPeople, derived_generator
+from mirror_ppl.people.base import DomainPeople
 from mirror_ppl.people.recordings import Recording, draw_starts, record
+from mirror_ppl.randomness import derived_generator
 
 PARTICIPANT_ROUNDS = 36
 """Number of rounds of a participant."""

@@ -15,8 +15,9 @@ from mirror_ppl.domains.driving.oracle import Oracle
 from mirror_ppl.domains.driving.people import DISCOUNT, HORIZON, PlanningDrivers, TaskDrivers
 from mirror_ppl.domains.driving.populations import POPULATIONS, consistencies, reaches
 from mirror_ppl.domains.driving.world import Driving
-from mirror_ppl.people.base import DomainPeople, derived_generator
+from mirror_ppl.people.base import DomainPeople
 from mirror_ppl.people.recordings import Recording, draw_starts, record
+from mirror_ppl.randomness import derived_generator
 
 PARTICIPANTS = 10
 """Number of ground-truth people from whom the reward is learned."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from mirror_ppl.domains.base import require_known
 from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.domains.driving.world import FOG_REACH, Driving
-from mirror_ppl.people.base import derived_generator
+from mirror_ppl.randomness import derived_generator
 
 CONSISTENCY_MEDIAN = 3.0
 """Median over people of the consistency, in 1 / units of reward."""

@@ -21,6 +21,7 @@ from mirror_ppl.domains.driving.cars import CAR_LANES, CARS, DrivingState
 from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.domains.driving.people import Memory
 from mirror_ppl.domains.driving.road import DARK_TO_LIGHT, DISTANCES, draw_car, draw_road
+from mirror_ppl.errors import InputError
 from mirror_ppl.models.belief_tracking import BeliefState
 from mirror_ppl.plots.communication import WORDS, in_words
 from mirror_ppl.plots.picture import Picture
@@ -116,14 +117,14 @@ def plot_frames(
         cells: number of cells drawn ahead and behind.
 
     Raises:
-        ValueError: there are no rounds or steps, or a round does not have all of these steps.
+        InputError: there are no rounds or steps, or a round does not have all of these steps.
     """
     if not rounds or not steps:
-        raise ValueError("there has to be a round, and a step, to draw")
+        raise InputError("there has to be a round, and a step, to draw")
     for title, past in rounds.items():
         for step in steps:
             if not 0 <= step <= past.time:
-                raise ValueError(f'there is no step {step} in "{title}", which has {past.time}')
+                raise InputError(f'there is no step {step} in "{title}", which has {past.time}')
     size = (0.5 + 4.75 * len(rounds), 1.85 * len(steps) + 1.6)
     figure = Picture(figsize=size, layout="constrained")
     # Roads and knowledge have equal size; around the roads there is room for messages.

@@ -11,7 +11,8 @@ from mirror_ppl.domains.highway import expert
 from mirror_ppl.domains.highway.lidar import RANGE
 from mirror_ppl.domains.highway.people import HighwayDrivers
 from mirror_ppl.domains.highway.world import FOG_AHEAD, FOG_BEHIND, Highway
-from mirror_ppl.people.base import DomainPeople, derived_generator
+from mirror_ppl.people.base import DomainPeople
+from mirror_ppl.randomness import derived_generator
 
 CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 1.0, 0.35
 """Median over drivers of the consistency, and spread of its logarithm."""

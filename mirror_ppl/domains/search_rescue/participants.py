@@ -25,8 +25,9 @@ from mirror_ppl.domains.search_rescue.people import (
     subgoal_distances,
 )
 from mirror_ppl.domains.search_rescue.world import SMOKE_REACH, SearchRescue
-from mirror_ppl.people.base import DomainPeople, derived_generator
+from mirror_ppl.people.base import DomainPeople
 from mirror_ppl.people.recordings import Recording, draw_starts, record
+from mirror_ppl.randomness import derived_generator
 
 PARTICIPANT_ROUNDS = 36
 """Number of rounds of a participant in each setting."""

@@ -20,7 +20,7 @@ import pandas as pd
 import xarray as xr
 from scipy.stats import entropy
 
-from mirror_ppl.errors import PosteriorError
+from mirror_ppl.errors import InputError, PosteriorError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.calibration.uniformity import ecdf_p_value, histogram_p_value
 from mirror_ppl.inference.sampler import HIGH_PARETO_K
@@ -52,7 +52,7 @@ class Calibration:
             of rounds.
 
     Raises:
-        ValueError: the failure rate is no probability.
+        InputError: the failure rate is no probability.
     """
 
     data: xr.Dataset
@@ -60,7 +60,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         if not 0 < self.failure_rate < 1:
-            raise ValueError(f"failure_rate must be between 0 and 1, not {self.failure_rate}")
+            raise InputError(f"failure_rate must be between 0 and 1, not {self.failure_rate}")
 
     @property
     def people(self) -> int:
@@ -209,11 +209,11 @@ def judge(
         dimension ``person`` only.
 
     Raises:
-        ValueError: there are no draws, or their number differs between sites.
+        InputError: there are no draws, or their number differs between sites.
     """
     sizes = {len(draws[site]) for site in truth}
     if len(sizes) != 1 or 0 in sizes:
-        raise ValueError(f"expected as many draws of each site, and some, not {sorted(sizes)}")
+        raise InputError(f"expected as many draws of each site, and some, not {sorted(sizes)}")
     measured = []
     for site, true in truth.items():
         own = draws[site]
@@ -241,7 +241,7 @@ def join_rounds(judged: Mapping[int, xr.Dataset]) -> xr.Dataset:
     """Join results for the same people after several numbers of rounds along ``rounds``.
 
     Raises:
-        ValueError: numbers of draws differ.
+        InputError: numbers of draws differ.
     """
     return _joined(list(judged.values()), pd.Index(list(judged), name="rounds"))
 
@@ -266,7 +266,7 @@ def collect(
         prior probability of the truth.
 
     Raises:
-        ValueError: numbers of draws differ.
+        InputError: numbers of draws differ.
     """
     data = _joined(parts, "person").transpose("site", "rounds", "person")
     data["truth"] = data["truth"].isel(rounds=0, drop=True)
@@ -280,7 +280,7 @@ def collect(
 def _joined(parts: Sequence[xr.Dataset], dimension: str | pd.Index) -> xr.Dataset:
     sizes = {part.attrs["draws"] for part in parts}
     if len(sizes) != 1:
-        raise ValueError(f"expected as many draws every time, not {sorted(sizes)}")
+        raise InputError(f"expected as many draws every time, not {sorted(sizes)}")
     return xr.concat(parts, dimension, **EXACTLY)
 
 

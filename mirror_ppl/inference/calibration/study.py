@@ -29,7 +29,7 @@ from torch import Tensor
 from mirror_ppl.checks import whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import require_known
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference.calibration.ranks import Calibration, collect, join_rounds, judge
 from mirror_ppl.inference.engines import Inferred
 from mirror_ppl.jobs import DatasetFormat, Runner
@@ -39,6 +39,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.randomness import forked
 from mirror_ppl.version import __version__
 
 PRIOR_PEOPLE = 4000
@@ -67,7 +68,7 @@ class CalibrationOptions:
             dimensions. A summary that returns integers or booleans is discrete.
 
     Raises:
-        ValueError: there are no people, no rounds, or rounds that do not increase.
+        InputError: there are no people, no rounds, or rounds that do not increase.
     """
 
     people: int = 500
@@ -79,7 +80,7 @@ class CalibrationOptions:
         for name in ("people", "batch"):
             object.__setattr__(self, name, whole_number(getattr(self, name), name, 1))
         if not self.rounds or sorted({0, *self.rounds}) != [0, *self.rounds]:
-            raise ValueError(f"rounds must be positive and increase, not {self.rounds}")
+            raise InputError(f"rounds must be positive and increase, not {self.rounds}")
 
 
 @torch.no_grad()
@@ -92,10 +93,10 @@ def prior_people(human: HumanModel, people: int, generator: torch.Generator) -> 
         generator: source of randomness.
 
     Raises:
-        ValueError: the number of people is below 1.
+        InputError: the number of people is below 1.
     """
     if people < 1:
-        raise ValueError(f"people must be at least 1, not {people}")
+        raise InputError(f"people must be at least 1, not {people}")
     parts = []
     for begin in range(0, people, PEOPLE_AT_ONCE):
         sites = _prior_sites(human, min(PEOPLE_AT_ONCE, people - begin), _seed(generator))
@@ -141,7 +142,7 @@ def calibrate(
 
     Raises:
         UnknownNameError: there is no such setting.
-        ValueError: ``infer`` or a summary returned invalid values.
+        InputError: ``infer`` or a summary returned invalid values.
         HumanModelError: a method has a factor, an observed site, a scale or a mask; or the model
             has a power of the likelihood.
     """
@@ -246,7 +247,7 @@ def _seed(generator: torch.Generator) -> int:
 
 def _prior_sites(human: HumanModel, people: int, seed: int) -> dict[str, Any]:
     """Trace nodes of all sites, sampled for P people."""
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         torch.manual_seed(seed)
         return sample_sites(human, people)
 
@@ -260,7 +261,7 @@ class _Scalars:
 
     def __post_init__(self) -> None:
         for name in set(self.sites) & set(self.summaries):
-            raise ValueError(f'the summary "{name}" has the name of a site')
+            raise InputError(f'the summary "{name}" has the name of a site')
 
     def of(
         self, draws: Mapping[str, Tensor], shape: tuple[int, ...], source: str
@@ -268,19 +269,19 @@ class _Scalars:
         """Scalars by name, of this shape ``[..., P]``, from draws ``[..., P, 1, ...]``.
 
         Raises:
-            ValueError: a site is missing, of another shape or not finite.
+            InputError: a site is missing, of another shape or not finite.
         """
         result = {}
         for name in (*self.sites, *self.summaries):
             try:
                 value = self.summaries[name](draws) if name in self.summaries else draws[name]
             except KeyError as error:
-                raise ValueError(f"{source}: there are no draws of {error}") from error
+                raise InputError(f"{source}: there are no draws of {error}") from error
             if tuple(value.shape) != (*shape, 1):
-                raise ValueError(
+                raise InputError(
                     f"{source}: {name} has shape {tuple(value.shape)}, expected {(*shape, 1)}"
                 )
             if not value.isfinite().all():
-                raise ValueError(f"{source}: {name} has values that are not finite numbers")
+                raise InputError(f"{source}: {name} has values that are not finite numbers")
             result[name] = value.detach().squeeze(-1).double().cpu().numpy()
         return result

@@ -45,6 +45,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
 from mirror_ppl.models.world_knowledge import world_sites
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.randomness import forked
 
 POOLINGS = ("none", "partial")
 MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
@@ -111,7 +112,7 @@ class Pooling:
     def __init__(self, human: HumanModel) -> None:
         self.human = human
         parents = dependencies(human).prior
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             torch.manual_seed(0)
             nodes = sample_sites(human, 1, PRIOR_DRAWS)
         nodes = {
@@ -244,7 +245,7 @@ class Pooling:
         """
         known, place, log_prior = self.read(draws)
         effective, chosen = [], []
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             torch.manual_seed(seed)
             for index in range(len(population)):
                 probabilities, mean, spread = (
@@ -268,7 +269,7 @@ class Pooling:
         several candidates by the density that they add.
         """
         number, tries = len(population), CANDIDATES if adds_to_prior(self.human) else 1
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             torch.manual_seed(seed)
             given: Draws = {}
             for name, support in self.supports.items():

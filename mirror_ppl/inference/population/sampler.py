@@ -26,6 +26,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Dirichlet, Normal
 
+from mirror_ppl.randomness import forked
+
 WARMUP = 300
 """Discarded sweeps."""
 THIN = 5
@@ -100,7 +102,7 @@ def sample_population(
     everybody = torch.arange(len(place), device=place.device)
     kept: list[tuple[dict[str, Tensor], Tensor, Tensor]] = []
     total = WARMUP + THIN * number
-    with torch.random.fork_rng(devices=[]):
+    with forked():
         torch.manual_seed(seed)
         weights = torch.ones_like(log_prior)
         for sweep in range(total):

@@ -22,15 +22,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import pyro
 import torch
-from pyro import poutine
 from torch import Tensor
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.likelihood.combinations import perceived_sites
-from mirror_ppl.likelihood.enumeration import acts_on_beliefs, combination_values, log_joints
+from mirror_ppl.likelihood.enumeration import (
+    acts_on_beliefs,
+    combination_values,
+    conditioned,
+    log_joints,
+)
 from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
@@ -278,12 +281,7 @@ def _information(
     builder = ViewTableBuilder(human, None, candidates, policy, VALUES)
     builder.add(Rounds.joined([rounds_of(played, player) for player in range(len(players))]))
     table = builder.table()
-    with (
-        poutine.block(),
-        poutine.condition(data=dict(policy)),
-        pyro.plate("draw", len(pairs), dim=-3),
-        pyro.plate("person", 1, dim=-2),
-    ):
+    with conditioned(policy, len(pairs), 1):
         likelihood = log_likelihoods(human, human.prior(), table)
     likelihood = likelihood.expand(len(pairs), 1, -1)[:, 0]  # [S, U]
     joint = likelihood[:, table.index[0][:, candidates]] + pairs[:, None]  # [S, R, C]

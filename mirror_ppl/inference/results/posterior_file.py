@@ -21,6 +21,7 @@ from mirror_ppl.models.loading import model_name
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.netcdf import read_netcdf
+from mirror_ppl.randomness import forked
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class PosteriorFile:
                 f"{self.path}: holds {held} draws, not {number}: ask for {held} or fewer"
             )
         chosen = np.linspace(0, held - 1, number).round().astype(int)
-        with torch.random.fork_rng(devices=[]):
+        with forked():
             nodes = sample_sites(human, len(self.people))
         device = next(human.parameters()).device
         domain, draws = human.domain, {}

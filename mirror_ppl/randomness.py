@@ -1,0 +1,30 @@
+"""Random states: generators by purpose, and blocks that leave the global state as it was."""
+
+from __future__ import annotations
+
+import hashlib
+from contextlib import AbstractContextManager
+
+import torch
+
+
+def derived_generator(
+    seed: int, *purpose: str | int, device: torch.device | str = "cpu"
+) -> torch.Generator:
+    """Return a separate generator for each seed and purpose.
+
+    Seeds are hashed rather than added, so that neighbouring seeds are independent.
+    """
+    text = "/".join(map(str, (seed, *purpose)))
+    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
+    # Torch's seeds are signed.
+    return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
+
+
+def forked() -> AbstractContextManager[None]:
+    """Return a context that restores the global random state of all devices at its end.
+
+    `torch.manual_seed` seeds graphics processors, too; they are included once they are in use.
+    """
+    used = torch.cuda.is_initialized()
+    return torch.random.fork_rng(devices=range(torch.cuda.device_count()) if used else [])
