@@ -65,8 +65,8 @@ class Options:
     horizon: int | None = None
     """Steps that planners look ahead; 10 in driving, 16 in search_rescue and 12 in bomb_defusal
     unless given. In highway mirror values the next action alone, without looking ahead."""
-    discount: float = 1.0
-    """Worth of a reward one step later, from above 0 to 1."""
+    discount: float | None = None
+    """Worth of a reward one step later, from above 0 to 1; 1 unless given."""
     min_standard_errors: float | None = None
     """How many standard errors of its gain a message has to gain to be sent; 0 is enough for the
     best on average. 2 in driving and highway, 1 in search_rescue and 0 in bomb_defusal unless
@@ -76,13 +76,14 @@ class Options:
     enumerate_above: float | None = None
     """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
     course a draw; 0.1 in driving and 0.4 in search_rescue and bomb_defusal unless given."""
-    hears: float = 0.9
+    hears: float | None = None
     """Prior probability that messages of a channel reach a person; updated by what they do after
-    messages. 1 assumes that all messages reach them."""
-    kl_weight: float = 1.0
-    """Units of reward that mirror-kl gives for a nat."""
-    kl_measure: str = "kl"
-    """What mirror-kl measures: kl, or squared (the distance of means of the released code)."""
+    messages. 1 assumes that all messages reach them; 0.9 unless given."""
+    kl_weight: float | None = None
+    """Units of reward that mirror-kl gives for a nat; 1 unless given."""
+    kl_measure: str | None = None
+    """What mirror-kl measures: kl (unless given), or squared (the distance of means of the
+    released code)."""
     json: Path | None = None
     """Write the results as data; the folder is made if it is not there."""
     log: Path | None = None
@@ -109,7 +110,7 @@ class Options:
     def __post_init__(self) -> None:
         check_numbers(self, "rounds", "people", "draws", "horizon", "patience", jobs=1)
         check_numbers(self, "seed", "people_seed")
-        if not 0 < self.discount <= 1:
+        if self.discount is not None and not 0 < self.discount <= 1:
             raise OptionError(f"--discount must be above 0 and at most 1, not {self.discount}")
         if self.enumerate_above is not None and not 0 <= self.enumerate_above <= 1:
             raise OptionError(f"--enumerate-above must be from 0 to 1, not {self.enumerate_above}")
@@ -117,12 +118,12 @@ class Options:
             raise OptionError(
                 f"--min-standard-errors must be at least 0, not {self.min_standard_errors}"
             )
-        if not 0 < self.hears <= 1:
+        if self.hears is not None and not 0 < self.hears <= 1:
             raise OptionError(f"--hears must be above 0 and at most 1, not {self.hears}")
-        if not 0 < self.kl_weight < math.inf:
+        if self.kl_weight is not None and not 0 < self.kl_weight < math.inf:
             raise OptionError(f"--kl-weight must be a positive number, not {self.kl_weight}")
         check_picture(self.film, "--film")
-        if self.kl_measure not in ("kl", "squared"):
+        if self.kl_measure not in (None, "kl", "squared"):
             raise OptionError(f'--kl-measure must be kl or squared, not "{self.kl_measure}"')
 
 

@@ -1,5 +1,6 @@
 """`python -m mirror_ppl.train`: train a self-model or a guide."""
 
+import math
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -250,5 +251,6 @@ def _show(card: dict) -> None:
     table.add_column(card.get("measured", "measured on 4000 rounds"))
     table.add_column("value", justify="right")
     for name, value in card["quality"].items():
-        table.add_row(name.replace("_", " "), f"{value:.3f}")
+        shown = "-" if value is None or math.isnan(value) else f"{value:.3f}"
+        table.add_row(name.replace("_", " "), shown)
     Console().print(table)

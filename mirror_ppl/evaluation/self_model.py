@@ -137,7 +137,7 @@ def self_model_quality(
             own = drive(self_model, start, plan, steps, generator)
             reached = float(returns(domain, start, own).mean())
             report[f"return_{name}"] = reached
-            if best is not None:
+            if best is not None and best != worst:  # in some worlds actions do not matter
                 report[f"share_{name}"] = (reached - worst) / (best - worst)
             if name == "full" and domain is not self_model.domain:
                 real = self_model.domain
