@@ -7,6 +7,7 @@ is consistent for every proposal, given enough draws (:mod:`mirror_ppl.inference
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,7 @@ from pyro.distributions import MultivariateStudentT
 from torch import Tensor
 
 from mirror_ppl.checks import real_number, whole_number
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
 from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted
 from mirror_ppl.likelihood.view_table import ViewTable
@@ -107,6 +109,11 @@ def adapt(sampler: Sampler, options: ImportanceOptions) -> Weighted:
     """
     for stage in range(options.stages if sampler.sites or sampler.supports else 0):
         found = sampler.weighted()
+        if math.isnan(found.effective):
+            raise HumanModelError(
+                "the recorded actions have probability 0 under all draws of the implants: act() "
+                "has to give every recorded action some probability, as lapses do"
+            )
         if found.effective >= options.enough:
             return found
         few = found.effective <= FEW
@@ -142,5 +149,10 @@ def _heavy_tailed(place: Tensor, log_weights: Tensor, wider: float) -> Multivari
     covariance = wider * (weights * centred).T @ centred
     # Where few draws have all the weight, their spread is not informative.
     floor = 1e-3 * place.var(0) + 1e-8
+    if not bool(covariance.isfinite().all()):
+        raise HumanModelError(
+            "draws of the implants have no finite variance: priors with heavy tails, such as a "
+            "StudentT with few degrees of freedom, need a transformation, such as dist.LogNormal"
+        )
     spread = torch.linalg.cholesky(covariance + torch.diag(floor))
     return MultivariateStudentT(place.new_tensor(TAILS), mean, spread)

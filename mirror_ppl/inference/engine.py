@@ -15,6 +15,7 @@ from mirror_ppl.inference.workers import People, Workers
 from mirror_ppl.likelihood.densities import BATCH
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models.human import HumanModel
+from mirror_ppl.models.implants import RESIDUAL
 from mirror_ppl.progress import Report, silent
 
 if TYPE_CHECKING:
@@ -56,13 +57,13 @@ class Inferred:
 
 
 def narrowed(draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Store weights in draws ``[S, P, 1, ...]`` with eight significant bits.
+    """Store the residual's weights in draws ``[S, P, 1, ...]`` with eight significant bits.
 
-    Weights are sites of more than one number per person. Their further bits are negligible against
-    the spread of the posterior, and take two thirds of a file.
+    They are of the size of their spread, so that further bits are negligible, and would take two
+    thirds of a file.
     """
     return {
-        name: value.bfloat16() if value.is_floating_point() and value.dim() > BATCH else value
+        name: value.bfloat16() if name in RESIDUAL and value.dim() > BATCH else value
         for name, value in draws.items()
     }
 

@@ -34,8 +34,15 @@ LITTLE = 0.01
 
 def models_by_kind(human: HumanModel) -> dict[str, HumanModel]:
     """Human models of the kinds of people; empty if a subclass or instance changes the model."""
-    if not isinstance(human, OneOfKinds) or "members" not in vars(type(human)):
+    kind = type(human)
+    if not isinstance(human, OneOfKinds) or "members" not in vars(kind):
         return {}
+    # What the mixture overrides beside its members, they do not have.
+    known = {OneOfKinds, *(base for member in human.members.values() for base in member.__mro__)}
+    for own in set(kind.__mro__) - known:
+        changed = {name for name in vars(own) if not name.startswith("_")} - {"members"}
+        if changed or not issubclass(own, OneOfKinds):
+            return {}
     if any(callable(getattr(type(human), name, None)) for name in vars(human)):
         return {}
     found = {}

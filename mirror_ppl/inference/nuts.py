@@ -12,6 +12,7 @@ from pyro.infer.autoguide import init_to_median
 from mirror_ppl.checks import whole_number
 from mirror_ppl.inference.batches import in_batches
 from mirror_ppl.inference.engine import Engine, Inferred, Job
+from mirror_ppl.inference.svi import refuse_scales
 from mirror_ppl.likelihood.compiled import Compiled
 from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.models.prior import Draws, sample_sites
@@ -57,6 +58,7 @@ def sample_nuts(
         done += 1
         report("sample", min(done, total), total, "")
 
+    refuse_scales(compiled, "nuts")
     with forked(), pyro.validation_enabled(False):
         torch.manual_seed(seed)
         kernel = NUTS(
@@ -67,7 +69,7 @@ def sample_nuts(
         )
         chain = MCMC(kernel, number, options.warmup, hook_fn=count, disable_progbar=True)
         chain.run()
-        drawn = compiled.sample_discrete(chain.get_samples())
+        drawn = compiled.sample_discrete(chain.get_samples(), number)
     return {name: drawn[name] for name in sample_sites(compiled.human, 1)}
 
 

@@ -90,8 +90,9 @@ class Weighted:
     @property
     def probable(self) -> Tensor:
         """The combinations that together have all but `NEGLIGIBLE` of the probability, sorted."""
-        given = torch.softmax(self.log_joint.double(), -1)
-        probability = self.log_weights.double().exp() @ given  # [G]
+        counts = self.log_weights > -torch.inf
+        given = torch.softmax(self.log_joint[counts].double(), -1)
+        probability = self.log_weights[counts].double().exp() @ given  # [G]
         best, order = probability.sort(descending=True)
         kept = torch.zeros_like(order, dtype=torch.bool)
         kept[order] = best.cumsum(0) - best < 1 - NEGLIGIBLE

@@ -7,6 +7,7 @@ of the likelihood; enumeration avoids that.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -196,7 +197,7 @@ def optimize(
     program = config_enumerate(compiled.program, "parallel")
     elbo = elbo_of(compiled)
     if isinstance(elbo, TraceEnum_ELBO):
-        _refuse_scales(compiled)
+        refuse_scales(compiled, "svi")
     svi = SVI(program, guide, optimizer, elbo)
     losses: list[float] = []
     if checkpoint is not None and checkpoint[0].exists():
@@ -205,6 +206,11 @@ def optimize(
         # Validate at the first step only: validation takes a third of the time.
         with pyro.validation_enabled(not losses):
             losses.append(cast(float, svi.step()))
+        if not math.isfinite(losses[-1]):
+            raise HumanModelError(
+                f"the negative ELBO is {losses[-1]} at step {len(losses)}: some implants that the "
+                "guide draws have probability 0, as with a factor of -inf; use importance"
+            )
         optimizer.step()
         report("fit", len(losses), options.steps, f"negative ELBO {losses[-1]:.1f}")
         if isinstance(compiled, ViewTables) and (
@@ -217,8 +223,11 @@ def optimize(
 
 
 @torch.no_grad()
-def _refuse_scales(compiled: Compiled) -> None:
-    """Refuse scales of enumerated sites: Pyro's TraceEnum_ELBO moves them out of the sum."""
+def refuse_scales(compiled: Compiled, engine: str) -> None:
+    """Refuse scales of enumerated sites.
+
+    Pyro's TraceEnum_ELBO moves them out of the sum, and its infer_discrete ignores them.
+    """
     program = cast(Callable[[], None], config_enumerate(compiled.program, "parallel"))
     with (
         forked(),
@@ -232,8 +241,7 @@ def _refuse_scales(compiled: Compiled) -> None:
         if not plain and log_prob(node).dim() > PLATES:
             raise HumanModelError(
                 f'{type(compiled.human).__name__} scales "{name}", which is discrete or depends on '
-                "discrete sites: the engine svi (Pyro's TraceEnum_ELBO) cannot sum them out; the "
-                "engine nuts can"
+                f"discrete sites: Pyro does not scale them as {engine} needs it; use importance"
             )
 
 

@@ -23,6 +23,7 @@ from mirror_ppl.likelihood.densities import (
     prior_nodes,
 )
 from mirror_ppl.models.dependencies import Sites, dependencies
+from mirror_ppl.models.dependencies import forget as forget_dependencies
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites
@@ -88,6 +89,13 @@ def perceived_sites(human: HumanModel) -> dict[str, Tensor]:
 
 
 _unread: WeakKeyDictionary[HumanModel, tuple[Sites, Sites]] = WeakKeyDictionary()
+
+
+def forget(human: HumanModel) -> None:
+    """Drop what was found out about a human model, which may have been changed since."""
+    _unread.pop(human, None)
+    forget_dependencies(human)
+    vars(human).pop("has_round_latents", None)
 
 
 def unread_sites(human: HumanModel, supports: Mapping[str, Tensor] | None = None) -> Sites:

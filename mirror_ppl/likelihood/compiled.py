@@ -73,12 +73,16 @@ class Compiled(ABC):
             return discrete_names(poutine.trace(self.program).get_trace())
 
     @torch.no_grad()
-    def sample_discrete(self, continuous: Mapping[str, Tensor]) -> Draws:
+    def sample_discrete(self, continuous: Mapping[str, Tensor], number: int = 1) -> Draws:
         """Draws ``[S, P, 1, ...]`` of all sites, given those of the continuous ones.
 
         Discrete sites are drawn from their posterior, with the global random state.
+
+        Args:
+            continuous: draws ``[S, P, 1, ...]`` of the continuous sites.
+            number: number of draws S, if there are no continuous sites.
         """
-        number = len(next(iter(continuous.values()))) if continuous else 1
+        number = len(next(iter(continuous.values()), range(number)))
         drawn = [
             self._with_discrete({name: value[draw] for name, value in continuous.items()})
             for draw in range(number)

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 import pyro
+import pyro.distributions as dist
 import torch
 from pyro import poutine
+from pyro.distributions.torch_distribution import MaskedDistribution
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
+from torch.distributions import biject_to
 
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
 from mirror_ppl.domains.record import require_power
 from mirror_ppl.errors import HumanModelError, MirrorError
 from mirror_ppl.likelihood.agreement import check_agreement
+from mirror_ppl.likelihood.combinations import forget
 from mirror_ppl.likelihood.densities import PLATES, check_plates, log_prob, sample_nodes
 from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
@@ -56,6 +61,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
     require_power(human.likelihood_power, f"{type(human).__name__}.likelihood_power")
     if not shipped and all(map(is_of_package, (human, human.self_model, domain))):
         return
+    forget(human)
     device = next(human.parameters()).device
     generator = torch.Generator(device).manual_seed(0)
     people, steps, actions = 2, 3, len(domain.actions)
@@ -103,6 +109,11 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                         _check_sees(domain, human.sees(readable, now, step), people)
                     method = "perceive"
                     view, knowledge = human.perceive(readable, knowledge, now, told, step)
+                    if not is_dataclass(knowledge):
+                        raise HumanModelError(
+                            f"perceive returned {type(knowledge).__name__} as knowledge, expected "
+                            "a dataclass of tensors"
+                        )
                     method = "evidence"
                     evidence = human.evidence(view, now)
                     method = "believe"
@@ -250,6 +261,11 @@ def _refuse_parameters(trace: poutine.Trace) -> None:
 def _refuse_plates(trace: poutine.Trace) -> None:
     for name, site in sample_nodes(trace).items():
         for frame in site["cond_indep_stack"]:
+            if frame.dim is None:
+                raise HumanModelError(
+                    f'"{name}" is in the sequential plate "{frame.name}"; give its distribution '
+                    ".to_event(1) in place of a plate"
+                )
             if frame.dim < -PLATES:
                 raise HumanModelError(
                     f'"{name}" is in the plate "{frame.name}" at dimension {frame.dim}, which '
@@ -280,8 +296,12 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
             if value.numel():  # factors are empty
                 check_plates(name, value[(..., *(0,) * site["fn"].event_dim)], people)
             check_plates(name, log_prob(site), people)
-    for name, site in latent_sites(trace).items():
+    latent = latent_sites(trace)
+    if not latent:
+        raise HumanModelError("prior samples no site, so there is nothing to infer")
+    for name, site in latent.items():
         fn = site["fn"]
+        _refuse_distribution(name, fn)
         if fn.support.is_discrete and not fn.has_enumerate_support:
             raise HumanModelError(
                 f'"{name}" is discrete without finite support; it can be neither enumerated nor '
@@ -298,3 +318,35 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
                 f'what "{name}" can be depends on another site; sample it from 0 to 1, say, and '
                 "stretch it where it is read"
             )
+
+
+def _refuse_distribution(name: str, fn: Any) -> None:
+    """Refuse a distribution whose draws and densities engines cannot use together."""
+    if isinstance(fn, MaskedDistribution):
+        raise HumanModelError(
+            f'"{name}" is of a masked distribution, which draws values and has no density of them; '
+            "put pyro.poutine.mask around pyro.sample in place of .mask()"
+        )
+    if isinstance(fn, dist.Delta):
+        raise HumanModelError(
+            f'"{name}" is of dist.Delta, so that nothing is to be inferred; write its value, or '
+            "pyro.deterministic"
+        )
+    if isinstance(fn, dist.VonMises):
+        raise HumanModelError(
+            f'"{name}" is an angle, which has no proposals on the whole line; sample it from '
+            "dist.Uniform, and give its density by pyro.factor"
+        )
+    if fn.support.is_discrete and fn.event_dim:
+        raise HumanModelError(
+            f'"{name}" is discrete with event shape {tuple(fn.event_shape)}; sample numbers, as '
+            "from dist.Categorical, and convert them where they are read"
+        )
+    if not fn.support.is_discrete:
+        try:
+            biject_to(fn.support)
+        except NotImplementedError:
+            raise HumanModelError(
+                f'values of "{name}" cannot be transformed to the whole line; for a mixture, '
+                "sample the component from dist.Categorical and the value given it"
+            ) from None

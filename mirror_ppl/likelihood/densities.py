@@ -53,6 +53,8 @@ def correction(node: Mapping[str, Any]) -> Tensor | None:
 
     The whole density of factors and observed sites; of sampled sites the effect of scale and mask.
     """
+    if node["infer"].get("_deterministic"):  # pyro.deterministic, whose density is 1
+        return None
     if is_observed(node):
         return log_prob(node)
     if node["mask"] is None and isinstance(node["scale"], (int, float)) and node["scale"] == 1:

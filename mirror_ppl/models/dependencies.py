@@ -77,6 +77,11 @@ def dependencies(human: HumanModel) -> Dependencies:
     return _found[human]
 
 
+def forget(human: HumanModel) -> None:
+    """Drop what was found; the human model may have been changed since."""
+    _found.pop(human, None)
+
+
 @torch.no_grad()
 def _run(human: HumanModel) -> Dependencies:
     like = next(human.parameters())

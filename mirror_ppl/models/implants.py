@@ -27,6 +27,8 @@ LEAST_PROBABILITY = 1e-6
 """Probabilities are clamped to at least this distance from 0 and 1, so logarithms are finite."""
 CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 3.0, 0.5
 """Prior median of the inverse temperature per unit of reward; prior SD of its logarithm."""
+RESIDUAL = ("residual_in", "residual_out")
+"""Sites of the residual's weights."""
 RESIDUAL_HIDDEN = 8
 MOTOR_NOISE = "motor_noise"
 """Site of the standard deviation of executed controls, in distances between levels of the grid."""

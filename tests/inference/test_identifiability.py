@@ -196,6 +196,9 @@ def test_probable_combinations_are_all_that_matters(toy, rounds):
         identify(human, one, posterior.draws, 0, combinations=some, rounds=0)
         for some in ((), posterior.combinations)
     )
+    before = torch.random.get_rng_state()
+    identify(human, one, posterior.draws, 0, combinations=posterior.combinations, rounds=1)
+    assert torch.equal(torch.random.get_rng_state(), before)
     for name in ("entropy", "shared", "all_entropy", "all_shared"):
         torch.testing.assert_close(
             getattr(known, name), getattr(found, name), rtol=0, atol=NEGLIGIBLE

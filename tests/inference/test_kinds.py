@@ -10,6 +10,7 @@ from mirror_ppl.inference import importance
 from mirror_ppl.inference.engine import Job
 from mirror_ppl.inference.kinds import models_by_kind
 from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import KIND, LATE, AnyKind, Late
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.simulation import simulate_from_prior
@@ -68,7 +69,25 @@ def test_what_adds_something_of_its_own_is_inferred_as_one_program(job):
         def prior(self):
             return super().prior()
 
-    assert models_by_kind(More(job.human.self_model)) == {}
+    class Mixin(HumanModel):
+        def act(self, implants, belief, values):
+            return super().act(implants, belief, values)
+
+    class Own(AnyKind):
+        members = AnyKind.members
+
+        def prior(self):
+            return super().prior()
+
+    class Mixed(Mixin, AnyKind):
+        members = AnyKind.members
+
+    class Same(AnyKind):
+        members = AnyKind.members
+
+    for changed in (More, Own, Mixed):
+        assert models_by_kind(changed(job.human.self_model)) == {}
+    assert set(models_by_kind(Same(job.human.self_model))) == set(AnyKind.members)
     assert models_by_kind(Late(job.human.self_model)) == {}
     changed = AnyKind(job.human.self_model)
     object.__setattr__(changed, "prior", job.human.prior)

@@ -137,3 +137,108 @@ def _one(human):
     from mirror_ppl.models.prior import draw_prior
 
     return {name: value[0] for name, value in draw_prior(human, 1, 1, 0).items()}
+
+
+class Drawing(HumanModel):
+    """Samples the site ``own`` from a distribution that tests set."""
+
+    own: dist.Distribution = dist.Normal(0.0, 1.0)
+    mask, scale = None, 1.0
+
+    def prior(self):
+        implants = super().prior()
+        with pyro.poutine.scale(scale=self.scale):
+            return implants | {"own": pyro.sample("own", self.own)}
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        (dist.Normal(0.0, 1.0).mask(False), "is of a masked distribution"),
+        (dist.Delta(torch.tensor(0.7)), "is of dist.Delta"),
+        (dist.VonMises(0.0, 1.0), "is an angle"),
+        (dist.OneHotCategorical(torch.ones(3) / 3), "is discrete with event shape (3,)"),
+        (
+            dist.MixtureSameFamily(
+                dist.Categorical(torch.ones(2)), dist.Normal(torch.zeros(2), 1.0)
+            ),
+            "cannot be transformed to the whole line",
+        ),
+    ],
+)
+def test_distributions_that_engines_cannot_treat_are_refused(self_model, own, message):
+    human = Drawing(self_model)
+    human.own = own
+    with pytest.raises(HumanModelError, match=message.replace("(", r"\(").replace(")", r"\)")):
+        check_contract(human)
+
+
+def test_a_scaled_discrete_site_is_drawn_by_importance_alone(self_model):
+    human, rounds = Drawing(self_model), load_recordings().select_people([0]).select_rounds([0])
+    human.own, human.scale = dist.Categorical(torch.ones(3) / 3), 0.3
+    for engine in ("svi", "nuts"):
+        with pytest.raises(HumanModelError, match='scales "own".*use importance'):
+            infer(human, rounds, InferenceOptions(engine, 4), 0)
+
+
+def test_sites_of_several_numbers_keep_their_precision(self_model):
+    """Of 1000 with a standard deviation of .5 eight significant bits leave nothing."""
+    human, nobody = Drawing(self_model), load_recordings().select_people([0]).select_rounds([])
+    human.own = dist.Normal(torch.tensor([500.0, 1000.0]), 0.5).to_event(1)
+    draws = infer(human, nobody, InferenceOptions("importance", 400), 0).draws["own"][:, 0, 0]
+    # Standard errors of 400 independent draws: .025 of the mean, .018 of the standard deviation.
+    torch.testing.assert_close(draws.mean(0), torch.tensor([500.0, 1000.0]), rtol=0, atol=0.13)
+    torch.testing.assert_close(draws.std(0), torch.tensor([0.5, 0.5]), rtol=0, atol=0.09)
+
+
+class Torn(HumanModel):
+    """Cannot have done what was recorded."""
+
+    def act(self, implants, belief, values):
+        found = super().act(implants, belief, values)
+        return torch.where(torch.arange(2) == 0, 0.0, -torch.inf).expand_as(found)
+
+
+def test_recorded_actions_without_probability_are_reported(self_model):
+    rounds = load_recordings().select_people([0]).select_rounds([0, 1])
+    with pytest.raises(HumanModelError, match="recorded actions have probability 0"):
+        infer(Torn(self_model), rounds, InferenceOptions("importance", 20), 0)
+
+
+class Hard(HumanModel):
+    """Two numbers, of which the first must be the smaller one."""
+
+    def prior(self):
+        low, high = (pyro.sample(name, dist.Normal(0.0, 1.0)) for name in ("low", "high"))
+        pyro.factor("ordered", torch.where(low < high, 0.0, -torch.inf))
+        return super().prior() | {"low": low, "high": high}
+
+
+def test_a_guide_that_leaves_the_prior_s_support_is_refused(self_model):
+    rounds = load_recordings().select_people([0]).select_rounds([0])
+    options = InferenceOptions("svi", 20, SVIOptions(steps=60))
+    with pytest.raises(HumanModelError, match="the negative ELBO is inf at step"):
+        infer(Hard(self_model), rounds, options, 0)
+
+
+class Moody(HumanModel):
+    """Lapses more with one switch set, which may be changed between fits."""
+
+    reads = False
+
+    def act(self, implants, belief, values):
+        found = super().act(implants, belief, values)
+        if self.reads:
+            flat = torch.full_like(found, -torch.log(torch.tensor(float(found.shape[-1]))).item())
+            found = torch.where((implants["sight_front_own"] > 3)[..., None], found, flat)
+        return found
+
+
+def test_a_model_that_was_changed_is_looked_at_again(self_model):
+    human = Moody(self_model)
+    check_contract(human)
+    before = dependencies(human)
+    human.reads = True
+    with pytest.raises(HumanModelError):
+        check_contract(human)
+    assert dependencies(human) != before
