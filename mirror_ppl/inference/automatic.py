@@ -7,6 +7,7 @@ person is inferred by ``importance``, from the same views of their rounds.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 
 from mirror_ppl.checks import real_number, require_kind
 from mirror_ppl.inference import amortized, importance
@@ -39,7 +40,7 @@ class AutomaticOptions:
         require_kind(self.amortized, AmortizedOptions, "amortized")
         require_kind(self.importance, ImportanceOptions, "importance")
         object.__setattr__(self, "enough", real_number(self.enough, "enough", 0))
-        object.__setattr__(self, "pareto_k", real_number(self.pareto_k, "pareto_k", 0))
+        object.__setattr__(self, "pareto_k", real_number(self.pareto_k, "pareto_k", -inf))
 
 
 def infer_automatically(job: Job) -> Inferred:

@@ -241,7 +241,8 @@ def refuse_scales(compiled: Compiled, engine: str) -> None:
         if not plain and log_prob(node).dim() > PLATES:
             raise HumanModelError(
                 f'{type(compiled.human).__name__} scales "{name}", which is discrete or depends on '
-                f"discrete sites: Pyro does not scale them as {engine} needs it; use importance"
+                f"discrete sites: Pyro does not scale them as {engine} needs it; use importance, "
+                "which needs the scale in prior() or act()"
             )
 
 

@@ -14,7 +14,6 @@ from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.engines import InferenceOptions, infer, run_identity
 from mirror_ppl.inference.sampler import Sampler
-from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.combination_sets import fixed_prior
 from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
 from mirror_ppl.likelihood.compiled import compile
@@ -226,15 +225,16 @@ def test_a_method_of_the_instance_counts(self_model):
     check_contract(human)
 
 
-def test_a_scale_around_all_is_refused_by_svi_alone(self_model, rounds):
+@pytest.mark.parametrize("engine", ["svi", "nuts"])
+def test_a_scale_around_all_is_refused(self_model, rounds, engine):
     class Scaled(ToyHuman):
         def model(self, rounds, world=False):
             with poutine.scale(scale=0.2):
                 super().model(rounds, world)
 
-    options = InferenceOptions("svi", 5, SVIOptions(steps=2))
-    with pytest.raises(HumanModelError, match='Scaled scales "[a-z_]+", which is discrete.*nuts'):
-        infer(Scaled(self_model), rounds, options, 0)
+    message = f'Scaled scales "[a-z_]+", which is discrete.* as {engine} needs it; use importance'
+    with pytest.raises(HumanModelError, match=message):
+        infer(Scaled(self_model), rounds, InferenceOptions(engine, 5), 0)
 
 
 # --- perception ---------------------------------------------------------------------------------

@@ -147,7 +147,7 @@ def test_there_is_no_network_of_it():
 
 def test_scales_that_pyro_cannot_sum_out_are_refused(recordings):
     human = own_program("scale", self_model())
-    with pytest.raises(HumanModelError, match="Own scales .* discrete sites.*nuts can"):
+    with pytest.raises(HumanModelError, match="Own scales .* discrete sites.*use importance"):
         infer(human, recordings, InferenceOptions("svi", 5), 0)
 
 

@@ -156,7 +156,8 @@ def test_options_and_communicators_of_assist_are_as_on_the_page():
     text, options = page("docs/communicator.md"), assist.Options()
     shown = {row[0].strip("`-").replace("-", "_"): row[1] for row in table_of(text, "Option")}
     assert shown.pop("communicator") == "all of them" and options.communicator == ()
-    for name in ("horizon", "enumerate_above", "patience", "min_standard_errors"):
+    domains = ("horizon", "enumerate_above", "patience", "min_standard_errors", "discount", "hears")
+    for name in domains:
         assert shown.pop(name) == "the domain's" and getattr(options, name) is None
     assert shown == {name: str(getattr(options, name)) for name in shown}
     first = " ".join(row[0] for row in table_of(text, "Communicator"))
