@@ -173,8 +173,13 @@ class BeliefState:
                 for name, value in observation[0].items()
             },
         )
-        still = None if still is None else still[one]
-        parts = torch.stack([action[one], key[one], shown.view(-1, steps)])
+        shown = shown.view(-1, steps)
+        # Views of equal evidence lead to equal beliefs, as of an item that is seen or imagined.
+        causes = row_numbers(as_whole_numbers(evidence), 1)[shown]
+        if still is not None:
+            still = still[one]
+            causes = torch.where(still, key[one], causes)
+        parts = torch.stack([action[one], causes, shown])
         state, states = replace(self, belief=self.belief[one]), []
         for place in range(steps):
             stays = None if still is None else still[:, place]
