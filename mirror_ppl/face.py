@@ -32,7 +32,7 @@ from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.results.posterior_file import load_posterior
-from mirror_ppl.inference.sampler import HIGH_PARETO_K
+from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.inference.workers import Workers
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.limits import LIMITS

@@ -16,7 +16,7 @@ from mirror_ppl.files import json_text, write_together
 from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.results.criticism import FINE
 from mirror_ppl.inference.results.export import netcdf_content
-from mirror_ppl.inference.sampler import HIGH_PARETO_K
+from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.limits import LIMITS
 from mirror_ppl.plots.fit import FILES, FitPlots
 from mirror_ppl.timing import clocked, stage

@@ -46,7 +46,7 @@ def class_in_file(path: Path, name: str, base: type[Base], error: type[MirrorErr
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as fault:
-        del sys.modules[module_name]
+        sys.modules.pop(module_name, None)
         raise error(f"{path} does not import: {describe(fault, path)}") from fault
     chosen = getattr(module, name, None)
     if isinstance(chosen, type) and issubclass(chosen, base):

@@ -10,7 +10,7 @@ from rich.table import Table
 from mirror_ppl.console import console_for_tables
 from mirror_ppl.inference.results.criticism import OK, UNCHECKED
 from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
-from mirror_ppl.inference.sampler import HIGH_PARETO_K
+from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.models.family import KIND, model_of
 from mirror_ppl.models.implants import NOTICES
 from mirror_ppl.models.loading import MIRROR, model_name

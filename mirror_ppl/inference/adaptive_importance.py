@@ -7,7 +7,6 @@ is consistent for every proposal, given enough draws (:mod:`mirror_ppl.inference
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +16,8 @@ from torch import Tensor
 from mirror_ppl.checks import real_number, whole_number
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
-from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler, Weighted
+from mirror_ppl.inference.sampler import NoScalars, Proposal, Sampler
+from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.view_table import ViewTable
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import unconstrained
@@ -109,11 +109,6 @@ def adapt(sampler: Sampler, options: ImportanceOptions) -> Weighted:
     """
     for stage in range(options.stages if sampler.sites or sampler.supports else 0):
         found = sampler.weighted()
-        if math.isnan(found.effective):
-            raise HumanModelError(
-                "the recorded actions have probability 0 under all draws of the implants: act() "
-                "has to give every recorded action some probability, as lapses do"
-            )
         if found.effective >= options.enough:
             return found
         few = found.effective <= FEW

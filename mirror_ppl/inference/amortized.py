@@ -31,7 +31,8 @@ from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
 from mirror_ppl.inference.refining import refined
-from mirror_ppl.inference.sampler import Sampler, Weighted
+from mirror_ppl.inference.sampler import Sampler
+from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.combination_sets import EquivalentCombinations
 from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.view_table import ViewTable

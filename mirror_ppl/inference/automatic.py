@@ -16,7 +16,7 @@ from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
 from mirror_ppl.inference.amortized_guide import guide_screening
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.importance import infer_by_importance
-from mirror_ppl.inference.sampler import HIGH_PARETO_K, Weighted
+from mirror_ppl.inference.weighted import HIGH_PARETO_K, Weighted
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 
 

@@ -10,8 +10,8 @@ import torch
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.kinds import infer_kinds, models_by_kind
-from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
+from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.densities import adds_to_prior
 from mirror_ppl.likelihood.tables import person_builders, rounds_of
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder

@@ -12,7 +12,6 @@ from pyro.infer.autoguide import init_to_median
 from mirror_ppl.checks import whole_number
 from mirror_ppl.inference.batches import in_batches
 from mirror_ppl.inference.engine import Engine, Inferred, Job
-from mirror_ppl.inference.svi import refuse_scales
 from mirror_ppl.likelihood.compiled import Compiled
 from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.models.prior import Draws, sample_sites
@@ -58,7 +57,7 @@ def sample_nuts(
         done += 1
         report("sample", min(done, total), total, "")
 
-    refuse_scales(compiled, "nuts")
+    compiled.refuse_scales("nuts")
     with forked(), pyro.validation_enabled(False):
         torch.manual_seed(seed)
         kernel = NUTS(

@@ -14,8 +14,8 @@ from mirror_ppl.errors import InputError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.amortized import AmortizedOptions, sample_amortized
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, require_network_of
-from mirror_ppl.inference.sampler import Weighted
 from mirror_ppl.inference.second_look import coarse, looks_twice, second_look
+from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
-from mirror_ppl.inference.sampler import Weighted
+from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder

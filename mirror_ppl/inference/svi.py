@@ -32,13 +32,12 @@ from mirror_ppl.inference.engine import Engine, Inferred, Job
 from mirror_ppl.inference.marginal_elbo import elbo_of
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
-from mirror_ppl.likelihood.densities import PLATES, log_prob
+from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import combination_scores
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.prior import Draws, sample_sites
-from mirror_ppl.models.sites import sample_nodes
 from mirror_ppl.progress import Report, silent
 from mirror_ppl.randomness import forked
 
@@ -197,7 +196,7 @@ def optimize(
     program = config_enumerate(compiled.program, "parallel")
     elbo = elbo_of(compiled)
     if isinstance(elbo, TraceEnum_ELBO):
-        refuse_scales(compiled, "svi")
+        compiled.refuse_scales("svi")
     svi = SVI(program, guide, optimizer, elbo)
     losses: list[float] = []
     if checkpoint is not None and checkpoint[0].exists():
@@ -220,30 +219,6 @@ def optimize(
         if checkpoint is not None and len(losses) % options.checkpoint_every == 0:
             _save(*checkpoint, cast(AutoGuide, guide), optimizer, losses, compiled)
     return losses
-
-
-@torch.no_grad()
-def refuse_scales(compiled: Compiled, engine: str) -> None:
-    """Refuse scales of enumerated sites.
-
-    Pyro's TraceEnum_ELBO moves them out of the sum, and its infer_discrete ignores them.
-    """
-    program = cast(Callable[[], None], config_enumerate(compiled.program, "parallel"))
-    with (
-        forked(),
-        poutine.block(),
-        poutine.enum(first_available_dim=-1 - PLATES),
-        poutine.trace() as trace,
-    ):
-        program()
-    for name, node in sample_nodes(trace.trace).items():
-        plain = isinstance(node["scale"], (int, float)) and node["scale"] == 1
-        if not plain and log_prob(node).dim() > PLATES:
-            raise HumanModelError(
-                f'{type(compiled.human).__name__} scales "{name}", which is discrete or depends on '
-                f"discrete sites: Pyro does not scale them as {engine} needs it; use importance, "
-                "which needs the scale in prior() or act()"
-            )
 
 
 @torch.no_grad()

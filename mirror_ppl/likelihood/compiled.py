@@ -89,6 +89,32 @@ class Compiled(ABC):
         ]
         return {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
 
+    @torch.no_grad()
+    def refuse_scales(self, engine: str) -> None:
+        """Refuse scales of enumerated sites.
+
+        Pyro's TraceEnum_ELBO moves them out of the sum, and its infer_discrete ignores them.
+
+        Raises:
+            HumanModelError: there are some; the message names the engine.
+        """
+        program = cast(Callable[[], None], config_enumerate(self.program, "parallel"))
+        with (
+            forked(),
+            poutine.block(),
+            poutine.enum(first_available_dim=-1 - PLATES),
+            poutine.trace() as trace,
+        ):
+            program()
+        for name, node in sample_nodes(trace.trace).items():
+            plain = isinstance(node["scale"], (int, float)) and node["scale"] == 1
+            if not plain and log_prob(node).dim() > PLATES:
+                raise HumanModelError(
+                    f'{type(self.human).__name__} scales "{name}", which is discrete or depends on '
+                    f"discrete sites: Pyro does not scale them as {engine} needs it; use "
+                    "importance, which needs the scale in prior() or act()"
+                )
+
     def _with_discrete(self, continuous: Mapping[str, Tensor]) -> Draws:
         """One draw ``[P, 1, ...]``."""
         sampled = infer_discrete(

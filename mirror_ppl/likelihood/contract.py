@@ -15,7 +15,7 @@ from pyro import poutine
 from pyro.distributions.torch_distribution import MaskedDistribution
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
-from torch.distributions import biject_to
+from torch.distributions import Independent, biject_to
 
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains import Domain
@@ -322,17 +322,20 @@ def _check_sites(trace: poutine.Trace, people: int) -> None:
 
 def _refuse_distribution(name: str, fn: Any) -> None:
     """Refuse a distribution whose draws and densities engines cannot use together."""
-    if isinstance(fn, MaskedDistribution):
+    kind = fn
+    while isinstance(kind, Independent):  # .to_event() of another
+        kind = kind.base_dist
+    if isinstance(kind, MaskedDistribution):
         raise HumanModelError(
             f'"{name}" is of a masked distribution, which draws values and has no density of them; '
             "put pyro.poutine.mask around pyro.sample in place of .mask()"
         )
-    if isinstance(fn, dist.Delta):
+    if isinstance(kind, dist.Delta):
         raise HumanModelError(
             f'"{name}" is of dist.Delta, so that nothing is to be inferred; write its value, or '
             "pyro.deterministic"
         )
-    if isinstance(fn, dist.VonMises):
+    if isinstance(kind, dist.VonMises):
         raise HumanModelError(
             f'"{name}" is an angle, which has no proposals on the whole line; sample it from '
             "dist.Uniform, and give its density by pyro.factor"

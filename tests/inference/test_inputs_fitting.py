@@ -1,5 +1,6 @@
 """Fitting from Python: what is no human model, recording, draw or number is refused in a line."""
 
+import inspect
 import json
 from pathlib import Path
 
@@ -11,6 +12,9 @@ from example_recordings import RAGGED, fields
 from refused import refused
 
 from mirror_ppl.data import Demonstrations
+from mirror_ppl.inference.adaptive_importance import ImportanceOptions
+from mirror_ppl.inference.amortized import AmortizedOptions
+from mirror_ppl.inference.automatic import AutomaticOptions
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.inference.population.pooling import Pooling
@@ -118,6 +122,13 @@ def test_numbers_of_numpy_make_the_same_fit(two):
             lambda: InferenceOptions(engine=3),
             "unknown engine 3; known: amortized, auto, importance, nuts, svi",
         ),
+        (lambda: ImportanceOptions(proposals=1), "proposals must be at least 2, not 1"),
+        (lambda: ImportanceOptions(proposals=2.5), "proposals must be a whole number, not 2.5"),
+        (lambda: ImportanceOptions(wider=-1), "wider must be at least 0, not -1"),
+        (lambda: ImportanceOptions(enough="a"), "enough must be a number, not 'a'"),
+        (lambda: AmortizedOptions(proposals=1), "proposals must be at least 2, not 1"),
+        (lambda: AmortizedOptions(refine=-1), "refine must be at least 0, not -1"),
+        (lambda: AutomaticOptions(enough=-1), "enough must be at least 0, not -1"),
     ],
 )
 def test_wrong_options_are_refused(make, message):
@@ -249,6 +260,19 @@ def test_simulations_take_numbers_of_numpy():
 
 
 # --- files -------------------------------------------------------------------------------------
+
+
+def test_files_of_one_name_are_two_modules(tmp_path):
+    kinds = []
+    for folder, method in (("a", "sees"), ("b", "act")):
+        (tmp_path / folder).mkdir()
+        file = tmp_path / folder / "model.py"
+        file.write_text(
+            "from mirror_ppl.models import HumanModel\n\n\nclass Own(HumanModel):\n"
+            f"    def {method}(self, *given):\n        return super().{method}(*given)\n"
+        )
+        kinds.append(type(load_human_model(f"{file}:Own", human().self_model)))
+    assert ["def sees" in inspect.getsource(kind) for kind in kinds] == [True, False]
 
 
 def test_files_of_models_are_named_by_text_or_path(tmp_path):

@@ -14,7 +14,8 @@ from mirror_ppl.inference import adaptive_importance as importance
 from mirror_ppl.inference import sampler as sampler_module
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.hierarchical_proposal import RelativeProposal, dependent_sites
-from mirror_ppl.inference.sampler import Sampler, Weighted
+from mirror_ppl.inference.sampler import Sampler
+from mirror_ppl.inference.weighted import Weighted
 from mirror_ppl.likelihood.combination_sets import EquivalentCombinations
 from mirror_ppl.likelihood.tables import build_view_table
 from mirror_ppl.models import HumanModel

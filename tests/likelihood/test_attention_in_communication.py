@@ -47,6 +47,9 @@ def test_who_acts_as_if_they_saw_has_noticed(self_model, recordings):
         error = 5 * (expected * (1 - expected) / 300).sqrt() + 1e-3
         assert ((found - expected).abs() < error).all()
         assert there.in_round(past).percepts.keys() == there.percepts.keys()
+        again, other = (someone.in_round(past, seed) for seed in (0, 1))
+        assert torch.equal(again.percept, there.percept)
+        assert not torch.equal(other.percept, there.percept)
     assert someone.percept_count == 1  # untouched
     bare = HumanModel(self_model)
     unchanged = Person(bare, drawn(bare, 2))

@@ -143,7 +143,7 @@ class Drawing(HumanModel):
     """Samples the site ``own`` from a distribution that tests set."""
 
     own: dist.Distribution = dist.Normal(0.0, 1.0)
-    mask, scale = None, 1.0
+    scale = 1.0
 
     def prior(self):
         implants = super().prior()
@@ -155,9 +155,11 @@ class Drawing(HumanModel):
     ("own", "message"),
     [
         (dist.Normal(0.0, 1.0).mask(False), "is of a masked distribution"),
+        (dist.Normal(torch.zeros(2), 1.0).mask(False).to_event(1), "is of a masked distribution"),
         (dist.Delta(torch.tensor(0.7)), "is of dist.Delta"),
         (dist.VonMises(0.0, 1.0), "is an angle"),
         (dist.OneHotCategorical(torch.ones(3) / 3), "is discrete with event shape (3,)"),
+        (dist.Categorical(torch.ones(2, 3)).to_event(1), "is discrete with event shape (2,)"),
         (
             dist.MixtureSameFamily(
                 dist.Categorical(torch.ones(2)), dist.Normal(torch.zeros(2), 1.0)
@@ -182,7 +184,7 @@ def test_a_scaled_discrete_site_is_drawn_by_importance_alone(self_model):
 
 
 def test_sites_of_several_numbers_keep_their_precision(self_model):
-    """Of 1000 with a standard deviation of .5 eight significant bits leave nothing."""
+    """Eight significant bits cannot represent 1000 with a standard deviation of .5."""
     human, nobody = Drawing(self_model), load_recordings().select_people([0]).select_rounds([])
     human.own = dist.Normal(torch.tensor([500.0, 1000.0]), 0.5).to_event(1)
     draws = infer(human, nobody, InferenceOptions("importance", 400), 0).draws["own"][:, 0, 0]
@@ -243,3 +245,38 @@ def test_a_model_that_was_changed_is_looked_at_again(self_model):
     assert dependencies(human) != before
     with pytest.raises(HumanModelError, match="reads a site that perceive"):
         infer(human, load_recordings().select_rounds([0]), InferenceOptions("importance", 4), 0)
+
+
+def test_what_is_deterministic_adds_nothing_to_the_evidence(self_model):
+    class Noted(HumanModel):
+        def prior(self):
+            implants = super().prior()
+            pyro.deterministic("doubled", 2 * implants["consistency"])
+            return implants
+
+    rounds = load_recordings().select_people([0]).select_rounds([0])
+    evidence = [
+        infer(kind(self_model), rounds, InferenceOptions("importance", 4), 0).log_evidence
+        for kind in (HumanModel, Noted)
+    ]
+    assert torch.equal(*evidence) and evidence[0].isfinite().all()
+
+
+def test_a_sequential_plate_and_other_knowledge_are_refused(self_model):
+    class Sequential(HumanModel):
+        def prior(self):
+            implants = super().prior()
+            for number in pyro.plate("items", 2):
+                pyro.sample(f"item_{number}", dist.Normal(0.0, 1.0))
+            return implants
+
+    class Tuple(HumanModel):
+        def perceive(self, implants, knowledge, observation, told, step):
+            view, _ = super().perceive(
+                implants, self.domain.nothing_known(2), observation, told, step
+            )
+            return view, (1,)
+
+    for kind, message in ((Sequential, 'sequential plate "items"'), (Tuple, "returned tuple as")):
+        with pytest.raises(HumanModelError, match=message):
+            check_contract(kind(self_model))

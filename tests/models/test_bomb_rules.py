@@ -7,6 +7,7 @@ import pytest
 import torch
 from example_bomb import RESIDUAL, WORLD, implants
 
+import mirror_ppl
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.domains.bomb_defusal.panel import BUTTONS, OLD_RULES, RULES
@@ -64,9 +65,18 @@ def test_rules_are_learned_from_rewards_and_planned_with():
     human.fit_world(recorded)
     assert torch.equal(human.rule_logits, before)
     # Without rewards there is nothing to learn.
-    again = BombDefusalHuman(human.self_model)
-    again.fit_world(replace(recorded, rewards=None))
-    assert again.rule_logits.exp()[:, 0].tolist() == pytest.approx([0.5, 0.5])
+    human.fit_world(replace(recorded, rewards=None))
+    assert human.rule_logits.exp()[:, 0].tolist() == pytest.approx([0.5, 0.5])
+
+
+def test_a_fit_learns_rules_in_a_model_of_its_own():
+    human = BombDefusalHuman(load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")[0])
+    before = human.rule_logits.clone()
+    recorded = simulate("bomb_defusal", "labelled", people=1, rounds=2, seed=1)
+    fit = mirror_ppl.infer(recorded, human=human, draws=4, train_rounds=2, explore=0)
+    assert torch.equal(human.rule_logits, before)
+    assert isinstance(fit.human, BombDefusalHuman)
+    assert not torch.equal(fit.human.rule_logits, before)
 
 
 def test_of_rules_the_most_probable_one_is_reported():

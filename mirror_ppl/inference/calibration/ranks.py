@@ -23,7 +23,7 @@ from scipy.stats import entropy
 from mirror_ppl.errors import InputError, PosteriorError
 from mirror_ppl.files import write_whole
 from mirror_ppl.inference.calibration.uniformity import ecdf_p_value, histogram_p_value
-from mirror_ppl.inference.sampler import HIGH_PARETO_K
+from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.netcdf import read_netcdf
 
 FAILURE_RATE = 1e-3

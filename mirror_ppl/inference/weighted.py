@@ -1,0 +1,104 @@
+"""Weighted draws of one person's implants, from which posterior draws are resampled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mirror_ppl.likelihood.combination_sets import EquivalentCombinations
+from mirror_ppl.models.prior import Draws
+
+HIGH_PARETO_K = 0.7
+"""Pareto k above which importance weights are unreliable (Vehtari et al., 2015)."""
+NEGLIGIBLE = 1e-4
+"""Posterior probability of the combinations of discrete sites that `Weighted.probable` leaves out.
+"""
+HALVINGS = 20
+"""Bisection steps for the power to which weights are raised."""
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """Weighted draws of one person's implants.
+
+    Attributes:
+        policy: values of the sites that perception does not read, ``[S, 1, 1, ...]``.
+        combinations: possible combinations of the discrete sites that it reads; G sets.
+        log_joint: log joint probability of each of these sets and the recorded actions under each
+            draw, ``[S, G]``, up to a common constant.
+        log_weights: normalized and Pareto-smoothed, ``[S]``.
+        pareto_k: Pareto k of the weights.
+        log_evidence: estimated log marginal likelihood of the recorded actions, nats.
+        proposed_residual: True if the residual was proposed by its Laplace approximation.
+    """
+
+    policy: Draws
+    combinations: EquivalentCombinations
+    log_joint: Tensor
+    log_weights: Tensor
+    pareto_k: float
+    log_evidence: float
+    proposed_residual: bool = False
+
+    @property
+    def effective(self) -> float:
+        """Effective number of draws."""
+        return float(1 / self.log_weights.exp().square().sum())
+
+    @property
+    def evidence_error(self) -> float:
+        """Approximate standard error of ``log_evidence``, nats."""
+        return max(1 / self.effective - 1 / len(self.log_weights), 0.0) ** 0.5
+
+    @property
+    def probable(self) -> Tensor:
+        """The combinations that together have all but `NEGLIGIBLE` of the probability, sorted."""
+        counts = self.log_weights > -torch.inf
+        given = torch.softmax(self.log_joint[counts].double(), -1)
+        probability = self.log_weights[counts].double().exp() @ given  # [G]
+        best, order = probability.sort(descending=True)
+        kept = torch.zeros_like(order, dtype=torch.bool)
+        kept[order] = best.cumsum(0) - best < 1 - NEGLIGIBLE
+        return self.combinations.kept(kept).members.sort().values
+
+    def tempered(self, effective: float) -> Weighted:
+        """Temper the weights until this many draws, at most a quarter of all, are effective.
+
+        The power is 1 if possible.
+        """
+        effective = min(effective, len(self.log_weights) / 4)
+        if self.effective >= effective:
+            return self
+        low, high = 2.0**-HALVINGS, 1.0
+        for _ in range(HALVINGS):
+            power = (low + high) / 2
+            weights = torch.softmax(power * self.log_weights, 0)
+            if float(1 / weights.square().sum()) >= effective:
+                low = power
+            else:
+                high = power
+        return replace(self, log_weights=torch.log_softmax(low * self.log_weights, 0))
+
+    def sample(self, number: int, values: Mapping[str, Tensor]) -> Draws:
+        """Joint draws ``[number, 1, 1, ...]`` of all sites from the global random state.
+
+        Args:
+            number: number of draws.
+            values: values of the discrete sites for every combination, ``[M]``.
+        """
+        # Systematic resampling in random order repeats draws as little as possible.
+        ladder = (torch.arange(number) + torch.rand(())) / number
+        place = torch.searchsorted(self.log_weights.exp().cumsum(0), ladder.to(self.log_weights))
+        place = place.clamp(max=len(self.log_weights) - 1)[torch.randperm(number)]
+        # Inverse transform sampling, since multinomial is slow for many combinations.
+        distinct, which = place.unique(return_inverse=True)
+        ladder = torch.softmax(self.log_joint[distinct].double(), -1).cumsum(-1)[which]
+        chosen = torch.searchsorted(ladder, ladder[:, -1:] * torch.rand_like(ladder[:, :1]))
+        combination = self.combinations.draw(chosen.clamp(max=ladder.shape[-1] - 1).squeeze(-1))[
+            :, None
+        ]
+        discrete = {site: value[combination][..., None] for site, value in values.items()}
+        return {name: value[place] for name, value in self.policy.items()} | discrete
