@@ -123,7 +123,7 @@ from mirror_ppl.domains.driving.people import Memory
 from mirror_ppl.people import draw_starts
 
 driver = simulated_drivers("fog", "paper", 10, 0).select([0])
-starts = draw_starts(1, 3 if quick else 40, 0, "notebook")
+starts = draw_starts(1, 8 if quick else 40, 0, "notebook")
 silence = {m.name: torch.zeros(len(m.items), dtype=torch.bool) for m in domain.modalities}
 
 

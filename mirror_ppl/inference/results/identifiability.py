@@ -157,12 +157,11 @@ def identify(
         own = {name: value[:, person : person + 1] for name, value in draws.items()}
         drawn = combination_number({site: own[site][:, 0, 0] for site in sizes}, sizes)
         one = train.select_people([person])
-        candidates = combinations[person] if combinations else drawn.unique()
-        if len(candidates) <= FEW and (combinations or ENOUGH * len(candidates) <= held):
+        candidates = drawn.unique()
+        if len(candidates) <= FEW and ENOUGH * len(candidates) <= held:
             table = build_view_table(human, one, [candidates], likely=own, values=VALUES)
-        else:
-            # Where probable combinations are not known, draws are too few to estimate the support.
-            known = [candidates] if combinations else None
+        else:  # too few draws to estimate the support
+            known = combinations[person : person + 1] or None
             table = build_view_table(human, one, known, Screening(), likely=own, values=VALUES)
             candidates = table.possible[0].nonzero().squeeze(-1)
         if not acts_on_beliefs(human, table.sites):
