@@ -26,7 +26,13 @@ from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, mixed, uniform_of
+from mirror_ppl.row_hashing import (
+    as_whole_numbers,
+    distinct_rows,
+    mixed,
+    row_numbers,
+    uniform_of,
+)
 
 
 @dataclass(frozen=True)
@@ -244,7 +250,8 @@ class _Tree:
 
     def _merge(self, rest: Tensor) -> None:
         """Merge groups that have the same sequences and the same ``rest`` ``[C, l, N]``."""
-        own = mixed(self.path, self.belief, as_whole_numbers(self.weight), self.draw)
+        parts = [self.path, self.belief, as_whole_numbers(self.weight), self.draw]
+        own = mixed(row_numbers(torch.stack(parts, -1)))
         courses = own.new_zeros(len(self.candidate)).index_add_(0, self.group, own)
         _, following = distinct_rows(rest.flatten(1).long())
         first, which = distinct_rows(torch.stack([courses, following[self.candidate]], -1))

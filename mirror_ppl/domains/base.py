@@ -320,7 +320,10 @@ class Domain(Protocol):
         ...
 
     def symbols(self, observation: Observation) -> dict[str, Tensor]:
-        """Encode observations for networks, ``[..., symbol_sizes[name]]``."""
+        """Encode observations for networks, ``[..., symbol_sizes[name]]``.
+
+        The symbols of an item depend on that item and the ego only.
+        """
         ...
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:

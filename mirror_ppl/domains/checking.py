@@ -243,6 +243,8 @@ def _looks(world: World) -> list[str]:
     for name, value in symbols.items():
         size = world.symbol_sizes[name]
         found.append(_fault("symbols", name, value, (*expected[name][:-1], size), float))
+    if not any(found):
+        found += _faults_of_symbols(world, observation, symbols)
     if world.random:
         found.append(_fault_of_chance(world, along, observation))
     behind = _call(world, "state_behind", observation)
@@ -308,6 +310,28 @@ def _outcome(world: World, state: Any, action: Tensor) -> dict[str, Tensor]:
     later = world.transition(state, action)
     earned = world.rewards(state, action, later)
     return {"over": world.over(later), **world.observe(later), **earned}
+
+
+def _faults_of_symbols(
+    world: World, observation: Mapping[str, Tensor], symbols: Mapping[str, Tensor]
+) -> list[str]:
+    """Return faults of symbols ``[..., K, D]``: an item's may depend on it and the ego only.
+
+    Beliefs of what a person imagines rest on that: some items are as observed, some as imagined.
+    """
+    every = {name: part for name, part in observation.items() if name != "ego"}
+    other = {name: part.flip(1) for name, part in every.items()}
+    chosen = {name: torch.arange(part.shape[-2]) % 2 == 0 for name, part in every.items()}
+    mixed = {n: torch.where(chosen[n][:, None], part, other[n]) for n, part in every.items()}
+    ego = {"ego": observation["ego"]}
+    there, both = _call(world, "symbols", ego | other), _call(world, "symbols", ego | mixed)
+    return [
+        f"symbols: {name} of an item has to depend on that item and the ego only"
+        for name in every
+        if not torch.equal(
+            both[name], torch.where(chosen[name][:, None], symbols[name], there[name])
+        )
+    ]
 
 
 def _fault_of_chance(world: World, states: Any, observation: Mapping[str, Tensor]) -> str:

@@ -117,8 +117,11 @@ class BeliefState:
 
     def key(self) -> Tensor:
         """Return whole numbers ``[n, ...]``, equal where belief and knowledge are equal."""
-        known = [getattr(self.knowledge, part.name) for part in fields(self.knowledge)]
-        known = [as_whole_numbers(part).flatten(1) for part in known]
+        known = [getattr(self.knowledge, part.name).flatten(1) for part in fields(self.knowledge)]
+        floats = [part for part in known if part.is_floating_point()]
+        known = [part.long() for part in known if not part.is_floating_point()]
+        if floats:
+            known.append(as_whole_numbers(torch.cat(floats, 1)))
         return torch.cat([self.belief[:, None], *known], 1)
 
     def distinct(self) -> tuple[BeliefState, Tensor]:
@@ -173,13 +176,8 @@ class BeliefState:
                 for name, value in observation[0].items()
             },
         )
-        shown = shown.view(-1, steps)
-        # Views of equal evidence lead to equal beliefs, as of an item that is seen or imagined.
-        causes = row_numbers(as_whole_numbers(evidence), 1)[shown]
-        if still is not None:
-            still = still[one]
-            causes = torch.where(still, key[one], causes)
-        parts = torch.stack([action[one], causes, shown])
+        still = None if still is None else still[one]
+        parts = torch.stack([action[one], key[one], shown.view(-1, steps)])
         state, states = replace(self, belief=self.belief[one]), []
         for place in range(steps):
             stays = None if still is None else still[:, place]

@@ -249,12 +249,8 @@ class HumanModel(nn.Module):
 
     def evidence(self, view: View, observation: Observation) -> Tensor:
         """Return the encoder's evidence ``[..., H]`` in a view ``[..., K]`` of an observation."""
-        encoder, domain = self.self_model.encoder, self.domain
-        symbols = domain.symbols(observation)
-        if not view.taken:
-            return encoder.evidence(symbols, view.visible)
-        imagined = domain.symbols({**observation, **view.imagined})
-        return encoder.evidence(symbols, view.visible, imagined, view.taken)
+        shown, visible = view.as_if_seen(observation)
+        return self.self_model.encoder.evidence(self.domain.symbols(shown), visible)
 
     def believe(
         self, belief: Tensor, evidence: Tensor, action: Tensor, still: Tensor | None = None

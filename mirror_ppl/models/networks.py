@@ -17,9 +17,7 @@ from mirror_ppl.domains.base import Domain, Visibility
 from mirror_ppl.models.readers import (
     ImageReader,
     ItemEmbedding,
-    JoinedReader,
     Reader,
-    Source,
     SpeechReader,
     image_patches,
     layers,
@@ -125,35 +123,19 @@ class Encoder(nn.Module):
             embedded[name] = cast(Reader, reader).embed(symbols[name])
         return embedded
 
-    def evidence(
-        self,
-        symbols: Mapping[str, Tensor],
-        visible: Visibility,
-        imagined: Mapping[str, Tensor] | None = None,
-        taken: Visibility | None = None,
-    ) -> Tensor:
+    def evidence(self, symbols: Mapping[str, Tensor], visible: Visibility) -> Tensor:
         """Return the evidence ``[..., H]`` in a view ``[..., K]`` of an observation.
 
-        Without imagined items that is :meth:`combine` of :meth:`embed`, in less time where each
-        view is of an observation of its own.
+        That is :meth:`combine` of :meth:`embed`, in less time where each view is of an observation
+        of its own.
 
         Args:
             symbols: the observation, as the domain encodes it.
             visible: its items that are in the view.
-            imagined: another encoded observation, from which items are taken.
-            taken: the items taken from it; none of them is visible.
         """
         total = self.ego(symbols["ego"])
         for name, reader in self.items.items():
-            sources = [(symbols[name], visible[name])]
-            if imagined is not None and taken:
-                sources.append((imagined[name], taken[name]))
-            if isinstance(reader, ItemEmbedding):
-                total = total + reader.read(sources)
-            elif isinstance(reader, JoinedReader):
-                total = total + reader.join(
-                    [Source(reader.embed(own), mask) for own, mask in sources]
-                )
+            total = total + cast(Reader, reader).read(symbols[name], visible[name])
         return total
 
     def combine(self, embedded: Mapping[str, Tensor], visible: Visibility) -> Tensor:
@@ -165,10 +147,7 @@ class Encoder(nn.Module):
         """
         total = embedded["ego"]
         for name, reader in self.items.items():
-            if isinstance(reader, ItemEmbedding):
-                total = total + reader.join(embedded[name], visible[name])
-            elif isinstance(reader, JoinedReader):
-                total = total + reader.join([Source(embedded[name], visible[name])])
+            total = total + cast(Reader, reader).join(embedded[name], visible[name])
         return total
 
     def previous_actions(self, actions: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ round share that work; ``join`` combines the items of a view into one vector.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,13 +16,6 @@ from mirror_ppl.models.sizes import Sizes
 
 KERNEL = 3
 """Rows and columns of a convolution's kernel."""
-
-
-class Source(NamedTuple):
-    """Embedded items ``[..., K, H]`` and a mask of those in the view ``[..., K]``."""
-
-    embedded: Tensor
-    mask: Tensor
 
 
 def layers(sizes: Sequence[int]) -> nn.Sequential:
@@ -41,6 +33,14 @@ class Reader(nn.Module):
         """Embed each item by itself: symbols ``[..., K, D]`` to ``[..., K, H]``."""
         raise NotImplementedError
 
+    def join(self, embedded: Tensor, mask: Tensor) -> Tensor:
+        """Return the contribution ``[..., H]`` of the items in the view, ``mask`` ``[..., K]``."""
+        raise NotImplementedError
+
+    def read(self, symbols: Tensor, mask: Tensor) -> Tensor:
+        """Embed and join items ``[..., K, D]`` of which a mask ``[..., K]`` is in the view."""
+        return self.join(self.embed(symbols), mask)
+
 
 class ItemEmbedding(Reader):
     """A linear map for each of K items, from symbols ``[..., K, D]`` to ``[..., K, H]``."""
@@ -55,25 +55,18 @@ class ItemEmbedding(Reader):
         """Return contributions ``[..., K, H]`` of ``symbols`` ``[..., K, D]``."""
         return torch.einsum("...kd,kdh->...kh", symbols, self.weight) + self.bias
 
-    def read(self, sources: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    def read(self, symbols: Tensor, mask: Tensor) -> Tensor:
         """Return the sum ``[..., H]`` of the items in the view.
 
         Where every view is of an observation of its own, the items of a view are a single row.
-
-        Args:
-            sources: symbols ``[..., K, D]`` and masks ``[..., K]``; no item is in two of them.
         """
-        symbols, mask = sources[0]
-        for other, there in sources[1:]:
-            symbols, mask = torch.where(there[..., None], other, symbols), mask | there
-        if symbols.dim() - 1 != mask.dim() or symbols.shape[:-1] != mask.shape:
-            return self.join(self.embed(symbols), mask)
+        if symbols.shape[:-1] != mask.shape:
+            return super().read(symbols, mask)
         weights = mask.to(symbols.dtype)
         items = (weights[..., None] * symbols).flatten(-2)
         return items @ self.weight.flatten(0, 1) + weights @ self.bias
 
-    @staticmethod
-    def join(embedded: Tensor, mask: Tensor) -> Tensor:
+    def join(self, embedded: Tensor, mask: Tensor) -> Tensor:
         """Return the sum ``[..., H]`` of the items in the view."""
         weights = mask.to(embedded.dtype)
         return (weights[..., None, :] @ embedded).squeeze(-2)
@@ -87,19 +80,11 @@ class JoinedReader(Reader):
         self.body = layers((items * (each + 1), *hidden))
         self.head = nn.Linear(hidden[-1], encoder, bias=False)
 
-    def join(self, sources: Sequence[Source]) -> Tensor:
-        """Return the contribution ``[..., H]`` to the encoder's first layer.
-
-        Args:
-            sources: items and masks; no item is in two of them.
-        """
-        features = torch.as_tensor(0.0)
-        there = torch.as_tensor(0.0)
-        for embedded, mask in sources:
-            weights = mask.to(embedded.dtype)
-            features = features + weights[..., None] * embedded
-            there = there + weights
-        return self.head(self.body(torch.cat([features.flatten(-2), there], -1)))
+    def join(self, embedded: Tensor, mask: Tensor) -> Tensor:
+        """Return the contribution ``[..., H]`` to the encoder's first layer."""
+        there = mask.to(embedded.dtype)
+        features = (there[..., None] * embedded).flatten(-2)
+        return self.head(self.body(torch.cat([features, there], -1)))
 
 
 class ImageReader(JoinedReader):

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation, Visibility
-from mirror_ppl.row_hashing import as_whole_numbers, random_keys
+from mirror_ppl.row_hashing import as_whole_numbers, exact_keys, random_keys
+from mirror_ppl.shapes import broadcast_shapes
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,19 @@ class View:
             None if self.still is None else function(self.still),
         )
 
+    def as_if_seen(self, observation: Observation) -> tuple[Observation, Visibility]:
+        """Return an observation in which taken items are as imagined, and masks of the view."""
+        visible = {
+            name: mask | self.taken[name] if name in self.taken else mask
+            for name, mask in self.visible.items()
+        }
+        imagined = {
+            name: torch.where(self.taken[name][..., None], value, observation[name])
+            for name, value in self.imagined.items()
+            if name in self.taken
+        }
+        return {**observation, **imagined}, visible
+
     @classmethod
     def joined(cls, parts: Sequence[View]) -> View:
         """Concatenate views ``[n, K]`` of different people."""
@@ -56,27 +70,24 @@ class View:
 
     def numbers(self) -> Tensor:
         """Return a hash of the view ``[...]``, equal where views are equal."""
-        masks = {**self.visible, **{f"{name}, taken": mask for name, mask in self.taken.items()}}
+        masks = [*self.visible.values(), *self.taken.values()]
         if self.still is not None:
-            masks["still"] = self.still[..., None]
+            masks.append(self.still[..., None])
         if not masks:  # the model looks at nothing
             return torch.zeros((), dtype=torch.long)
-        sizes = [mask.shape[-1] for mask in masks.values()]
-        taken = {name: mask for name, mask in self.taken.items() if name in self.imagined}
-        sizes += [self.imagined[name].shape[-2:].numel() for name in taken]
-        device = next(iter(masks.values())).device
-        (*keys,) = random_keys(sum(sizes), device, kind=1).split(sizes)
-        total = torch.zeros((), dtype=torch.long, device=device)
-        for mask in masks.values():
-            # Sums of few keys of 48 bits are exact in 64-bit floats, which multiply faster.
-            total = total + (mask.double() @ (keys.pop(0) >> 14).double()).long()
-        for name, mask in taken.items():
+        shape = broadcast_shapes(*(mask.shape[:-1] for mask in masks))
+        joined = torch.cat([mask.expand(*shape, -1) for mask in masks], -1)
+        total = (joined.double() @ exact_keys(joined.shape[-1], joined.device)).long().sum(-1)
+        for kind, (name, mask) in enumerate(self.taken.items(), 2):
+            if name not in self.imagined:
+                continue
             imagined = self.imagined[name]
-            key = keys.pop(0).view(imagined.shape[-2:])
+            key = random_keys(imagined.shape[-2:].numel(), imagined.device, kind)
+            key = key.view(imagined.shape[-2:])
             # Few items are taken for granted; the others are skipped.
             place = mask.nonzero(as_tuple=True)
             value = as_whole_numbers(imagined.expand(*mask.shape, -1)[place])
             value = (value * key[place[-1]]).sum(-1)
-            each = torch.zeros(mask.shape[:-1], dtype=torch.long, device=device)
+            each = torch.zeros(mask.shape[:-1], dtype=torch.long, device=mask.device)
             total = total + each.index_put(place[:-1], value, accumulate=True)
         return total

@@ -5,6 +5,7 @@ import pytest
 import torch
 from example_driving import rollout, same, state
 
+from mirror_ppl.domains.checking import faults_of
 from mirror_ppl.domains.driving import CAR_LANES, Driving, DrivingState
 
 
@@ -134,6 +135,17 @@ def test_who_assumes_cars_to_come_closer_supposes_it_of_those_seen_once(domain, 
     assert torch.equal(supposed.position, start.position)
     assert torch.equal(supposed.speed[unsure], -start.position[unsure].sign())
     assert torch.equal(supposed.speed[~unsure], start.speed[~unsure])
+
+
+def test_symbols_that_depend_on_other_items_are_a_fault(domain):
+    assert faults_of(domain) == []
+
+    class Mixing(type(domain)):
+        def symbols(self, observation):
+            found = super().symbols(observation)
+            return {**found, "verbal": found["verbal"].cumsum(-2)}
+
+    assert "symbols: verbal of an item has to depend on that item" in faults_of(Mixing())[0]
 
 
 def test_symbols_distinguish_all_observations(domain):

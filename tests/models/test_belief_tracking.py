@@ -111,6 +111,12 @@ def test_a_belief_that_stays_is_as_sure_as_it_was(case):
     assert stayed or views[0].still is None
 
 
+def alike(state):
+    """Which two people have the same belief, up to rounding."""
+    apart = state.believed[:, None] - state.believed
+    return apart.abs().amax(-1) < 1e-5
+
+
 @pytest.mark.parametrize("remembers", [False, True])
 @torch.no_grad()
 def test_steps_one_by_one_come_to_the_same(case, remembers):
@@ -120,7 +126,8 @@ def test_steps_one_by_one_come_to_the_same(case, remembers):
     for transition, expected in zip(transitions, state.through(transitions), strict=True):
         state = state.after(transition)
         torch.testing.assert_close(state.believed, expected.believed, rtol=0, atol=1e-5)
-        assert len(state.belief.unique()) == len(expected.belief.unique())
+        # Beliefs of different origin are one if equal to the last bit, which rounding decides.
+        assert torch.equal(alike(state), alike(expected))
         assert torch.equal(state.key()[:, 1:], expected.key()[:, 1:])
         assert state.step == expected.step
 

@@ -115,19 +115,12 @@ class Knowing(SelfModel):
             lit = WORLD.sought({"ego": ego, **symbols})
             return {"ego": torch.cat(values, -1), "visual": lit, "verbal": symbols["verbal"]}
 
+        def evidence(self, symbols, visible):
+            return self.combine(self.embed(symbols), visible)
+
         def combine(self, embedded, visible):
-            return self.joined(embedded, visible, None)
-
-        def evidence(self, symbols, visible, imagined=None, taken=None):
-            guess = None if imagined is None else self.embed(imagined)
-            return self.joined(self.embed(symbols), visible, guess)
-
-        def joined(self, embedded, visible, imagined):
             kind = embedded["verbal"][..., 0, 1:]
             known = visible["verbal"].float()
-            if imagined is not None:
-                guess = imagined["verbal"][..., 0, 1:]
-                kind, known = torch.where(visible["verbal"], kind, guess), torch.ones_like(known)
             first, second = embedded["ego"].split(5, -1)
             values = (1 - kind) * first + kind * second
             found = (visible["visual"] & embedded["visual"]).any(-1, keepdim=True) & (known > 0)

@@ -130,17 +130,10 @@ def test_hidden_item_contributes_exactly_nothing(name):
 
 @pytest.mark.parametrize("observations", [1, 6])
 def test_evidence_is_that_of_embedded_items(observations):
-    """Six views of one observation or of six, without and with items that are imagined."""
+    """Six views of one observation or of six."""
     network, values, visible = encoder(), symbols(observations), masks(6)
     together = network.combine(network.embed(values), visible)
     torch.testing.assert_close(network.evidence(values, visible), together)
-
-    imagined = {name: value.flip(-2) for name, value in values.items()}
-    taken = {name: ~mask & (torch.arange(4) < 2) for name, mask in visible.items()}
-    everything = network.embed(imagined) | {"ego": torch.tensor(0.0, dtype=torch.float64)}
-    expected = together + network.combine(everything, taken)
-    torch.testing.assert_close(network.evidence(values, visible, imagined, taken), expected)
-    assert (expected != together).any()
 
 
 def test_hidden_item_gets_and_gives_no_gradient():

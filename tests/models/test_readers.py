@@ -13,9 +13,10 @@ from mirror_ppl.domains.search_rescue import SearchRescue
 from mirror_ppl.errors import AssetError, UnknownNameError
 from mirror_ppl.models import speech
 from mirror_ppl.models.networks import PIXEL_SCALE, Encoder, ImageDecoder
-from mirror_ppl.models.readers import ImageReader, Source, SpeechReader, image_patches
+from mirror_ppl.models.readers import ImageReader, SpeechReader, image_patches
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
+from mirror_ppl.models.view import View
 
 WORLD = SearchRescue()
 VERBAL = next(m for m in WORLD.modalities if m.name == "verbal")
@@ -120,18 +121,24 @@ def test_what_is_hidden_counts_for_nothing_and_what_is_seen_does(name):
 
 
 def test_imagined_items_are_read_as_if_they_were_seen():
-    network, values = Encoder(WORLD, sizes_of(WORLD), codes()), observed(4)
-    imagined = {name: value.flip(0) for name, value in values.items()}
+    network = Encoder(WORLD, sizes_of(WORLD), codes())
+    state = WORLD.initial(4, torch.Generator().manual_seed(0))
+    observation = WORLD.observe(state)
+    imagined = {name: value.flip(0) for name, value in observation.items()}
     masks = {m.name: torch.rand(4, len(m.items)) < 0.5 for m in WORLD.modalities}
     taken = {name: ~mask & (torch.rand(mask.shape) < 0.5) for name, mask in masks.items()}
+    symbols, other = WORLD.symbols(observation), WORLD.symbols(imagined)
     overlaid = {
-        name: torch.where(taken[name][..., None], imagined[name], values[name]) for name in masks
+        name: torch.where(mask[..., None], other[name], symbols[name])
+        for name, mask in taken.items()
     }
     both = {name: masks[name] | taken[name] for name in masks}
+    shown, visible = View(masks, taken, imagined).as_if_seen(observation)
     torch.testing.assert_close(
-        network.evidence(values, masks, imagined, taken),
-        network.combine(network.embed(overlaid | {"ego": values["ego"]}), both),
+        network.evidence(WORLD.symbols(shown), visible),
+        network.combine(network.embed(overlaid | {"ego": symbols["ego"]}), both),
     )
+    assert all(torch.equal(visible[name], both[name]) for name in masks)
 
 
 def test_views_share_what_items_look_like():
@@ -139,9 +146,9 @@ def test_views_share_what_items_look_like():
     reader = ImageReader(9, (3, 3, 3), sizes_of(WORLD))
     embedded = reader.embed(observed(1)["visual"])
     masks = torch.rand(7, 9) < 0.5
-    together = reader.join([Source(embedded, masks)])
+    together = reader.join(embedded, masks)
     for mask, row in zip(masks, together, strict=True):
-        torch.testing.assert_close(reader.join([Source(embedded, mask[None])])[0], row)
+        torch.testing.assert_close(reader.join(embedded, mask[None])[0], row)
 
 
 # --- speech -----------------------------------------------------------------------------------
