@@ -25,6 +25,7 @@ from mirror_ppl.baselines.training import check_parts, mean_nll
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.domains import Domain, get_domain, require_known
 from mirror_ppl.errors import DemonstrationsError, InputError
+from mirror_ppl.minimization import minimize
 
 ITERATIONS, ENOUGH = 200, 1e-5
 """Most iterations of the optimizer, and the change of the loss in nats below which it stops."""
@@ -129,20 +130,15 @@ def _mode(inputs: Tensor, actions: Tensor, number: int, precisions: Sequence[flo
     some, chosen, times = _counted(inputs[..., used], actions)
     shared = some.new_zeros(some.shape[-1], number, requires_grad=True)
     own = some.new_zeros(len(some), some.shape[-1], number, requires_grad=True)
-    optimizer = torch.optim.LBFGS(
-        [shared, own], max_iter=ITERATIONS, tolerance_change=ENOUGH, line_search_fn="strong_wolfe"
-    )
 
     def loss() -> Tensor:
-        optimizer.zero_grad()
         log_probabilities = (some @ (shared + own)).log_softmax(-1)
         total = -(times * log_probabilities.gather(-1, chosen).squeeze(-1)).sum()
         for precision, part in zip(precisions, (shared, own), strict=True):
             total = total + 0.5 * precision * part.square().sum()
-        total.backward()
         return total
 
-    optimizer.step(loss)  # pyright: ignore[reportArgumentType]
+    minimize(loss, [shared, own], ITERATIONS, tolerance_change=ENOUGH)
     weights = inputs.new_zeros(len(inputs), inputs.shape[-1], number)
     weights[:, used] = (shared + own).detach()
     return weights

@@ -31,6 +31,7 @@ from torch import Tensor
 from mirror_ppl.domains.driving.lane_values import action_values
 from mirror_ppl.domains.driving.rewards import lane_rewards
 from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.minimization import minimize
 
 CENTRE, SWITCH = "centre_distance", "switch"
 CAR_DISTANCES = 5
@@ -131,17 +132,7 @@ def learn_reward(
 
     device = decisions.lane.device
     weights = torch.zeros(len(FEATURES), dtype=torch.float64, device=device, requires_grad=True)
-    optimizer = torch.optim.LBFGS(
-        [weights], max_iter=iterations, tolerance_grad=1e-6, line_search_fn="strong_wolfe"
-    )
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        objective = loss(weights)
-        objective.backward()
-        return objective
-
-    optimizer.step(closure)  # pyright: ignore[reportArgumentType]
+    minimize(lambda: loss(weights), [weights], iterations, tolerance_grad=1e-6)
     mode = weights.detach()
     hessian = torch.autograd.functional.hessian(loss, mode)
     assert isinstance(hessian, Tensor)

@@ -25,6 +25,7 @@ from mirror_ppl.domains.search_rescue.people import (
     subgoal_distances,
 )
 from mirror_ppl.domains.search_rescue.world import SMOKE_REACH, SearchRescue
+from mirror_ppl.minimization import minimize
 from mirror_ppl.people.base import DomainPeople
 from mirror_ppl.people.recordings import Recording, draw_starts, record
 from mirror_ppl.randomness import derived_generator
@@ -132,23 +133,16 @@ def learn_transitions(recordings: list[Recording]) -> Tensor:
     place, choice, may = torch.cat(places, 1), torch.cat(chosen), torch.cat(possible)
     habit = torch.zeros(people, number, number, requires_grad=True)
     haste = torch.zeros(people, requires_grad=True)
-    optimizer = torch.optim.LBFGS(
-        [habit, haste], max_iter=LEARNING_STEPS, line_search_fn="strong_wolfe"
-    )
 
     def patience() -> Tensor:
         return PATIENCE_MEDIAN * (PATIENCE_SPREAD * haste).exp()
 
     def loss() -> Tensor:
-        optimizer.zero_grad()
         liked = transitions_of(HABIT_SPREAD * habit, patience())[tuple(place)] * may
         chance = liked.gather(-1, choice[:, None]).squeeze(-1) / liked.sum(-1)
-        value = 0.5 * (habit.pow(2).sum() + haste.pow(2).sum()) - chance.log().sum()
-        value.backward()
-        return value
+        return 0.5 * (habit.pow(2).sum() + haste.pow(2).sum()) - chance.log().sum()
 
-    with torch.enable_grad():
-        optimizer.step(loss)
+    minimize(loss, [habit, haste], LEARNING_STEPS)
     with torch.no_grad():
         return transitions_of(HABIT_SPREAD * habit, patience())
 
