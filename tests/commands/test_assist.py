@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import pytest
@@ -11,6 +13,7 @@ from running import command, command_on_cluster
 from mirror_ppl.commands import assist, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.driving import Driving
 from mirror_ppl.evaluation import assistance_cells
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
 
@@ -342,6 +345,17 @@ def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     assert "mirror-kl is left out: beliefs of LatePerson have no density" in error
     played = results_of(tmp_path / "a.json")["communicators"]
     assert tuple(played) == tuple(name for name in COMMUNICATORS if name != "mirror-kl")
+
+
+def test_a_world_s_record_of_planning_holds_unless_options_say_otherwise(monkeypatch):
+    planning = {"discount": 0.5, "hears": 0.7, "kl_weight": 2.0, "kl_measure": "squared"}
+    monkeypatch.setattr(Driving, "record", replace(Driving.record, planning=planning))
+    attributes = {"domain": "driving", "setting": "fog"}
+    posterior = SimpleNamespace(attributes=attributes, people=("person-01",))
+    for given in ({}, {"hears": 0.8, "kl_measure": "kl"}):
+        options = assist.Options(posterior="posterior.nc", **given)
+        planner = assist._pairing(options, posterior, {"population": "paper", "seed": 0}).planner
+        assert {name: getattr(planner, name) for name in planning} == {**planning, **given}
 
 
 def test_nobody_plans_in_a_world_that_the_robot_was_taught_wrong_unless_asked_to(

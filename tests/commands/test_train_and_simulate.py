@@ -41,3 +41,10 @@ def test_simulate_writes_recordings_that_can_be_fitted(tmp_path, capsys):
     small = "--train-rounds", 1, "--draws", 4, "--explore", 1, *RADIUS
     assert command(fit, "--demos", tmp_path / "b.nc", "--out", tmp_path / "out", *small) == 0
     assert set(content(tmp_path / "out")) == RESULTS_OF_RADIUS
+
+
+def test_a_card_shows_a_dash_for_what_could_not_be_measured(capsys):
+    quality = {"share_full": None, "return_full": float("nan"), "agreement_full": 0.5}
+    train._show({"command": "train", "quality": quality})
+    shown = capsys.readouterr().out
+    assert shown.count(" - ") == 2 and "0.500" in shown

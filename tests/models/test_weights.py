@@ -127,3 +127,13 @@ def test_shipped_weights_are_as_good_as_their_card_says(shipped):
         # Decisions of one round go together: the error is at most that of whole rounds.
         error = math.sqrt(stated * (1 - stated) * (1 / number + 1 / of_card))
         assert measured[name] >= stated - 4 * error, name
+
+
+def test_a_world_in_which_actions_do_not_matter_has_no_share_of_the_best(shipped, monkeypatch):
+    def nothing(self, state, action, following):
+        return {"nothing": torch.zeros(action.shape)}
+
+    monkeypatch.setattr(Driving, "rewards", nothing)
+    measured = self_model_quality(shipped[0], 3, seed=0)
+    assert measured["return_full"] == measured["return_random"] == measured["return_exact"] == 0
+    assert not any(name.startswith("share") for name in measured)
