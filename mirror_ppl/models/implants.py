@@ -240,8 +240,8 @@ def reach(domain: Domain, implants: Mapping[str, Tensor]) -> Tensor:
     sites = [implants[site] for site in sight_sites(domain)]
     bins = torch.tensor(domain.reach_bins, device=sites[0].device)
     # Stacking in front copies whole blocks; a hundred thousand combinations are looked up.
-    found = [bins.index_select(0, site.flatten()).view(site.shape) for site in sites]
-    return torch.stack(torch.broadcast_tensors(*found)).movedim(0, -1)
+    index = torch.stack(torch.broadcast_tensors(*sites))
+    return bins.index_select(0, index.flatten()).view(index.shape).movedim(0, -1)
 
 
 def in_units(domain: Domain, draws: Mapping[str, Tensor]) -> dict[str, Tensor]:
