@@ -24,11 +24,12 @@ RECORD = Record(
         "exact": True,
     },
     # A third item costs more than it can gain; the oracle considers two as well. The bomb does not
-    # change by itself, so delaying a message never helps; and if the next stage takes as long, the
-    # planned steps are used up whenever the present stage ends.
+    # change by itself, so delaying a message never helps.
+    # People search about 20 steps for a terminal. A shorter horizon ends before they press by
+    # themselves: silence then seems to spare them a wrong button, which is only put off.
     # A wrong button costs much more than a message, so a gain need not be significant.
     planning={
-        "horizon": 12,
+        "horizon": 24,
         "terminal_value": True,
         "enumerate_above": 0.4,
         "items": 2,
