@@ -2,8 +2,9 @@
 
 A message affects the world only through the person's actions, so the world is rolled out once for
 all candidate messages: one future for each possible sequence of actions. A *path* is such a
-sequence; paths are computed when first requested. The *name* of a path is a number: that of path
-``p`` followed by action ``a`` is ``p * A + a``, and that of the empty path is 0.
+sequence; paths are computed when first requested. The *name* of a path is a number, by which it
+gets random numbers of its own: that of path ``p`` followed by action ``a`` is ``p * F + a``, and
+that of the empty path is 0.
 
 There are two worlds. `SelfModelWorld` is the robot's learned world model; `SimulatorWorld` is the
 domain itself. W stands for draws of the world in which all paths are computed. In a random domain
@@ -12,7 +13,6 @@ paths begin in R *roots* instead, states with different futures, and each path i
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -22,12 +22,12 @@ from torch import Tensor
 from mirror_ppl.checks import require_kind, require_methods, whole_number
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import FUTURES, Domain, Observation, map_state, total_reward
-from mirror_ppl.errors import InputError
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.self_model import SelfModel
 
-NAMES = 2**62
-"""Maximum number of paths, so that names fit into integers."""
+NAMES, FACTOR = 2**62, 0x2545F4914F6CDD1D
+"""Up to this number of paths names count them: F is the number of actions. Names of more paths
+overflow, and are practically different with this factor."""
 
 
 class Dynamics(Protocol):
@@ -80,20 +80,13 @@ class RolloutTree:
         now: the present observation, ``[W, R, ...]``.
         actions: number of actions A.
         horizon: maximum number of steps.
-
-    Raises:
-        InputError: there are too many paths.
     """
 
     def __init__(
         self, dynamics: Dynamics, state: Any, now: Observation, actions: int, horizon: int
     ):
-        if actions**horizon > NAMES:
-            raise InputError(
-                f"of {actions} actions at most {int(62 / math.log2(actions))} steps can be looked "
-                f"ahead, not {horizon}"
-            )
         self.dynamics, self.actions = dynamics, actions
+        self._factor = actions if actions**horizon <= NAMES else FACTOR
         root = torch.zeros(now["ego"].shape[1], dtype=torch.long, device=now["ego"].device)
         self._steps = [_Paths(state, root, now)]
 
@@ -151,7 +144,7 @@ class RolloutTree:
         new = new[here.child[new] < 0]
         if len(new):
             state = map_state(lambda part: part[:, new], here.following)
-            name = here.name[new // self.actions] * self.actions + new % self.actions
+            name = here.name[new // self.actions] * self._factor + new % self.actions
             found = _Paths(state, name, self.dynamics.observe(state))
             known = 0
             if step + 1 < len(self._steps):

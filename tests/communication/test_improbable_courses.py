@@ -119,10 +119,15 @@ def test_paths_are_worked_out_when_they_are_asked_for():
     )
 
 
-def test_more_steps_than_can_be_named_are_refused():
+@pytest.mark.parametrize("steps", [62, 80])
+def test_long_paths_have_names_of_their_own(steps):
+    """Also those of which there are more than whole numbers."""
     past = begun(0, [3, 5, -2, -3], [-1, -1, 1, 1])
-    with pytest.raises(ValueError, match="of 2 actions at most 62 steps can be looked ahead"):
-        SimulatorWorld(DOMAIN).rollouts(past, 63, torch.Generator())
+    rollouts = SimulatorWorld(DOMAIN).rollouts(past, steps, torch.Generator())
+    path, chooser = torch.zeros(64, dtype=torch.long), torch.Generator().manual_seed(0)
+    for step in range(steps):
+        path = rollouts.follow(step, path, torch.randint(2, path.shape, generator=chooser))
+    assert len(rollouts.names(steps).unique()) == 64
 
 
 def test_all_candidates_have_common_random_numbers():

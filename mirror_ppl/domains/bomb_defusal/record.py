@@ -25,12 +25,11 @@ RECORD = Record(
     },
     # A third item costs more than it can gain; the oracle considers two as well. The bomb does not
     # change by itself, so delaying a message never helps.
-    # People search about 20 steps for a terminal. A shorter horizon ends before they press by
-    # themselves: silence then seems to spare them a wrong button, which is only put off.
+    # The whole round is rolled out. Where it ends before people find a terminal by themselves,
+    # silence seems to spare them a wrong button, which is only put off.
     # A wrong button costs much more than a message, so a gain need not be significant.
     planning={
-        "horizon": 24,
-        "terminal_value": True,
+        "horizon": 60,
         "enumerate_above": 0.4,
         "items": 2,
         "patience": 1,
