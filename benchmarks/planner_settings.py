@@ -1,6 +1,6 @@
 r"""What settings of the planner are worth, on people who are reported nowhere else.
 
-    python -m benchmarks.planner_settings --domain bomb_defusal --rounds 0 1 5 --horizon 12 18 24
+    python -m benchmarks.planner_settings --domain bomb_defusal --rounds 0 1 5 --horizon 12 24 60
     python -m benchmarks.planner_settings --domain bomb_defusal --min-standard-errors 0 1 2
     python -m benchmarks.planner_settings --domain search_rescue --min-standard-errors 0 1 2
 
@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from benchmarks._rows import rows_in
 from mirror_ppl.communication.planners import PlannerOptions
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import play_together, speaker
-from mirror_ppl.evaluation.learners import Group, learn
+from mirror_ppl.evaluation.learners import Group, Plannable, learn
 from mirror_ppl.evaluation.study_summary import interval
 
 ROWS = Path(__file__).parents[1] / "docs/results/planner_settings.csv"
@@ -81,7 +82,7 @@ def measure(options: Options) -> None:
                 row |= {"seed": seed, "rounds": rounds} | changes
                 if _key(row) in known:
                     continue
-                learned = learned or learn("mirror", group, rounds, seed, 1)
+                learned = learned or cast(Plannable, learn("mirror", group, rounds, seed, 1))
                 planner = PlannerOptions.of(options.domain, **changes)
                 people = [
                     replace(one, person=learned.person(number, options.draws))

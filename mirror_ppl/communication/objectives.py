@@ -178,6 +178,7 @@ class _Tree:
         draw, path, weight, group: of each sequence ``[E]``.
         belief: index into ``state`` of the belief and knowledge after each ``[E]``.
         state: beliefs and knowledge after the last step.
+        values: action values of these beliefs, ``[m, A]``.
         candidate: one candidate of each group, ``[G]``.
         group_of: group of each candidate and draw, ``[C, S]``.
     """
@@ -198,6 +199,7 @@ class _Tree:
         self.weight = torch.ones(len(self.draw), device=device)
         self.state = context.before
         self.belief = context.own[person.percept[self.draw]]
+        self.values: Tensor | None = None
         self.last = torch.full_like(self.draw, context.last_action)
 
     def draw_of_world(self) -> Tensor:
@@ -238,7 +240,7 @@ class _Tree:
         if told is not None:
             self._merge(self.candidates[:, step + 1 :])
         beliefs = self.state.mean
-        values = self.person.human.action_values(beliefs)
+        values = self.values = self._values()
         # Sequences of a draw share its policy implants: one row a draw, padded to the longest.
         counts = torch.bincount(self.draw, minlength=self.person.number)
         begin = counts.cumsum(0) - counts
@@ -247,6 +249,16 @@ class _Tree:
         padded[self.draw, place] = self.state.belief[self.belief]
         log_probabilities = self.person.act(beliefs[padded], values[padded])[self.draw, place]
         return self.weight[:, None] * log_probabilities.exp()
+
+    def _values(self) -> Tensor:
+        """Return action values of the beliefs ``[m, A]``; those that stayed have theirs."""
+        beliefs, stayed = self.state.mean, self.state.stayed
+        if stayed is None or self.values is None:
+            return self.person.human.action_values(beliefs)
+        values, new = self.values[stayed], stayed < 0
+        if new.any():
+            values[new] = self.person.human.action_values(beliefs[new])
+        return values
 
     def _merge(self, rest: Tensor) -> None:
         """Merge groups that have the same sequences and the same ``rest`` ``[C, l, N]``."""

@@ -87,6 +87,8 @@ class BeliefState:
         knowledge: the domain's, ``[n]``.
         step: the number of the next step.
         memory: cache of inferred beliefs; no cache unless given.
+        stayed: which of the beliefs of the step before each belief is ``[m]``, -1 if it is new;
+            ``None`` if all may be new, or with a memory.
     """
 
     human: HumanModel
@@ -96,6 +98,7 @@ class BeliefState:
     knowledge: Any
     step: int = 0
     memory: Memory | None = None
+    stayed: Tensor | None = None
 
     @classmethod
     def initial(cls, human: HumanModel, number: int, memory: Memory | None = None) -> BeliefState:
@@ -240,23 +243,32 @@ class BeliefState:
         known = len(effects)
         first, which = distinct_rows(causes)
         some = first[first >= known] - known
+        before, begin = self.belief[some], len(mean)
+        new = torch.ones_like(some, dtype=torch.bool)
+        if still is not None and (self.scale is not None or self.memory is not None):
+            new = ~still[some]  # beliefs that do not change keep mean and scale
         found = []
-        for own in some.split(CHUNK) if len(some) else ():
+        for own in some[new].split(CHUNK) if new.any() else ():
             stays = None if still is None else still[own]
-            before = self.mean[self.belief[own]]
-            found.append(self.human.infer(before, evidence[shown[own]], action[own], stays))
+            inferred = self.mean[self.belief[own]], evidence[shown[own]], action[own], stays
+            found.append(self.human.infer(*inferred))
         scales = [part.scale for part in found if isinstance(part, Gaussian)]
-        scale = torch.cat(scales) if scales and self.memory is None else None
-        if still is not None and scale is not None and self.scale is not None:
-            # A belief that does not change keeps its scale.
-            scale = torch.where(still[some, None], self.scale[self.belief[some]], scale)
-        begin = len(mean)
-        mean = torch.cat([mean, *(part.mean if scales else part for part in found)])
+        means = self.mean[before]
+        if found:
+            means[new] = torch.cat([part.mean if scales else part for part in found])
+        scale = None
+        if self.memory is None and (scales or (self.scale is not None and not found)):
+            scale = torch.empty_like(means) if self.scale is None else self.scale[before]
+            if found:
+                scale[new] = torch.cat(scales)
+        mean, stayed = torch.cat([mean, means]), None
         place = torch.arange(begin, len(mean), device=mean.device)
         if still is not None and len(some):
+            stayed = torch.where(new, -1, before)
             # Beliefs that do not change are merged, however long ago they were formed.
             kept, own = _first_of_equal(mean if scale is None else torch.cat([mean, scale], 1))
             mean, scale, place = mean[kept], None if scale is None else scale[kept], own[begin:]
+            stayed = stayed[kept] if self.memory is None else None
         effects = torch.cat([effects, torch.zeros_like(action)])
         effects[some + known] = place
         memory = self.memory
@@ -269,6 +281,7 @@ class BeliefState:
             belief=effects[first[which[known:]]],
             step=self.step + 1,
             memory=memory,
+            stayed=stayed,
         )
 
 

@@ -13,9 +13,10 @@ from mirror_ppl.domains.bomb_defusal.human import BombDefusalHuman
 from mirror_ppl.likelihood.attention import attention_sites
 from mirror_ppl.likelihood.combinations import discrete_sites
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.belief_tracking import BeliefState, Memory, Transition
+from mirror_ppl.models.belief_tracking import NOT_SHOWN, BeliefState, Memory, Transition
 from mirror_ppl.models.human import at_step, messages_at
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.row_hashing import row_numbers
 
 PEOPLE, STEPS = 60, 8
 
@@ -165,8 +166,11 @@ def test_a_belief_is_inferred_once(case, monkeypatch):
     monkeypatch.setattr(type(human), "infer", counted)
     start = BeliefState.initial(human, PEOPLE, Memory.of_rounds(human, observation))
     states = start.through(transitions)
-    assert len(states[-1].memory.causes) == sum(inferred)
-    assert len(states[-1].memory.causes.unique(dim=0)) == sum(inferred)
+    causes = states[-1].memory.causes
+    assert len(causes.unique(dim=0)) == len(causes)
+    # A belief that stays is not inferred.
+    nothing_new = row_numbers(torch.tensor([NOT_SHOWN, NOT_SHOWN]))
+    assert (causes[:, 2] != nothing_new).sum() == sum(inferred)
     assert len(states[-1].mean.unique(dim=0)) == len(states[-1].mean) <= 1 + sum(inferred)
     first, index = states[-1].distinct()
     assert torch.equal(first.key()[index], states[-1].key())
@@ -197,3 +201,19 @@ def test_what_many_observe_is_worked_out_once():
         "visual": (4, 3, 1),
     }
     assert torch.equal(of_each(doubled, distinct), 2 * distinct["ego"])
+
+
+@torch.no_grad()
+def test_beliefs_that_stayed_are_those_of_the_step_before(case):
+    human, _, transitions, _ = case
+    before = BeliefState.initial(human, PEOPLE)
+    stayed = 0
+    for transition in transitions:
+        after = before.after(transition)
+        assert (after.stayed is None) == (human.perceive.__qualname__.startswith("HumanModel"))
+        if after.stayed is not None:
+            some = after.stayed >= 0
+            stayed += int(some.sum())
+            assert torch.equal(after.mean[some], before.mean[after.stayed[some]])
+        before = after
+    assert stayed or before.stayed is None
