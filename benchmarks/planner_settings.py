@@ -27,7 +27,8 @@ from benchmarks._rows import rows_in
 from mirror_ppl.communication.planners import PlannerOptions
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import play_together, speaker
-from mirror_ppl.evaluation.learners import Group, Plannable, learn
+from mirror_ppl.evaluation.learned import Plannable
+from mirror_ppl.evaluation.learners import Group, learn
 from mirror_ppl.evaluation.study_summary import interval
 
 ROWS = Path(__file__).parents[1] / "docs/results/planner_settings.csv"
