@@ -1,6 +1,8 @@
 r"""What settings of the planner are worth, on people who are reported nowhere else.
 
     python -m benchmarks.planner_settings --domain bomb_defusal --rounds 0 1 5 --horizon 12 24 60
+    python -m benchmarks.planner_settings --domain bomb_defusal --rounds 0 1 5 --horizon 12 24 \
+        --terminal-value True
     python -m benchmarks.planner_settings --domain bomb_defusal --min-standard-errors 0 1 2
     python -m benchmarks.planner_settings --domain search_rescue --min-standard-errors 0 1 2
 
@@ -32,7 +34,7 @@ from mirror_ppl.evaluation.learners import Group, learn
 from mirror_ppl.evaluation.study_summary import interval
 
 ROWS = Path(__file__).parents[1] / "docs/results/planner_settings.csv"
-SETTINGS = ("horizon", "min_standard_errors", "enumerate_above")
+SETTINGS = ("horizon", "terminal_value", "min_standard_errors", "enumerate_above")
 COLUMNS = ("domain", "population", "seed", "person", "rounds", *SETTINGS, "net", "oracle")
 
 
@@ -56,6 +58,8 @@ class Options:
     """Numbers of rounds that the posterior is fitted to."""
     horizon: tuple[int, ...] = ()
     """Steps that are looked ahead; the world's unless given."""
+    terminal_value: tuple[bool, ...] = ()
+    """Whether the best return from the horizon on is added; as in the world unless given."""
     min_standard_errors: tuple[float, ...] = ()
     """Standard errors that a message has to gain; the world's unless given."""
     enumerate_above: tuple[float, ...] = ()
@@ -80,7 +84,7 @@ def measure(options: Options) -> None:
             learned = None
             for changes in tried(options):
                 row = {"domain": options.domain, "population": options.population}
-                row |= {"seed": seed, "rounds": rounds} | changes
+                row |= {"seed": seed, "rounds": rounds} | {k: float(v) for k, v in changes.items()}
                 if _key(row) in known:
                     continue
                 learned = learned or cast(Plannable, learn("mirror", group, rounds, seed, 1))
@@ -127,11 +131,13 @@ def table(rows: Sequence[dict[str, str]]) -> str:
     """Return the table of docs/decisions.md: mean losses to the oracle, with intervals."""
     amounts = sorted({int(row["rounds"]) for row in rows})
     heads = [f"{amount} round{'s' * (amount != 1)}" for amount in amounts]
-    names = ("world", "horizon", "standard errors", *heads)
-    lines = [" | ".join(names), " | ".join(["---"] * 3 + ["---:"] * len(amounts))]
+    names = ("world", "horizon", "value at it", "standard errors", *heads)
+    lines = [" | ".join(names), " | ".join(["---"] * 4 + ["---:"] * len(amounts))]
     places = dict.fromkeys((row["domain"], *(row[name] for name in SETTINGS)) for row in rows)
     for place in places:
-        cells = [place[0].replace("_", " "), place[1], f"{float(place[2]):g}"]
+        world, horizon, terminal, errors, _ = place
+        cells = [world.replace("_", " "), f"{float(horizon):g}"]
+        cells += ["best" if float(terminal) else "none", f"{float(errors):g}"]
         for amount in amounts:
             loss = [
                 float(row["net"]) - float(row["oracle"])

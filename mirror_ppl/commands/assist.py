@@ -63,7 +63,7 @@ class Options:
     draws: int = 64
     """Posterior draws that are planned with."""
     horizon: int | None = None
-    """Steps that planners look ahead; 10 in driving, 16 in search_rescue and 60 in bomb_defusal
+    """Steps that planners look ahead; 10 in driving, 16 in search_rescue and 24 in bomb_defusal
     unless given. In highway mirror values the next action alone, without looking ahead."""
     discount: float | None = None
     """Worth of a reward one step later, from above 0 to 1; 1 unless given."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks import example_world, highway_gap, highway_messages
+from benchmarks import example_world, highway_gap, highway_messages, planner_settings
 from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
@@ -41,6 +41,14 @@ def test_the_choice_of_the_prior_over_directions_is_what_its_rows_say():
     assert f"the data are {-total['inf']:.1f} nats more probable under it" in words
     gained, lost = f"{total['0.5']:.1f}".lstrip("0"), f"{-total['2']:.1f}"
     assert f"another {gained}, one of two bins loses {lost}" in words
+
+
+def test_the_table_of_planner_settings_is_what_its_rows_say():
+    page = (DOCS / "decisions.md").read_text()
+    rows = rows_in(planner_settings.ROWS)
+    found = page.partition("<!-- planner settings -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == planner_settings.table(rows)
+    assert all(int(row["seed"]) >= 100 for row in rows)
 
 
 def test_the_table_of_messages_to_drivers_is_what_its_rows_say():

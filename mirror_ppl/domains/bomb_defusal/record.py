@@ -25,11 +25,11 @@ RECORD = Record(
     },
     # A third item costs more than it can gain; the oracle considers two as well. The bomb does not
     # change by itself, so delaying a message never helps.
-    # The whole round is rolled out. Where it ends before people find a terminal by themselves,
-    # silence seems to spare them a wrong button, which is only put off.
+    # People search about 20 steps for a terminal. No value is added at the horizon: the best return
+    # from there on would count as if what they have not done yet could not go wrong any more.
     # A wrong button costs much more than a message, so a gain need not be significant.
     planning={
-        "horizon": 60,
+        "horizon": 24,
         "enumerate_above": 0.4,
         "items": 2,
         "patience": 1,
