@@ -179,8 +179,13 @@ class BeliefState:
                 for name, value in observation[0].items()
             },
         )
-        still = None if still is None else still[one]
-        parts = torch.stack([action[one], key[one], shown.view(-1, steps)])
+        shown = shown.view(-1, steps)
+        # Views of equal evidence lead to equal beliefs, as of an item that is seen or imagined.
+        causes = row_numbers(as_whole_numbers(evidence), 1)[shown]
+        if still is not None:
+            still = still[one]
+            causes = torch.where(still, key[one], causes)
+        parts = torch.stack([action[one], causes, shown])
         state, states = replace(self, belief=self.belief[one]), []
         for place in range(steps):
             stays = None if still is None else still[:, place]
@@ -245,8 +250,9 @@ class BeliefState:
         some = first[first >= known] - known
         before, begin = self.belief[some], len(mean)
         new = torch.ones_like(some, dtype=torch.bool)
-        if still is not None and (self.scale is not None or self.memory is not None):
-            new = ~still[some]  # beliefs that do not change keep mean and scale
+        known_scale = self.scale is not None or self.memory is not None
+        if still is not None and known_scale and not overrides(self.human, "believe"):
+            new = ~still[some]  # these beliefs do not change, nor does their scale
         found = []
         for own in some[new].split(CHUNK) if new.any() else ():
             stays = None if still is None else still[own]
