@@ -252,21 +252,23 @@ class BeliefState:
         new = torch.ones_like(some, dtype=torch.bool)
         known_scale = self.scale is not None or self.memory is not None
         if still is not None and known_scale and not overrides(self.human, "believe"):
-            new = ~still[some]  # these beliefs do not change, nor does their scale
+            new = ~still[some]
         found = []
         for own in some[new].split(CHUNK) if new.any() else ():
             stays = None if still is None else still[own]
-            inferred = self.mean[self.belief[own]], evidence[shown[own]], action[own], stays
-            found.append(self.human.infer(*inferred))
+            own_before = self.mean[self.belief[own]]
+            found.append(self.human.infer(own_before, evidence[shown[own]], action[own], stays))
         scales = [part.scale for part in found if isinstance(part, Gaussian)]
         means = self.mean[before]
         if found:
             means[new] = torch.cat([part.mean if scales else part for part in found])
-        scale = None
-        if self.memory is None and (scales or (self.scale is not None and not found)):
-            scale = torch.empty_like(means) if self.scale is None else self.scale[before]
-            if found:
-                scale[new] = torch.cat(scales)
+        scale = None if self.scale is None else self.scale[before]
+        if scales and self.memory is None:
+            inferred_scale = torch.empty_like(means)
+            inferred_scale[new] = torch.cat(scales)
+            # A belief that does not change keeps its scale.
+            keeps = None if still is None or scale is None else still[some, None]
+            scale = inferred_scale if keeps is None else torch.where(keeps, scale, inferred_scale)
         mean, stayed = torch.cat([mean, means]), None
         place = torch.arange(begin, len(mean), device=mean.device)
         if still is not None and len(some):

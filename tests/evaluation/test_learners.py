@@ -110,13 +110,9 @@ def test_mirror_predicts_what_a_fit_predicts():
 @pytest.mark.parametrize(
     ("name", "domain"),
     [
-        # On the highway they take minutes; tests/domains/highway infers a driver.
-        *(
-            (name, domain)
-            for name in ("perceptual-only", "policy-only")
-            for domain in DOMAINS
-            if domain != "highway"
-        ),
+        # On the highway it takes minutes; tests/domains/highway infers a driver.
+        *(("perceptual-only", domain) for domain in DOMAINS if domain != "highway"),
+        *(("policy-only", domain) for domain in DOMAINS),
         *(("no-implants", domain) for domain in DOMAINS),
         *(("logistic", domain) for domain in DOMAINS),
         *(("bc", domain) for domain in DOMAINS),

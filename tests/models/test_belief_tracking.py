@@ -1,5 +1,6 @@
 """Tracked beliefs, against the recursion of the human model for each person by itself."""
 
+from copy import copy
 from dataclasses import replace
 
 import pytest
@@ -217,3 +218,20 @@ def test_beliefs_that_stayed_are_those_of_the_step_before(case):
             assert torch.equal(after.mean[some], before.mean[after.stayed[some]])
         before = after
     assert stayed or before.stayed is None
+
+
+@torch.no_grad()
+def test_a_model_with_the_same_believe_of_its_own_has_the_same_beliefs(case):
+    """What does not change is then inferred again, which must make no difference."""
+    human, _, transitions, _ = case
+
+    class Own(type(human)):
+        def believe(self, belief, evidence, action, still=None):
+            return super().believe(belief, evidence, action, still)
+
+    own = copy(human)
+    own.__class__ = Own
+    first, other = (BeliefState.initial(each, PEOPLE).through(transitions) for each in (human, own))
+    for one, two in zip(first, other, strict=True):
+        torch.testing.assert_close(one.believed, two.believed, rtol=0, atol=1e-5)
+        torch.testing.assert_close(one.scale[one.belief], two.scale[two.belief], rtol=0, atol=1e-5)
