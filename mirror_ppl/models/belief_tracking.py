@@ -264,11 +264,11 @@ class BeliefState:
             means[new] = torch.cat([part.mean if scales else part for part in found])
         scale = None if self.scale is None else self.scale[before]
         if scales and self.memory is None:
-            inferred_scale = torch.empty_like(means)
-            inferred_scale[new] = torch.cat(scales)
-            # A belief that does not change keeps its scale.
-            keeps = None if still is None or scale is None else still[some, None]
-            scale = inferred_scale if keeps is None else torch.where(keeps, scale, inferred_scale)
+            before_scale, scale = scale, torch.empty_like(means)
+            scale[new] = torch.cat(scales)
+            if still is not None and before_scale is not None:
+                # A belief that does not change keeps its scale.
+                scale = torch.where(still[some, None], before_scale, scale)
         mean, stayed = torch.cat([mean, means]), None
         place = torch.arange(begin, len(mean), device=mean.device)
         if still is not None and len(some):
