@@ -6,7 +6,7 @@ from typing import NoReturn
 
 from mirror_ppl.commands import COMMANDS, call
 from mirror_ppl.console import guarded
-from mirror_ppl.errors import OptionError
+from mirror_ppl.errors import OptionError, UnknownNameError
 from mirror_ppl.version import __version__
 
 MODULE, SCRIPT = "python -m mirror_ppl", "mirror-ppl"
@@ -40,6 +40,9 @@ def main(args: Sequence[str], program: str = MODULE) -> int:
             print(f"mirror_ppl {__version__}")
         case [named, *rest] if (name := named.replace("-", "_")) in COMMANDS:
             call(name, spoken(program, name), rest)
+        case [first, *_] if not first.startswith("-"):
+            known = [name.replace("_", "-") if program == SCRIPT else name for name in COMMANDS]
+            raise UnknownNameError.of("command", first, known)
         case [*_, last]:
             raise OptionError(f'unknown argument "{last}"; try {program} --help')
     return 0

@@ -16,6 +16,7 @@ from mirror_ppl.errors import MirrorError
 
 Base = TypeVar("Base")
 _FILES: set[Path] = set()
+_PACKAGE = Path(__file__).resolve().parent
 _LIBRARIES = ("mirror_ppl", "torch", "pyro", "builtins", "abc", "typing", "dataclasses")
 
 
@@ -89,8 +90,8 @@ def describe(error: BaseException, path: Path | None = None) -> str:
         text = f"the file ends the program, sys.exit({text})"
     else:
         text = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    if not frames:
-        return text
+    if not own and (not frames or _PACKAGE in Path(frames[-1].filename).resolve().parents):
+        return text  # it called the user's code wrongly, as the message says
     line = (own or frames)[-1]
     return f"{text} ({Path(line.filename).name}, line {line.lineno})"
 
@@ -117,7 +118,8 @@ def _functions_from_libraries(values: Iterable[Any]) -> bool:
 
 
 def _from_libraries(defined: FunctionType | type) -> bool:
-    return defined.__module__.partition(".")[0] in _LIBRARIES
+    # None if a class was executed without a module.
+    return (defined.__module__ or "").partition(".")[0] in _LIBRARIES
 
 
 def passed_user_code(error: BaseException) -> bool:

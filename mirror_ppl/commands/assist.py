@@ -337,9 +337,9 @@ def _people(options: Options):
             )
     if None in source.values():
         raise PosteriorError(
-            f"{options.posterior}: does not say which simulated people it is of; give --population "
-            "and --people-seed (people who were recorded are assisted from Python, see "
-            "docs/communicator.md)"
+            f"{options.posterior}: is not of simulated people, as far as it says; recorded people "
+            "are assisted from Python (docs/communicator.md), and only if these are simulated "
+            "people, give --population and --people-seed"
         )
     if not str(source["seed"]).isdecimal():
         raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")

@@ -200,7 +200,7 @@ class Decision:
         if turn is None:
             return f"{text}: brings their belief closer to the truth"
         step, action, without, told = turn
-        worth = f"(gain {self.gain.mean:+.2f})"
+        worth = f"(gain {self.gain.mean:+.2f}{self._with_later()})"
         if without - told < LITTLE:
             return f"{text}: slightly changes what they do in the steps ahead {worth}"
         # Their lane at later steps is not known.
@@ -229,6 +229,15 @@ class Decision:
         )
         deed = world.deed(now, None, int(values.argmax()))
         return f"{deed}: {about}" if about else deed
+
+    def _with_later(self) -> str:
+        """Name the later messages of the plan, since the gain is of all of it."""
+        later = [
+            f"{self._about(message)} in {step} step{'s' * (step > 1)}"
+            for step, message in enumerate(self.plan)
+            if step and message
+        ]
+        return f" together with {' and '.join(later)}" if later else ""
 
     def _why_not(self) -> str:
         if self.over:

@@ -9,6 +9,7 @@ from mirror_ppl.checks import require_kind
 from mirror_ppl.communication.communicator import Communicator, Decision
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
+from mirror_ppl.domains.base import require_known
 from mirror_ppl.domains.controls import action_at
 from mirror_ppl.errors import InputError
 
@@ -63,14 +64,14 @@ class Companion:
     def observe(
         self,
         observation: Mapping[str, Any],
-        action: int | Sequence[float],
+        action: str | int | Sequence[float],
         message: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         """Record the person's action and the observation after it.
 
         Args:
             observation: the observation after the action.
-            action: index of the action; in a world with controls their values ``[C]``.
+            action: name or index of the action; in a world with controls their values ``[C]``.
             message: names of the items that were communicated before it, by modality; unless given,
                 those of the decision, or none if there was no decision.
 
@@ -88,7 +89,12 @@ class Companion:
         else:
             items = {name: tuple(own) for name, own in (message or {}).items()}
             told = channels.split(channels.flags(items))
-        number = action_at(domain.controls, action) if domain.controls else action
+        if domain.controls:
+            number = action_at(domain.controls, action)
+        elif isinstance(action, str):
+            number = domain.actions.index(require_known(action, "action", domain.actions))
+        else:
+            number = action
         after = past.then(told, number, observation)  # pyright: ignore[reportArgumentType]
         after.check(domain)
         self.past, self._decision = after, None

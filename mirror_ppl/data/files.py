@@ -134,7 +134,9 @@ def from_dataset(
         DemonstrationsError: the dataset is not in the format, or its values are not valid.
     """
     for name, expected in (("format", FORMAT), ("format_version", FORMAT_VERSION)):
-        given = str(dataset.attrs.get(name, "missing"))
+        if name not in dataset.attrs:
+            raise DemonstrationsError(f"attribute {name} is missing, expected {expected!r}")
+        given = str(dataset.attrs[name])
         if given != expected:
             raise DemonstrationsError(f"attribute {name} is {given!r}, expected {expected!r}")
     domain_name = _agreed(dataset, "domain", domain)

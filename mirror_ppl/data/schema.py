@@ -209,10 +209,16 @@ class _Places:
         expected = {key: sizes[key] for key in self.dimensions[name]}
         if tuple(value.shape) != tuple(expected.values()):
             wanted = ", ".join(f"{key} {size}" for key, size in expected.items())
-            raise DemonstrationsError(
+            message = (
                 f"{name} has shape {tuple(value.shape)}, "
                 f"expected {tuple(expected.values())} ({wanted})"
             )
+            others = [size for key, size in expected.items() if key != "time"]
+            given = zip(expected, value.shape, strict=False)
+            given = [size for key, size in given if key != "time"]
+            if value.dim() == len(expected) and given == others:
+                message += f", as action has {sizes['step']} steps"
+            raise DemonstrationsError(message)
 
     def refuse(
         self, name: str, bad: Tensor, value: Tensor, expected: str, inside: Tensor | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from difflib import get_close_matches
 from typing import Any
 
 import torch
@@ -21,6 +22,8 @@ ROUNDS = 6
 REMARKED = 100
 """Number of rounds on which remarks rest."""
 TOLERANCE = 1e-4
+ALMOST = 0.9
+"""Similarity from which another name counts as misspelt."""
 
 
 @dataclass(frozen=True)
@@ -297,12 +300,24 @@ def remarks_on(world: World) -> str:
     if not earned:
         return "all rounds are over where they begin"
     remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
+    remark += "".join(f"; {one}" for one in _misspelt(world))
     if world.random and not chance:
         remark += "; no step depended on chance, so random may be left out"
     if not offers(world, "over"):
         return remark
     remark += f"; {number} of {REMARKED} rounds ended"
     return remark if number else f"{remark}, so ends were not checked"
+
+
+def _misspelt(world: World) -> list[str]:
+    """Return a remark on each attribute that nothing reads and that almost has a member's name."""
+    declared = [name for kind in World.__mro__ for name in vars(kind).get("__annotations__", {})]
+    members = {name for name in (*dir(World), *declared) if not name.startswith("_")}
+    found = []
+    for name in dir(world):
+        if name not in members and (close := get_close_matches(name, members, 1, ALMOST)):
+            found.append(f"{name} is not read; perhaps you meant {close[0]}")
+    return found
 
 
 def _outcome(world: World, state: Any, action: Tensor) -> dict[str, Tensor]:

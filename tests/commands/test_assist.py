@@ -237,7 +237,7 @@ def quickly(monkeypatch):
         ({"domain_version": "99"}, "is of domain version 99, not"),
         ({"self_model": "0" * 16}, f"is of self model {'0' * 16}, not"),
         ({"human_model": "LatePerson"}, "is of human model LatePerson, not mirror"),
-        ({"recorded_population": None}, "does not say which simulated people it is of"),
+        ({"recorded_population": None}, "is not of simulated people, as far as it says"),
         ({"recorded_population": "martians"}, 'unknown population "martians"'),
     ],
 )

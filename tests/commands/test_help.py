@@ -81,7 +81,8 @@ def test_the_status_of_the_script_is_the_commands(tmp_path):
     wrong = called("fit", "--step", "3")
     assert (wrong.returncode, wrong.stdout) == (2, "")
     assert wrong.stderr.endswith("see mirror-ppl fit --help\n")
-    assert called("fly").stderr == 'error: unknown argument "fly"; try mirror-ppl --help\n'
+    known = ", ".join(sorted(name.replace("_", "-") for name in COMMANDS))
+    assert called("fly").stderr == f'error: unknown command "fly"; known: {known}\n'
 
 
 # --- help -------------------------------------------------------------------------------------

@@ -62,7 +62,8 @@ def test_what_was_really_said_counts(communicator):
     companion.decide()
     companion.observe(next(seen), 0, {"verbal": ["rear-left"]})
     assert companion.past.told["verbal"][0].tolist() == [False, False, True, False]
-    companion.observe(next(seen), 0)  # nothing was decided
+    companion.observe(next(seen), "stay")  # nothing was decided
+    assert companion.past.actions.tolist() == [0, 0]
     assert not companion.past.told["verbal"][1].any()
     with pytest.raises(UnknownNameError, match="unknown verbal item"):
         companion.observe(next(seen), 0, {"verbal": ["above"]})
@@ -79,13 +80,14 @@ def test_what_cannot_be_is_refused_and_changes_nothing(communicator):
     now = next(seen)
     for bad, message in (
         ((now, 9), "there is no action 9"),
+        ((now, "sty"), '; perhaps you meant "stay"'),
         ((now, 0.5), "whole"),
         (({"ego": now["ego"]}, 0), "observation"),
         ((now | {"visual": now["visual"][:2]}, 0), "shape"),
         ((now | {"visual": now["visual"] + np.nan}, 0), "nan"),
         (("nothing", 0), "observation"),
     ):
-        with pytest.raises(InputError, match=message):
+        with pytest.raises((InputError, UnknownNameError), match=message):
             companion.observe(*bad)
         assert companion.past.time == 0
     for _ in range(DOMAIN.horizon):

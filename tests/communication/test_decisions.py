@@ -239,6 +239,16 @@ def test_why_a_message(silent, told, what):
     assert turned(silent, told).why() == f"{AHEAD}: they would {what} (gain +1.00)"
 
 
+def test_why_names_what_the_plan_sends_later_since_the_gain_is_of_both():
+    later = decision(
+        1,
+        [plan(None, None), plan(SAID, SHOWN)],
+        [[0.0, 0], [1, 1]],
+        [[[0.9, 0.1]] * 2, [[0.2, 0.8]] * 2],
+    )
+    assert later.why().endswith(f"0.20 (gain +1.00 together with {AHEAD} in 1 step)")
+
+
 def test_why_where_no_action_changes_much():
     assert turned([[0.9, 0.1]], [[0.87, 0.13]]).why() == (
         f"{AHEAD}: slightly changes what they do in the steps ahead (gain +1.00)"

@@ -194,7 +194,7 @@ BAD_DATASETS = {
     ),
     "no format": (
         lambda dataset: dataset.drop_attrs(),
-        "attribute format is 'missing', expected 'mirror_ppl demonstrations'",
+        "attribute format is missing, expected 'mirror_ppl demonstrations'",
     ),
     "unknown domain": (
         renamed(domain="boats"),
@@ -224,7 +224,7 @@ BAD_DATASETS = {
     "wrong shape": (
         lambda dataset: dataset.isel(time=slice(4)),
         "ego has shape (3, 3, 4, 1), expected (3, 3, 5, 1) "
-        "(person 3, round 3, time 5, ego_feature 1)",
+        "(person 3, round 3, time 5, ego_feature 1), as action has 4 steps",
     ),
     "too few items": (
         lambda dataset: dataset.isel(visual_item=slice(3)),
@@ -291,7 +291,7 @@ def test_files_that_cannot_be_read(ragged, path, tmp_path):
             load_demonstrations(path)
     # A netCDF file of something else.
     xr.Dataset({"x": ("y", [1.0])}).to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(DemonstrationsError, match="attribute format is 'missing'"):
+    with pytest.raises(DemonstrationsError, match="attribute format is missing"):
         load_demonstrations(path)
 
 

@@ -225,6 +225,21 @@ def test_a_bad_world_ends_a_command_with_one_line(tmp_path, capsys):
     assert "left out" in capsys.readouterr().out
 
 
+def test_misspelt_members_are_remarked_on_and_wrong_ones_are_not_placed_in_the_package(
+    tmp_path, capsys
+):
+    from mirror_ppl.commands import check_domain
+
+    text, file = FILE.read_text(), tmp_path / "almost.py"
+    file.write_text(text.replace("    horizon = 8\n", "    horizon = 8\n    setings = ('dim',)\n"))
+    assert command(check_domain, f"{file}:RoundTable") == 0
+    assert "setings is not read; perhaps you meant settings" in capsys.readouterr().out
+    file.write_text(text.replace("def transition(self, state,", "def transition(self,"))
+    assert command(check_domain, f"{file}:RoundTable") == 1
+    said = capsys.readouterr().out
+    assert "transition fails: TypeError: " in said and ".py, line" not in said
+
+
 def test_memory_keeps_what_has_not_changed_and_what_lasts():
     from mirror_ppl.domains.memory import LastSeen
 
