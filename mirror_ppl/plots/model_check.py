@@ -22,7 +22,7 @@ LIKELIHOODS = 3.6
 """Inches of the panel of held-out actions."""
 LEAST_WIDTH, CHARACTER = 1.4, 0.09
 """Inches of the left panel without ids, and of a character of an id."""
-WRAP, DARK = 12, 1.8
+WRAP, DARK = 12, 2.3
 """Characters in a line of a name, and the depth of a colour above which letters are white."""
 MOST_PEOPLE = 60
 
@@ -30,9 +30,10 @@ MOST_PEOPLE = 60
 def plot_model_check(data: az.InferenceData) -> Picture:
     """Draw each person's posterior predictive checks and likelihoods of held-out actions.
 
-    Left: two-sided p-values, blue where there is more than the model predicts, red where there is
-    less; frames mark those that make a person suspect. Right, if rounds were held out: NLL in nats
-    an action of the model, of the base rate of each action, and of the model without implants.
+    Left: two-sided p-values, with an arrow up (blue) where there is more than the model predicts
+    and down (red) where there is less; frames mark those that make a person suspect. Right, if
+    rounds were held out: NLL in nats an action of the model, of the base rate of each action, and
+    of the model without implants.
 
     Args:
         data: with the group ``model_check``; of more than 60 people the first are drawn.
@@ -78,6 +79,10 @@ def _p_values(ax, group: xr.Dataset) -> None:
                 continue
             text = f"{tail:.2f}" if tail >= 0.01 else f"{tail:.3f}"  # noqa: PLR2004
             text = f"<{2 / REPLICATES:.3f}" if tail < 2 / REPLICATES else text
+            # Grey prints do not tell the colours apart.
+            text = (
+                "\N{UPWARDS ARROW}" if values[row, column] < 0.5 else "\N{DOWNWARDS ARROW}"
+            ) + text
             colour = "white" if depth[row, column] > DARK else BLACK
             frame = {"edgecolor": colour, "facecolor": "none", "pad": 1.5, "lw": 1}
             ax.text(
@@ -93,7 +98,8 @@ def _p_values(ax, group: xr.Dataset) -> None:
     names = [textwrap.fill(str(name), WRAP) for name in group["check"].values]
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9)
     title = (
-        "Two-sided p-values; blue: more, red: less than predicted;\nframes: such people are suspect"
+        "Two-sided p-values; \N{UPWARDS ARROW} more, \N{DOWNWARDS ARROW} less than predicted;\n"
+        "frames: such people are suspect"
     )
     ax.set_title(title, fontsize=11)
 

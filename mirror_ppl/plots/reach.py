@@ -10,7 +10,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import draws, explain, of_person, people, truth
+from mirror_ppl.plots.reading import draws, edged, explain, of_person, people, truth
 
 if TYPE_CHECKING:
     import arviz as az
@@ -84,7 +84,9 @@ def reach_picture(data: az.InferenceData) -> Picture:
 def _frame(row: int, number: int):
     from matplotlib.patches import Rectangle
 
-    return Rectangle((-0.5, row - 0.45), number, 0.9, fill=False, edgecolor="tab:red", lw=1.4)
+    frame = Rectangle((-0.5, row - 0.45), number, 0.9, fill=False, edgecolor="tab:red", lw=1.4)
+    frame.set_path_effects(edged())
+    return frame
 
 
 def _domain(data: az.InferenceData):

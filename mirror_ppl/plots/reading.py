@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 
 from mirror_ppl.domains import require_known
 from mirror_ppl.errors import DemonstrationsError
@@ -22,6 +23,11 @@ TRUTH = "truth_"
 # Okabe and Ito's colours, which people of any colour vision can distinguish.
 BLUE, ORANGE, PURPLE, BLACK, GREY = "#0072B2", "#E69F00", "#CC79A7", "#000000", "#8a8a8a"
 POSTERIOR, PRIOR, TRUE, OBSERVED = BLUE, GREY, ORANGE, BLACK
+
+
+def edged(width: float = 3.2) -> list[AbstractPathEffect]:
+    """Return effects that draw a line on a white one, so that it is seen on dark colours, too."""
+    return [Stroke(linewidth=width, foreground="white"), Normal()]
 
 
 def people(data: az.InferenceData) -> list[str]:

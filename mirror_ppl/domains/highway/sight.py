@@ -12,7 +12,7 @@ from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
 from mirror_ppl.domains.highway.world import DIRECTION_OF, KNOTS, Highway
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture, SightPicture, label_of
-from mirror_ppl.plots.reading import BLUE, TRUE, draws, explain, of_person, people, truth
+from mirror_ppl.plots.reading import BLUE, TRUE, draws, edged, explain, of_person, people, truth
 
 if TYPE_CHECKING:
     import arviz as az
@@ -103,7 +103,10 @@ def _outline(ax: PolarAxes, reach: list[float]) -> None:
     far = [reach[direction] for direction in DIRECTION_OF]
     angles = np.repeat(edges, 2)[1:-1]
     radius = np.repeat(far, 2)
-    ax.plot(np.append(angles, angles[0]), np.append(radius, radius[0]), color=TRUE, linewidth=1.6)
+    (line,) = ax.plot(
+        np.append(angles, angles[0]), np.append(radius, radius[0]), color=TRUE, lw=1.6
+    )
+    line.set_path_effects(edged(3.6))
 
 
 PICTURES = {
