@@ -69,7 +69,7 @@ def table(rows: Sequence[dict[str, str]]) -> str:
         lines.append(
             f"| {label} | {number['net']:.1f} ± {number['net_se']:.1f} | {'' if none else gain} | "
             f"{'' if none or name == 'oracle' else way} | "
-            f"{accidents} of {row['people']} x {row['rounds']} | "
+            f"{accidents} of {number['people'] * number['rounds']:.0f} | "
             f"{number['visual']:.2f}, {number['verbal']:.2f} |"
         )
     return "\n".join(lines)

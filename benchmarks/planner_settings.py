@@ -128,7 +128,7 @@ def _add(rows: Sequence[dict]) -> None:
 
 
 def table(rows: Sequence[dict[str, str]]) -> str:
-    """Return the table of docs/decisions.md: mean losses to the oracle, with intervals."""
+    """Return the table of docs/decisions.md: net return minus the oracle's, with intervals."""
     amounts = sorted({int(row["rounds"]) for row in rows})
     heads = [f"{amount} round{'s' * (amount != 1)}" for amount in amounts]
     names = ("world", "horizon", "value at it", "standard errors", *heads)

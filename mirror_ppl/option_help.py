@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 WORDS = {
     "allow_contradictions": "PERCENT",
-    "by": "{loo,heldout}",
+    "by": "{loo,heldout,evidence}",
     "device": "DEVICE",
     "domain": "WORLD",
     "guide": "ENGINE",

@@ -286,9 +286,9 @@ from mirror_ppl.plots.communication import plot_action, plot_utilities
 plot_utilities(decision)
 
 # %% [markdown]
-# All candidates as a table, best first. `later` is the plan's message for later steps,
-# `probability` the share of draws in which the candidate beats silence, and `p(switch)` the
-# probability of a change of lanes now.
+# All candidates as a table, largest mean gain first; the chosen one has the largest gain minus two
+# standard errors. `later` is the plan's message for later steps, `probability` the share of draws
+# in which the candidate beats silence, and `p(switch)` the probability of a change of lanes now.
 
 # %%
 decision.alternatives.head(6).round(3)

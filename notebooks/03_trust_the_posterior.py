@@ -256,7 +256,7 @@ for number in (0,) if quick else (0, 1):
         )
         tests = [person["test"] for person in fitted.summary["people"]]
         above = np.mean([test["nll"] - test["floor"] for test in tests])
-        rows.setdefault(f"{number} rounds", {})[how] = round(float(above), 3)
+        rows.setdefault(f"{number} round{'s' * (number != 1)}", {})[how] = round(float(above), 3)
 pd.DataFrame(rows).T.rename_axis("NLL above the floor, nats an action")
 
 # %% [markdown]

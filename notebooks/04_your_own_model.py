@@ -209,8 +209,8 @@ pd.DataFrame(
 # %% [markdown]
 # A positive log Bayes factor favours `Reluctant`. For the second person the evidence is strong, the
 # held-out NLL is lower, and the model check finds a misfit of `mirror`. For the first person all
-# three are about equal: other implants absorb most of a small reluctance, and a verdict of `ok` is
-# no proof. Four held-out rounds are few.
+# three are about equal: other implants absorb most of a reluctance of 2 nats, and a verdict of
+# `ok` is no proof. Four held-out rounds are few.
 #
 # ## From here
 #

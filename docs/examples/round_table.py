@@ -45,7 +45,7 @@ class RoundTable(World):
         return Table(pot, puddle, torch.zeros(batch, dtype=torch.bool))
 
     def transition(self, state, action):
-        """Whoever moves to the right has everything one place further to the left."""
+        """A move to the right shifts everything one place to the left."""
         move = torch.tensor([0, -1, 1])[action] * ~state.has_tea
         pot, puddle = around(state.pot - move), around(state.puddle - move)
         return replace(state, pot=pot, puddle=puddle, has_tea=state.has_tea | (pot == 0))
@@ -64,7 +64,7 @@ class RoundTable(World):
         return state.has_tea
 
     def observe(self, state):
-        """Everything that there is, whoever looks."""
+        """All features of all items, seen or not."""
         items = torch.stack([state.pot, state.puddle], -1)[..., None].float()
         return {"ego": state.has_tea[..., None].float(), "visual": items}
 

@@ -15,7 +15,7 @@ COMMANDS = {
     "evaluate": "compare MIRROR with its ablations and baselines, as the paper does",
     "train": "train a domain's self-model, or the network of the amortized guide",
     "simulate": "record rounds of simulated people",
-    "check_domain": "look over a world of your own, and tell what it offers",
+    "check_domain": "check a world of your own and list what it offers",
 }
 
 

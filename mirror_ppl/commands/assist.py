@@ -28,8 +28,8 @@ KL, LEARNED = "mirror-kl", "mirror-self-model"
 PROGRAM = "python -m mirror_ppl.assist"
 DESCRIPTION = """Let communicators send messages to the simulated people of a posterior in their
 rounds, and print for each the people's returns, the cost of messages and what they were about. All
-play the same rounds with the same random numbers. With --json, --log or --film, a run that is
-stopped goes on where it was when the same command is given again."""
+play the same rounds with the same random numbers. With --json, --log or --film, the same
+command resumes a stopped run."""
 EXAMPLES = {
     "all communicators, with every decision in a file": (
         "--json runs/assist.json --log runs/assist.jsonl"
@@ -55,7 +55,7 @@ class Options:
     communicator: tuple[str, ...] = ()
     """One or several of mirror, mirror-self-model, mirror-kl, none, all, random, nearest, oracle;
     all of them unless given (but for mirror-self-model where the robot was taught wrong rules).
-    What each is stands in docs/communicator.md."""
+    They are described in docs/communicator.md."""
     rounds: int = 20
     """Rounds of each person."""
     people: int | None = None
@@ -74,8 +74,8 @@ class Options:
     patience: int | None = None
     """Steps over which a message is compared with saying it later; 1 compares with silence only."""
     enumerate_above: float | None = None
-    """Courses of actions less probable than this are kept by chance: 0 is exact, 1 samples one
-    course a draw; 0.1 in driving and 0.4 in search_rescue and bomb_defusal unless given."""
+    """Action sequences at least this probable are enumerated, others sampled: 0 is exact, 1 samples
+    one sequence a draw; 0.1 in driving and 0.4 in search_rescue and bomb_defusal unless given."""
     hears: float | None = None
     """Prior probability that messages of a channel reach a person; updated by what they do after
     messages. 1 assumes that all messages reach them; 0.9 unless given."""

@@ -26,11 +26,10 @@ PROGRAM = "python -m mirror_ppl.calibrate"
 DESCRIPTION = """Simulation-based calibration: simulates people from the human model's prior, fits
 them, and tests that ranks of the truth among posterior draws are uniform. Prints a table for each
 implant and number of rounds, and writes ranks.png, ecdf.png, coverage.png and calibration.nc. The
-exit status is 1 if calibration is rejected. A run that is stopped goes on where it was when the
-same command is given again."""
+exit status is 1 if calibration is rejected. The same command resumes a stopped run."""
 EXAMPLES = {
     "the engine importance, in a few minutes": "--people 100 --rounds 1 5 --out runs/calibration",
-    "the trained network, of people who react late": "--guide amortized --human-model late",
+    "people who react late": "--human-model late",
 }
 """Arguments, by what they are for."""
 REJECTED = 1
@@ -47,8 +46,8 @@ class Options:
     """The world: driving, search_rescue, bomb_defusal, highway, or one of your own,
     path/to/file.py:Class, whose code is run."""
     setting: str | None = None
-    """The setting under which rounds are recorded; what people see is up to their implants.
-    Default: the one in which people see less."""
+    """The setting under which rounds are recorded; what people see depends on their
+    implants. Default: the one in which people see less."""
     guide: str = "importance"
     """What to test: importance, amortized, auto, svi or nuts."""
     guide_file: Path | None = None
@@ -62,9 +61,10 @@ class Options:
     out: Path = Path("runs/calibration")
     """Folder for the results; made if it is not there."""
     human_model: str | None = None
-    """Another human model: all (weighs mirror, late and preferring for each person), late,
-    preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or no-implants,
-    or one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
+    """Another human model: all (averages over several models for each person), late, noticing,
+    forgetting, preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or
+    no-implants, or one of your own, path/to/file.py:Class, whose code is run (see
+    docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     jobs: int = -1

@@ -1,4 +1,4 @@
-"""`python -m mirror_ppl.check_domain`: look over a world that a user wrote."""
+"""`python -m mirror_ppl.check_domain`: check a world that a user wrote."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from mirror_ppl.domains import World
 
 PROGRAM = "python -m mirror_ppl.check_domain"
-DESCRIPTION = """Look over a world of your own, whose code is run: whether it keeps the contract of
-worlds, one line for each thing that is wrong, and what it offers. The exit status is 1 if something
-is wrong, and 2 if it cannot be loaded. How a world is written stands in docs/adding_a_world.md."""
+DESCRIPTION = """Check a world of your own, whose code is run: print one line for each fault, or
+list what the world offers. The exit status is 1 if something is wrong, and 2 if it cannot be
+loaded. docs/adding_a_world.md describes how to write a world."""
 EXAMPLES = {
     "a world that the documentation explains": "docs/examples/round_table.py:RoundTable",
 }

@@ -22,8 +22,8 @@ DESCRIPTION = """Compare MIRROR with its ablations and baselines on simulated pe
 how well each predicts held-out actions, by the number of rounds that it learned from. assistance:
 the net return of people who receive messages from communicators that plan with each. relevance: the
 share of the communicated items that is relevant. Writes rows of every person (CSV), tables to read
-(Markdown), a summary (JSON) and a figure. A run that is stopped goes on where it was when the same
-command is given again; the exit status is 1 if something failed."""
+(Markdown), a summary (JSON) and a figure. The same command resumes a stopped run. The exit
+status is 1 if something failed."""
 EXAMPLES = {
     "a quick look at predictions beside baselines": (
         "prediction --people 4 --seeds 1 --models mirror bc logistic --out runs/baselines"

@@ -25,8 +25,8 @@ COPIES = 4
 DESCRIPTION = """Infer from recorded rounds what each person sees and how they decide, with the
 uncertainty of it, and measure how well their held-out actions are predicted. Without --demos the
 recordings of ten simulated people are used that ship with the package. Writes posterior.nc (ArviZ
-InferenceData), summary.json, pictures of what they see, check.png and identifiability.png. A fit
-that is stopped goes on from its checkpoint when the same command is given again."""
+InferenceData), summary.json, pictures of what they see, check.png and identifiability.png. The same
+command resumes a stopped run."""
 EXAMPLES = {
     "ten simulated people who differ in what they see": (
         "--setting fog --population diverse --out runs/diverse"
@@ -63,16 +63,18 @@ class Options:
     """How many rounds of each person to learn from, from the first on; 0 for none. Default: 20 of
     recordings with 36 rounds or more (rounds 31 to 36 are held out), else three quarters."""
     human_model: str | None = None
-    """Another human model: all (weighs several models for each person), late,
-    preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or no-implants,
-    or one of your own, path/to/file.py:Class, whose code is run (see docs/extending.md)."""
+    """Another human model: all (averages over several models for each person), late, noticing,
+    forgetting, preferring, hard-of-hearing, one-radius, per-item, perceptual-only, policy-only or
+    no-implants, or one of your own, path/to/file.py:Class, whose code is run (see
+    docs/extending.md)."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     guide: str = "auto"
-    """How to infer: auto (amortized for whoever it serves well, if a network of this human model is
-    there, else importance; the output says who was inferred by which), importance (what people see
-    summed out exactly, how they decide by importance sampling), amortized (the same, proposed at
-    once by a trained network), svi (variational) or nuts (Hamiltonian Monte Carlo, slow)."""
+    """How to infer: auto (amortized for people for whom its draws are reliable, if there is a
+    network of this human model, else importance; the output names the engine of each person),
+    importance (what people see summed out exactly, how they decide by importance sampling),
+    amortized (the same, proposed at once by a trained network), svi (variational) or nuts
+    (Hamiltonian Monte Carlo, slow)."""
     guide_file: Path | None = None
     """Network of the guides auto and amortized (see `python -m mirror_ppl.train --what guide`)."""
     pooling: str = "none"

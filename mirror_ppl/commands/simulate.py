@@ -51,7 +51,7 @@ class Options:
     or diverse (each their own sight)."""
     human_model: str | None = None
     """People drawn from the prior of a human model instead: one of the package's, such as late, or
-    path/to/file.py:Class, whose code is run. What they see is up to their implants."""
+    path/to/file.py:Class, whose code is run. What they see depends on their implants."""
     self_model: Path | None = None
     """Weights of the robot that people of a --human-model, and those of a world of your own, are
     made of. Default: those that ship, or that python -m mirror_ppl.train wrote."""

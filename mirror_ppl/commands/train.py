@@ -13,10 +13,10 @@ from mirror_ppl.progress import Progress, Stages
 LEAST_PEOPLE = 10
 PROGRAM = "python -m mirror_ppl.train"
 DESCRIPTION = """Train the robot's self-model from nothing, or a guide that infers people at once,
-measure it, and write its weights with a card that tells both. A self-model is measured against the
-exact planner; it takes about ten minutes. A guide learns from people who are drawn from the human
-model's prior; it takes about half an hour. A run that is stopped goes on when the same command is
-given again."""
+measure it, and write its weights and a card with settings and quality. A self-model is measured
+against the exact planner; it takes about ten minutes in driving and half an hour in search_rescue
+and bomb_defusal. A guide learns from people who are drawn from the human model's prior; it takes
+about half an hour. The same command resumes a stopped run."""
 EXAMPLES = {
     "the self-model that ships, from nothing": (
         "--domain driving --out runs/driving_self_model.safetensors"

@@ -32,6 +32,9 @@ from mirror_ppl.evaluation.tables import Rows, TextTable
 from mirror_ppl.plots.picture import Picture
 from mirror_ppl.plots.study import plot_curves, plot_relevance
 
+NOTIONS = {"closing": "cars that close in", "goal_and_obstacle": "victim and obstacle"}
+"""Notions of relevance in words, where their name alone is unclear."""
+
 
 @dataclass(frozen=True)
 class Report:
@@ -95,7 +98,8 @@ def _relevance(rows: Rows) -> Report:
                 here = [one for one in found if one.place == where]
                 if not place:
                     first += here
-                title = f"{', '.join(where)}: items about {notion.replace('_', ' ')}"
+                about = NOTIONS.get(notion, notion.replace("_", " "))
+                title = f"{', '.join(where)}: items about {about}"
                 tables.append(_shares(here, title))
     return Report(tables, [], {"relevance": data}, plot_relevance(shares_table(first)))
 
@@ -130,7 +134,7 @@ def _tables(
             caption += (
                 "; below it the advantage of mirror, its 90% interval over people, and the share "
                 "of people in whom mirror is better (ties count half); mirror has as many training "
-                "rounds as the model that it is compared with, and the most if that learns nothing"
+                "rounds as the compared model, or the largest number if that model does not learn"
                 + (f"; {', '.join(pooling)}: advantage of {POOLED}" if pooling else "")
             )
         if place in floor:

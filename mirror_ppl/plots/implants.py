@@ -21,9 +21,9 @@ TITLES = {
     "sight_back_own": "sight behind, own lane",
     "sight_back_other": "sight behind, other lane",
     "sight_radius": "sight, in every direction",
-    "assumes_open": "takes unknown corridors to be free",
-    "assumes_clear": "takes the unseen to be absent",
-    "assumes_closing": "takes what they cannot judge to come closer",
+    "assumes_open": "assumes unknown corridors free",
+    "assumes_clear": "assumes unseen cars absent",
+    "assumes_closing": "assumes cars seen once come closer",
     "consistency": "consistency of choices",
     "lapse": "lapses: choices at random",
 }

@@ -31,7 +31,7 @@ def test_implants_are_drawn_beside_the_prior_with_the_truth_marked(data):
     # The truth, 2 cells, is the third of the possible values.
     assert ax.lines[-1].get_label() == "truth"
     assert ax.lines[-1].get_xdata() == [2]
-    for what in ("takes the unseen to be absent", "takes what they cannot judge to come closer"):
+    for what in ("assumes unseen cars absent", "assumes cars seen once come closer"):
         ax = axes[what]
         assert [label.get_text() for label in ax.get_xticklabels()] == ["no", "yes"]
     assert [bar.get_height() for bar in ax.containers[1]] == [0.25, 0.75]
