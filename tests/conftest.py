@@ -6,6 +6,8 @@ import sys
 # In the environment, before the libraries are imported, so that it holds for subprocesses too.
 os.environ["MPLBACKEND"] = "Agg"
 os.environ["OMP_NUM_THREADS"] = "1"
+# The suite's own workers use all cores; a test that is about processes says how many.
+os.environ["LOKY_MAX_CPU_COUNT"] = "1"
 
 import hypothesis
 import numpy as np
