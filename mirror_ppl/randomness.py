@@ -21,6 +21,17 @@ def derived_generator(
     return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
 
 
+def seed_everything(seed: int) -> None:
+    """Seed the global random states, as `torch.manual_seed` does, of the devices that there are.
+
+    For each kind of device that is missing, `torch.manual_seed` formats and keeps the call stack,
+    which takes up to a millisecond a call.
+    """
+    torch.default_generator.manual_seed(seed)
+    if torch.cuda.is_available():
+        torch.cuda.manual_seed_all(seed)
+
+
 def forked() -> AbstractContextManager[None]:
     """Return a context that restores the global random state of all devices at its end.
 

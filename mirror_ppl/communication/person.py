@@ -29,7 +29,7 @@ from mirror_ppl.likelihood.densities import choices, log_weighted_latents
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.prior import checked_draws
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.row_hashing import distinct_rows
 
 COUNTED = 3
@@ -99,7 +99,7 @@ class Person:
         values, log_prior = self._attending(past)
         log_probabilities = self._log_probabilities(values, past) + log_prior
         with forked():
-            torch.manual_seed(seed * 1_000_003 + past.time)
+            seed_everything(seed * 1_000_003 + past.time)
             chosen = torch.multinomial(log_probabilities.softmax(-1), 1).squeeze(-1)
         own = {name: value[chosen] for name, value in values.items()}
         person = copy(self)

@@ -19,7 +19,7 @@ from mirror_ppl.models.dependencies import dependencies
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.measured import measured_draws
 from mirror_ppl.models.prior import sample_sites
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.timing import stage
 
 
@@ -48,7 +48,7 @@ def infer_by_importance(
                 builder = next(builders)
             human = builder.human
             # Independent of other people, and of how many draws they took.
-            torch.manual_seed((job.seed + 1) * 1_000_003 + job.first + person)
+            seed_everything((job.seed + 1) * 1_000_003 + job.first + person)
             first = coarse(job.settings) if looks_twice(human) else job.settings
             engine, own = first_pass(builder, first)
             if looks_twice(human):

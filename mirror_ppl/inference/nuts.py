@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import pyro
-import torch
 from pyro.infer import MCMC, NUTS
 from pyro.infer.autoguide import init_to_median
 
@@ -16,7 +15,7 @@ from mirror_ppl.likelihood.compiled import Compiled
 from mirror_ppl.likelihood.densities import PLATES
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.progress import Report, silent
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def sample_nuts(
 
     compiled.refuse_scales("nuts")
     with forked(), pyro.validation_enabled(False):
-        torch.manual_seed(seed)
+        seed_everything(seed)
         kernel = NUTS(
             compiled.program,
             max_plate_nesting=PLATES,

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from time import monotonic
 
-import torch
-
 from mirror_ppl.checks import real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.data.contradictions import check_world
@@ -24,7 +22,7 @@ from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites
 from mirror_ppl.models.recorded import check_rounds
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 AT_ONCE = AmortizedOptions(adaptation=ImportanceOptions(128, enough=64.0))
 """Settings with fewer effective draws, for a fast answer."""
@@ -132,7 +130,7 @@ class OnlinePosterior:
             )
         began = monotonic()
         with forked():
-            torch.manual_seed(self.seed * 1_000_003 + self.rounds)
+            seed_everything(self.seed * 1_000_003 + self.rounds)
             found = self._last = self._weighted()
             drawn = found.sample(number, self._builder.grid)
         self.pareto_k = found.pareto_k

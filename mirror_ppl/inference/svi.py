@@ -39,7 +39,7 @@ from mirror_ppl.likelihood.tables import combination_scores
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.progress import Report, silent
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100
@@ -132,7 +132,7 @@ def continuous_guide(compiled: Compiled, without: Collection[str] = ()) -> Prior
 def own_parameters(seed: int) -> Iterator[None]:
     """Context with its own random state and parameter store."""
     with forked(), pyro.get_param_store().scope():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         yield
 
 

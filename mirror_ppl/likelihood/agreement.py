@@ -33,7 +33,7 @@ from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, at_step, messages_at, recorded_covariates
 from mirror_ppl.models.prior import Draws, draw_prior
 from mirror_ppl.models.sites import latent_sites, sample_nodes
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 DRAWS, ROUNDS, STEPS = 6, 2, 4
 SEED = 0
@@ -128,7 +128,7 @@ def _said_by_site(
         pyro.plate("draw", number, dim=-3),
         pyro.plate("person", people, dim=-2),
     ):
-        torch.manual_seed(seed)
+        seed_everything(seed)
         with poutine.trace() as prior:
             implants = human.prior()
         with poutine.trace() as act, pyro.plate("round", 1, dim=-1):
@@ -189,7 +189,7 @@ def log_densities(
     found, latents = [], []
     number = len(next(iter(draws.values()), (0,)))
     with forked():
-        torch.manual_seed(SEED)
+        seed_everything(SEED)
         for draw in range(number):
             own = {name: value[draw] for name, value in draws.items()}
             with poutine.block(), Given(own), poutine.trace() as trace:

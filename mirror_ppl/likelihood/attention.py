@@ -31,7 +31,7 @@ from torch import Tensor
 
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 VALUES, KEPT = 512, 96
 """Number of sampled values of attention per round, and how many are kept given the actions."""
@@ -110,7 +110,7 @@ def site_probabilities(
         pyro.plate("policy", number, dim=-3),
         pyro.plate("person", 1, dim=-2),
     ):
-        torch.manual_seed(0)
+        seed_everything(0)
         nodes = attention_nodes(human, {**human.prior(), **(covariates or {})})
     found = {}
     for name, node in nodes.items():

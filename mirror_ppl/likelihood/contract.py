@@ -28,7 +28,7 @@ from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants, has_own_program, overrides
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.shapes import broadcast_shapes
 from mirror_ppl.user_code import describe, is_of_package
 
@@ -82,7 +82,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
             poutine.trace() as trace,
             pyro.plate("person", people, dim=-2),
         ):
-            torch.manual_seed(0)
+            seed_everything(0)
             implants = human.prior()
             if not isinstance(implants, Mapping):
                 raise HumanModelError(

@@ -27,7 +27,7 @@ from torch.overrides import TorchFunctionMode
 
 from mirror_ppl.models.human import ACTION, HumanModel
 from mirror_ppl.models.sites import latent_sites, latent_values, sample_nodes
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 Sites = frozenset[str]
 TRIED = 32
@@ -95,7 +95,7 @@ def _run(human: HumanModel) -> Dependencies:
         _ValuesAlone(),
         pyro.plate("person", 1, dim=-2),
     ):
-        torch.manual_seed(0)
+        seed_everything(0)
         with poutine.trace() as prior:
             implants = human.prior()
         with pyro.plate("round", 1, dim=-1):
@@ -133,7 +133,7 @@ def _as_drawn(seed: int, given: Mapping[str, Tensor]) -> Iterator[None]:
         poutine.condition(data=dict(given)),
         pyro.plate("person", 1, dim=-2),
     ):
-        torch.manual_seed(seed)
+        seed_everything(seed)
         yield
 
 
@@ -166,7 +166,7 @@ def _hidden_causes(
     """
     like = next(human.parameters())
     with forked():
-        torch.manual_seed(0)
+        seed_everything(0)
         belief = torch.randn(1, 1, human.belief_size).to(like)
     values, action = human.action_values(belief), torch.zeros(1, 1, dtype=torch.long)
     same = {name: detach_provenance(value) for name, value in latents.items()}

@@ -17,7 +17,7 @@ from mirror_ppl.checks import as_tensor, require_kind, seed_number, whole_number
 from mirror_ppl.errors import HumanModelError, InputError, shown
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 Draws = dict[str, Tensor]
 """Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
@@ -80,7 +80,7 @@ def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
     people, number = whole_number(people, "people", 1), whole_number(number, "number", 1)
     seed = seed_number(seed)
     with forked():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         return values_of(sample_sites(human, people, number))
 
 
@@ -96,7 +96,7 @@ def draw_prior_of_each(human: HumanModel, people: range, number: int, seed: int)
     each = []
     with forked():
         for person in people:
-            torch.manual_seed(seed * 1_000_003 + person)
+            seed_everything(seed * 1_000_003 + person)
             each.append(values_of(sample_sites(human, 1, number)))
     return {name: torch.cat([own[name] for own in each], 1) for name in each[0]}
 

@@ -25,7 +25,7 @@ from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.implants import in_units
 from mirror_ppl.models.prior import draw_prior
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.version import __version__
 
 PRIOR_OF = "prior of "
@@ -89,7 +89,7 @@ def play_rounds(
     own.set_state(generator.get_state())
     seed = int(torch.randint(2**31, (), generator=own, device=device))
     with forked():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         with poutine.condition(data=dict(implants)), pyro.plate("person", people, dim=-2):
             drawn = human.prior()
     for step in range(steps):
@@ -217,6 +217,6 @@ def _round_latents(
     Runs inside the person plate. The seed is fixed, so latents change only with covariates.
     """
     so_far = {name: torch.stack([one[name] for one in observed], 2) for name in observed[0]}
-    torch.manual_seed(seed)
+    seed_everything(seed)
     with pyro.plate("round", observed[0]["ego"].shape[1], dim=-1):
         return human.round_latents(implants | human.covariates(so_far))

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from mirror_ppl.domains.base import Modality
 from mirror_ppl.errors import AssetError
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 Embedding = Callable[[Sequence[str]], Tensor]
 """Maps N sentences to vectors ``[N, D]``."""
@@ -114,7 +114,7 @@ def compress(vectors: Tensor, code: int, seed: int = 0) -> Autoencoder:
         seed: of its initial weights.
     """
     with forked(), torch.enable_grad():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         network = Autoencoder(vectors.shape[-1], code)
         optimizer = torch.optim.Adam(network.parameters(), 0.01)
         for _ in range(COMPRESSION_STEPS):

@@ -44,7 +44,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import sample_sites, scalar_sites, unconstrained
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.progress import Report, silent
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.training.guide_elbo import ELBOTraining, Group, simulated_groups
 
 
@@ -133,7 +133,7 @@ def train_guide(
     require_acting_on_beliefs(human, perceived_sites(human))
     examples = simulate_examples(human, options, seed, report, checkpoint)
     with forked():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         generator = torch.Generator().manual_seed(seed * 1_000_003 + options.people)
         groups = simulated_groups(human, options.rounds, generator)
         return _optimize(human, examples, options, groups, report)

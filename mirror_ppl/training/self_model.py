@@ -33,7 +33,7 @@ from mirror_ppl.domains.world import World, offers
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.training.experience import Course, drive, experience
 from mirror_ppl.training.self_model_loss import self_model_loss
 from mirror_ppl.training.self_model_options import SelfModelOptions, require_fitting
@@ -74,7 +74,7 @@ def train_self_model(
     device = generator.device
     seed = int(torch.randint(2**31, (1,), generator=generator, device=device))
     with forked():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         sizes = sizes or sizes_of(domain)
         trainer = _Trainer(domain, options, generator, seed, speech, sizes, kind)
         trainer.run(report, checkpoint)

@@ -39,7 +39,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import fingerprint
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.version import __version__
 
 PRIOR_PEOPLE = 4000
@@ -248,7 +248,7 @@ def _seed(generator: torch.Generator) -> int:
 def _prior_sites(human: HumanModel, people: int, seed: int) -> dict[str, Any]:
     """Trace nodes of all sites, sampled for P people."""
     with forked():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         return sample_sites(human, people)
 
 

@@ -45,7 +45,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import Draws, sample_sites, scalar_sites, unconstrained, values_of
 from mirror_ppl.models.world_knowledge import world_sites
 from mirror_ppl.progress import Report, silent
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 POOLINGS = ("none", "partial")
 MOST_DRAWS, ALL_DRAWS, LEAST_DRAWS = 1000, 20_000, 100
@@ -113,7 +113,7 @@ class Pooling:
         self.human = human
         parents = dependencies(human).prior
         with forked():
-            torch.manual_seed(0)
+            seed_everything(0)
             nodes = sample_sites(human, 1, PRIOR_DRAWS)
         nodes = {
             name: node
@@ -246,7 +246,7 @@ class Pooling:
         known, place, log_prior = self.read(draws)
         effective, chosen = [], []
         with forked():
-            torch.manual_seed(seed)
+            seed_everything(seed)
             for index in range(len(population)):
                 probabilities, mean, spread = (
                     {name: value[index] for name, value in part.items()}
@@ -270,7 +270,7 @@ class Pooling:
         """
         number, tries = len(population), CANDIDATES if adds_to_prior(self.human) else 1
         with forked():
-            torch.manual_seed(seed)
+            seed_everything(seed)
             given: Draws = {}
             for name, support in self.supports.items():
                 probabilities = population.probabilities[name][:, None].expand(

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Dirichlet, Normal
 
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 WARMUP = 300
 """Discarded sweeps."""
@@ -103,7 +103,7 @@ def sample_population(
     kept: list[tuple[dict[str, Tensor], Tensor, Tensor]] = []
     total = WARMUP + THIN * number
     with forked():
-        torch.manual_seed(seed)
+        seed_everything(seed)
         weights = torch.ones_like(log_prior)
         for sweep in range(total):
             own = torch.multinomial(weights, 1)[:, 0]

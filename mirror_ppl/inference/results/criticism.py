@@ -34,7 +34,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.randomness import forked
+from mirror_ppl.randomness import forked, seed_everything
 
 OK, SUSPECT, UNEXPLAINED, UNCHECKED = "ok", "suspect", "unexplained", "unchecked"
 """The verdicts."""
@@ -130,7 +130,7 @@ def no_implants(
     human = load_human_model("no-implants", self_model)
     if bool(train.mask.any()):
         with forked():
-            torch.manual_seed(seed)
+            seed_everything(seed)
             views = ViewTableBuilder(human, None)
             views.add(rounds_of(train, 0))
             weighted = sample_importance(human, views.table(), QUICK)
