@@ -26,6 +26,7 @@ import torch
 import tyro
 
 from benchmarks._rows import rows_in
+from benchmarks.tables import TITLES
 from mirror_ppl.communication.planners import PlannerOptions
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import play_together, speaker
@@ -136,7 +137,8 @@ def table(rows: Sequence[dict[str, str]]) -> str:
     places = dict.fromkeys((row["domain"], *(row[name] for name in SETTINGS)) for row in rows)
     for place in places:
         world, horizon, terminal, errors, _ = place
-        cells = [world.replace("_", " "), f"{float(horizon):g}"]
+        name = TITLES.get(world, world.replace("_", " ")).lower()
+        cells = [name, f"{float(horizon):g}"]
         cells += ["best" if float(terminal) else "none", f"{float(errors):g}"]
         for amount in amounts:
             loss = [

@@ -40,7 +40,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
     "sqil-everything": (VERMILION, ":", "x"),
     "sqil-informed": (VERMILION, "-.", ">"),
     "sqil-pooled": (VERMILION, "--", "8"),
-    "logistic": (GREEN, "-", "h"),
+    "logistic": (GREEN, "--", "h"),
     "base-rate": (GREEN, ":", "1"),
     "none": (GREY, ":", ""),
     "all": (GREY, "--", ""),
