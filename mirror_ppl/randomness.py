@@ -35,7 +35,7 @@ def seed_everything(seed: int) -> None:
 def forked() -> AbstractContextManager[None]:
     """Return a context that restores the global random state of all devices at its end.
 
-    `torch.manual_seed` seeds graphics processors, too; they are included once they are in use.
+    Graphics processors are included once they are in use.
     """
     used = torch.cuda.is_initialized()
     return torch.random.fork_rng(devices=range(torch.cuda.device_count()) if used else [])
