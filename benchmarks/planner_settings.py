@@ -3,8 +3,16 @@ r"""What settings of the planner are worth, on people who are reported nowhere e
     python -m benchmarks.planner_settings --domain bomb_defusal --rounds 0 1 5 --horizon 12 24 60
     python -m benchmarks.planner_settings --domain bomb_defusal --rounds 0 1 5 --horizon 12 24 \
         --terminal-value True
-    python -m benchmarks.planner_settings --domain bomb_defusal --min-standard-errors 0 1 2
-    python -m benchmarks.planner_settings --domain search_rescue --min-standard-errors 0 1 2
+    python -m benchmarks.planner_settings --domain bomb_defusal --rounds 0 1 5 \
+        --min-standard-errors 0 1 2
+    python -m benchmarks.planner_settings --domain search_rescue --rounds 0 1 5 \
+        --min-standard-errors 0 1 2
+    python -m benchmarks.planner_settings --domain search_rescue --rounds 0 1 5 \
+        --terminal-value False
+    python -m benchmarks.planner_settings --domain driving --rounds 0 1 5 \
+        --min-standard-errors 0 1 2
+    python -m benchmarks.planner_settings --domain driving --rounds 0 1 5 \
+        --min-standard-errors 1 2 --seeds 105 106 107 108 109 110 111 112 113 114
 
 Each combination of the settings given, of `PlannerOptions`, is played by ``mirror`` for the same
 people, fitted to each number of rounds, in the setting in which they see least. Rows are added to
@@ -132,24 +140,29 @@ def table(rows: Sequence[dict[str, str]]) -> str:
     """Return the table of docs/decisions.md: net return minus the oracle's, with intervals."""
     amounts = sorted({int(row["rounds"]) for row in rows})
     heads = [f"{amount} round{'s' * (amount != 1)}" for amount in amounts]
-    names = ("world", "horizon", "value at it", "standard errors", *heads)
-    lines = [" | ".join(names), " | ".join(["---"] * 4 + ["---:"] * len(amounts))]
-    places = dict.fromkeys((row["domain"], *(row[name] for name in SETTINGS)) for row in rows)
-    for place in places:
-        world, horizon, terminal, errors, _ = place
+    names = ("world", "horizon", "value at it", "standard errors", "people", *heads)
+    lines = [" | ".join(names), " | ".join(["---"] * 4 + ["---:"] * (1 + len(amounts)))]
+    places = {_place(row) for row in rows}
+    for place in sorted(places, key=lambda one: (*one[:2], *map(float, one[2:]))):
+        world, population, horizon, terminal, errors, _ = place
+        here = [row for row in rows if _place(row) == place]
         name = TITLES.get(world, world.replace("_", " ")).lower()
-        cells = [name, f"{float(horizon):g}"]
+        cells = [f"{name}, {population}", f"{float(horizon):g}"]
         cells += ["best" if float(terminal) else "none", f"{float(errors):g}"]
+        cells.append(str(len({(row["seed"], row["person"]) for row in here})))
         for amount in amounts:
             loss = [
                 float(row["net"]) - float(row["oracle"])
-                for row in rows
-                if (row["domain"], *(row[name] for name in SETTINGS)) == place
-                and int(row["rounds"]) == amount
+                for row in here
+                if int(row["rounds"]) == amount
             ]
             cells.append(_shown(loss))
         lines.append(" | ".join(cells))
     return "\n".join(f"| {line} |" for line in lines)
+
+
+def _place(row: dict[str, str]) -> tuple[str, ...]:
+    return tuple(row[name] for name in ("domain", "population", *SETTINGS))
 
 
 def _shown(loss: Sequence[float]) -> str:

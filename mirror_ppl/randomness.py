@@ -22,10 +22,10 @@ def derived_generator(
 
 
 def seed_everything(seed: int) -> None:
-    """Seed the global random states, as `torch.manual_seed` does, of the devices that there are.
+    """Seed the global random states of the processor and of CUDA devices.
 
-    For each kind of device that is missing, `torch.manual_seed` formats and keeps the call stack,
-    which takes up to a millisecond a call.
+    `torch.manual_seed` does the same, but formats and keeps the call stack for each other kind of
+    device that is missing or not in use yet, which takes up to a millisecond.
     """
     torch.default_generator.manual_seed(seed)
     if torch.cuda.is_available():

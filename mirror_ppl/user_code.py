@@ -90,8 +90,10 @@ def describe(error: BaseException, path: Path | None = None) -> str:
         text = f"the file ends the program, sys.exit({text})"
     else:
         text = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    if not own and (not frames or _PACKAGE in Path(frames[-1].filename).resolve().parents):
-        return text  # it called the user's code wrongly, as the message says
+    if not frames:
+        return text
+    if len(frames) == 1 and _PACKAGE in Path(frames[0].filename).resolve().parents:
+        return text  # the user's function could not be called, which the message says
     line = (own or frames)[-1]
     return f"{text} ({Path(line.filename).name}, line {line.lineno})"
 

@@ -233,11 +233,11 @@ class Decision:
     def _with_later(self) -> str:
         """Name the later messages of the plan, since the gain is of all of it."""
         later = [
-            f"{self._about(message)} in {step} step{'s' * (step > 1)}"
+            f"in {step} step{'s' * (step > 1)}: {self._about(message)}"
             for step, message in enumerate(self.plan)
             if step and message
         ]
-        return f" together with {' and '.join(later)}" if later else ""
+        return f" with what follows {'; '.join(later)}" if later else ""
 
     def _why_not(self) -> str:
         if self.over:

@@ -78,7 +78,7 @@ class Companion:
         Raises:
             InputError: no round has begun or it is over, or an argument is impossible; nothing has
                 changed then.
-            UnknownNameError: there is no such modality or item.
+            UnknownNameError: there is no such modality, item or action.
         """
         past, domain = self._round(), self.communicator.person.human.domain
         if past.time >= domain.horizon:

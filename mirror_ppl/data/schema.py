@@ -213,11 +213,10 @@ class _Places:
                 f"{name} has shape {tuple(value.shape)}, "
                 f"expected {tuple(expected.values())} ({wanted})"
             )
-            others = [size for key, size in expected.items() if key != "time"]
-            given = zip(expected, value.shape, strict=False)
-            given = [size for key, size in given if key != "time"]
-            if value.dim() == len(expected) and given == others:
-                message += f", as action has {sizes['step']} steps"
+            pairs = zip(expected.items(), value.shape, strict=False)
+            wrong = {key for (key, size), own in pairs if size != own}
+            if value.dim() == len(expected) and wrong <= {"time", "step"}:
+                message += f", as there are {sizes['step']} actions a round"
             raise DemonstrationsError(message)
 
     def refuse(

@@ -22,7 +22,7 @@ ROUNDS = 6
 REMARKED = 100
 """Number of rounds on which remarks rest."""
 TOLERANCE = 1e-4
-ALMOST = 0.9
+ALMOST = 0.85
 """Similarity from which another name counts as misspelt."""
 
 
@@ -310,13 +310,18 @@ def remarks_on(world: World) -> str:
 
 
 def _misspelt(world: World) -> list[str]:
-    """Return a remark on each attribute that nothing reads and that almost has a member's name."""
-    declared = [name for kind in World.__mro__ for name in vars(kind).get("__annotations__", {})]
-    members = {name for name in (*dir(World), *declared) if not name.startswith("_")}
+    """Return a remark on each public attribute of a user that almost has a member's name."""
+    members, own = set[str](), set[str]()
+    for kind in type(world).__mro__:
+        if kind.__module__.partition(".")[0] == "mirror_ppl":
+            members |= {*vars(kind), *vars(kind).get("__annotations__", {})}
+        else:
+            own |= {*vars(kind)} - {*vars(kind).get("_derived", ())}
     found = []
-    for name in dir(world):
-        if name not in members and (close := get_close_matches(name, members, 1, ALMOST)):
-            found.append(f"{name} is not read; perhaps you meant {close[0]}")
+    for name in sorted(own - members):
+        close = get_close_matches(name, members - own, 1, ALMOST)
+        if close and not name.startswith("_"):
+            found.append(f"{name} is no member of worlds; perhaps you meant {close[0]}")
     return found
 
 

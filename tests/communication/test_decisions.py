@@ -246,7 +246,7 @@ def test_why_names_what_the_plan_sends_later_since_the_gain_is_of_both():
         [[0.0, 0], [1, 1]],
         [[[0.9, 0.1]] * 2, [[0.2, 0.8]] * 2],
     )
-    assert later.why().endswith(f"0.20 (gain +1.00 together with {AHEAD} in 1 step)")
+    assert later.why().endswith(f"0.20 (gain +1.00 with what follows in 1 step: {AHEAD})")
 
 
 def test_why_where_no_action_changes_much():

@@ -115,7 +115,7 @@ BAD = {
     "as many observations as actions": (
         put(["ego"], None, torch.zeros(3, 3, 4, 1)),
         "ego has shape (3, 3, 4, 1), expected (3, 3, 5, 1) "
-        "(person 3, round 3, time 5, ego_feature 1), as action has 4 steps",
+        "(person 3, round 3, time 5, ego_feature 1), as there are 4 actions a round",
     ),
     "lengths without people": (
         put(["lengths"], None, torch.ones(3)),

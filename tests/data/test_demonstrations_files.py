@@ -224,7 +224,7 @@ BAD_DATASETS = {
     "wrong shape": (
         lambda dataset: dataset.isel(time=slice(4)),
         "ego has shape (3, 3, 4, 1), expected (3, 3, 5, 1) "
-        "(person 3, round 3, time 5, ego_feature 1), as action has 4 steps",
+        "(person 3, round 3, time 5, ego_feature 1), as there are 4 actions a round",
     ),
     "too few items": (
         lambda dataset: dataset.isel(visual_item=slice(3)),
