@@ -231,9 +231,9 @@ def test_misspelt_members_are_remarked_on_and_wrong_ones_are_not_placed_in_the_p
     from mirror_ppl.commands import check_domain
 
     text, file = FILE.read_text(), tmp_path / "almost.py"
-    file.write_text(text.replace("    horizon = 8\n", "    horizon = 8\n    mishapp = 'puddle'\n"))
+    file.write_text(text.replace("    horizon = 8\n", "    horizon = 8\n    lastingg = ()\n"))
     assert command(check_domain, f"{file}:RoundTable") == 0
-    assert "mishapp is no member of worlds; perhaps you meant mishap" in capsys.readouterr().out
+    assert "lastingg is no member of worlds; perhaps you meant lasting" in capsys.readouterr().out
     file.write_text(text.replace("def transition(self, state,", "def transition(self,"))
     assert command(check_domain, f"{file}:RoundTable") == 1
     said = capsys.readouterr().out
