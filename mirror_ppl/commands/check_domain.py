@@ -34,7 +34,8 @@ def main(options: Options) -> int:
     Raises:
         DomainError: the file or class is missing, does not import, or is no world.
     """
-    from mirror_ppl.domains.checking import faults_of, remarks_on
+    from mirror_ppl.domains.capabilities import remarks_on
+    from mirror_ppl.domains.checking import faults_of
     from mirror_ppl.domains.registry import load_world
     from mirror_ppl.errors import DomainError
 
@@ -87,7 +88,7 @@ def _show(world: World, remark: str) -> None:
     from rich.table import Table
 
     from mirror_ppl.console import console_for_tables
-    from mirror_ppl.domains.checking import capabilities
+    from mirror_ppl.domains.capabilities import capabilities
     from mirror_ppl.domains.controls import bounds_in_words
 
     table = Table(title=f"{world.name}: nothing wrong", box=SIMPLE_HEAD, title_justify="left")

@@ -1,17 +1,16 @@
-"""Checks a world against the contract of worlds, and lists what it implements."""
+"""Checks a world against the contract of worlds."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
-from difflib import get_close_matches
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import map_state, total_reward
+from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.world import World, offers
 from mirror_ppl.errors import DomainError
 from mirror_ppl.randomness import forked
@@ -19,51 +18,7 @@ from mirror_ppl.user_code import describe
 
 ROUNDS = 6
 """Number of rounds that a check plays."""
-REMARKED = 100
-"""Number of rounds on which remarks rest."""
 TOLERANCE = 1e-4
-ALMOST = 0.85
-"""Similarity from which another name counts as misspelt."""
-
-
-@dataclass(frozen=True)
-class Capability:
-    """An optional member of a world.
-
-    Attributes:
-        method: the method or attribute.
-        otherwise: the default.
-        gives: its use.
-    """
-
-    method: str
-    otherwise: str
-    gives: str
-
-
-CAPABILITIES = (
-    Capability("visibility", "everything is seen", "settings: what unaided people see"),
-    Capability("positions", "all items at distance 1", "thresholds of sight by distance"),
-    Capability("levels", "numbers in units of scales", "networks that read whole numbers exactly"),
-    Capability(
-        "controls", "numbered actions", "continuous actions, and how precisely they are set"
-    ),
-    Capability("over", "rounds last to the horizon", "rounds that end"),
-    Capability("learn", "what was last seen", "memory: what people know without looking"),
-    Capability("assume", "nothing", "what people take for granted"),
-    Capability("communicable", "everything", "items that can be communicated"),
-    Capability("relevance", "everything", "shares of relevant messages"),
-    Capability("describe", "names and numbers", "messages in words"),
-    Capability("deed", "the action's name", "actions in words"),
-    Capability("render", "a table of numbers", "pictures of states"),
-    Capability("reference_values", "left out", "an expert; exact agreement; advice"),
-    Capability("reflected", "left out", "with `distil`, twice the rounds: mirror images"),
-)
-
-
-def capabilities(world: World) -> list[tuple[Capability, bool]]:
-    """Return optional members of a world, and whether it implements each."""
-    return [(one, offers(world, one.method)) for one in CAPABILITIES]
 
 
 def require_sound(world: World) -> World:
@@ -279,57 +234,6 @@ def _looks(world: World) -> list[str]:
 
 def _of_its_own(world: World) -> list[str]:
     return _call(world, "own_faults")
-
-
-def remarks_on(world: World) -> str:
-    """Return what random rounds of a sound world are like: rewards a step, how many ended."""
-    generator = torch.Generator().manual_seed(1)
-    state = world.initial(REMARKED, generator)
-    ended, earned, chance = world.over(state), [], False
-    for _ in range(world.horizon):
-        action = torch.randint(len(world.actions), (REMARKED,), generator=generator)
-        following = world.transition(state, action)
-        if world.random and not chance:
-            one, other = (
-                _outcome(world, now, action) for now in (state, world.redrawn(state, generator))
-            )
-            chance = any(not torch.equal(part, other[name]) for name, part in one.items())
-        earned += total_reward(world.rewards(state, action, following))[~ended].tolist()
-        state, ended = following, ended | world.over(following)
-    number = int(ended.sum())
-    if not earned:
-        return "all rounds are over where they begin"
-    remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
-    remark += "".join(f"; {one}" for one in _misspelt(world))
-    if world.random and not chance:
-        remark += "; no step depended on chance, so random may be left out"
-    if not offers(world, "over"):
-        return remark
-    remark += f"; {number} of {REMARKED} rounds ended"
-    return remark if number else f"{remark}, so ends were not checked"
-
-
-def _misspelt(world: World) -> list[str]:
-    """Return a remark on each public attribute of a user that almost has a member's name."""
-    members, own = set[str](), set[str]()
-    for kind in type(world).__mro__:
-        if kind.__module__.partition(".")[0] == "mirror_ppl":
-            members |= {*vars(kind), *vars(kind).get("__annotations__", {})}
-        else:
-            own |= {*vars(kind)} - {*vars(kind).get("_derived", ())}
-    found = []
-    for name in sorted(own - members):
-        close = get_close_matches(name, members - own, 1, ALMOST)
-        if close and not name.startswith("_"):
-            found.append(f"{name} is no member of worlds; perhaps you meant {close[0]}")
-    return found
-
-
-def _outcome(world: World, state: Any, action: Tensor) -> dict[str, Tensor]:
-    """Return everything that is observable of what follows an action."""
-    later = world.transition(state, action)
-    earned = world.rewards(state, action, later)
-    return {"over": world.over(later), **world.observe(later), **earned}
 
 
 def _faults_of_symbols(

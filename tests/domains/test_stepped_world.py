@@ -11,7 +11,8 @@ import torch
 from stepped_worlds import Endless, Random, Swing, Walk, Way, Wind, Windy
 
 from mirror_ppl.domains import Control, Modality
-from mirror_ppl.domains.checking import faults_of, remarks_on
+from mirror_ppl.domains.capabilities import remarks_on
+from mirror_ppl.domains.checking import faults_of
 from mirror_ppl.domains.gymnasium_world import GymnasiumWorld
 from mirror_ppl.domains.registry import load_world
 from mirror_ppl.domains.stepped_world import SteppedWorld

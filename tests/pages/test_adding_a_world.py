@@ -12,7 +12,8 @@ from running import command
 
 import mirror_ppl
 from mirror_ppl.domains import DOMAINS, Modality, World, add_domain, get_domain
-from mirror_ppl.domains.checking import CAPABILITIES, faults_of
+from mirror_ppl.domains.capabilities import CAPABILITIES, remarks_on
+from mirror_ppl.domains.checking import faults_of
 from mirror_ppl.domains.registry import code_of, load_world
 from mirror_ppl.errors import DomainError, UnknownNameError
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
@@ -234,6 +235,8 @@ def test_misspelt_members_are_remarked_on_and_wrong_ones_are_not_placed_in_the_p
     file.write_text(text.replace("    horizon = 8\n", "    horizon = 8\n    lastingg = ()\n"))
     assert command(check_domain, f"{file}:RoundTable") == 0
     assert "lastingg is no member of worlds; perhaps you meant lasting" in capsys.readouterr().out
+    for name in ("round_table.py:RoundTable", "unlocking.py:Unlocking", "delivery.py:Delivery"):
+        assert "no member" not in remarks_on(get_domain(f"{FILE.parent}/{name}"))
     file.write_text(text.replace("def transition(self, state,", "def transition(self,"))
     assert command(check_domain, f"{file}:RoundTable") == 1
     said = capsys.readouterr().out

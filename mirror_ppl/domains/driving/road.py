@@ -16,12 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerPatch
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
-from matplotlib.patheffects import Normal, Stroke
 
 from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.models.implants import SIGHT
 from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import BLUE, TRUE, draws, of_person, people, truth
+from mirror_ppl.plots.reading import BLUE, TRUE, draws, edged, of_person, people, truth
 
 if TYPE_CHECKING:
     import arviz as az
@@ -268,8 +267,7 @@ def _explain(figure: Figure, axes: list[Axes], truth_known: bool) -> None:
     handles: list[Any] = [Rectangle((0, 0), 1, 1, fc=BLUE)]
     labels = ["the person's car and its direction of travel"]
     if truth_known:
-        edge = [Stroke(linewidth=4.6, foreground=ASPHALT), Normal()]
-        handles.append(Line2D([], [], color=TRUE, lw=2.6, path_effects=edge))
+        handles.append(Line2D([], [], color=TRUE, lw=2.6, path_effects=edged(4.6, ASPHALT)))
         labels.append("outline: what they really see (simulated people)")
     figure.legend(
         handles,
