@@ -136,7 +136,7 @@ class Decision:
             row: dict[str, Any] = {
                 "message": str(channels.message(candidate[0])),
                 "later": "; ".join(
-                    f"in {step} step{'s' * (step > 1)}: {channels.message(flags)}"
+                    f"{_in(step)}: {channels.message(flags)}"
                     for step, flags in enumerate(candidate)
                     if step > 0 and flags.any()
                 ),
@@ -205,7 +205,7 @@ class Decision:
             return f"{text}: slightly changes what they do in the steps ahead {worth}"
         # Their lane at later steps is not known.
         deed = self.domain.deed(self.observation, None if step else ranked[0][1], action)
-        when = "" if step == 0 else f" in {step} step{'s' * (step > 1)}"
+        when = "" if step == 0 else f" {_in(step)}"
         likely = f"with probability {without:.2f}; with the message, {told:.2f}"
         return f"{text}: they would {deed}{when} {likely} {worth}"
 
@@ -233,7 +233,7 @@ class Decision:
     def _with_later(self) -> str:
         """Name the later messages of the plan, since the gain is of all of it."""
         later = [
-            f"in {step} step{'s' * (step > 1)}: {self._about(message)}"
+            f"{_in(step)}: {self._about(message)}"
             for step, message in enumerate(self.plan)
             if step and message
         ]
@@ -257,6 +257,10 @@ class Decision:
     def _about(self, items: Iterable[tuple[str, str]]) -> str:
         about = [self.domain.describe(self.observation, *pair) for pair in items]
         return ", and ".join(dict.fromkeys(about))
+
+
+def _in(step: int) -> str:
+    return f"in {step} step{'s' * (step > 1)}"
 
 
 @dataclass(frozen=True, repr=False)

@@ -25,9 +25,9 @@ BLUE, ORANGE, PURPLE, BLACK, GREY = "#0072B2", "#E69F00", "#CC79A7", "#000000", 
 POSTERIOR, PRIOR, TRUE, OBSERVED = BLUE, GREY, ORANGE, BLACK
 
 
-def edged(width: float = 3.2) -> list[AbstractPathEffect]:
-    """Return effects that draw a line on a white one, so that it is seen on dark colours, too."""
-    return [Stroke(linewidth=width, foreground="white"), Normal()]
+def edged(width: float = 3.2, colour: str = "white") -> list[AbstractPathEffect]:
+    """Return effects that draw a line on a wider one, so that it is seen on any colour."""
+    return [Stroke(linewidth=width, foreground=colour), Normal()]
 
 
 def people(data: az.InferenceData) -> list[str]:

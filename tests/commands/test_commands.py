@@ -52,7 +52,7 @@ def test_version():
     ("args", "told"),
     [
         (("--nonsense",), "--nonsense"),
-        (("fitt", "--out", "x"), "perhaps you meant"),
+        (("fitt", "--out", "x"), 'perhaps you meant "fit"'),
         (("fit", "--nonsense"), "python -m mirror_ppl.fit --help"),
         (("--version", "more"), "more"),
     ],

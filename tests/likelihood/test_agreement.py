@@ -394,3 +394,10 @@ def test_what_a_program_leans_on_elsewhere_counts(self_model):
     one, other = Leaning(self_model), Leaning(self_model)
     other.weight = 2.0
     assert run_identity(one, None, ["x"]) != run_identity(other, None, ["x"])
+
+
+def test_a_class_that_was_executed_without_a_module_is_a_users():
+    names = {}
+    exec("class Mine:\n    def method(self): pass", {"__builtins__": __builtins__}, names)
+    made = names["Mine"]()
+    assert not is_of_package(made)
