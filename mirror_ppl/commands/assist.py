@@ -69,7 +69,7 @@ class Options:
     """Worth of a reward one step later, from above 0 to 1; 1 unless given."""
     min_standard_errors: float | None = None
     """How many standard errors of its gain a message has to gain to be sent; 0 is enough for the
-    best on average. 2 in driving and highway, 1 in search_rescue and 0 in bomb_defusal unless
+    best on average. 2 in highway, 1 in driving and search_rescue and 0 in bomb_defusal unless
     given."""
     patience: int | None = None
     """Steps over which a message is compared with saying it later; 1 compares with silence only."""
