@@ -286,8 +286,8 @@ from mirror_ppl.plots.communication import plot_action, plot_utilities
 plot_utilities(decision)
 
 # %% [markdown]
-# All candidates as a table, largest mean gain first; the chosen one has the largest gain minus two
-# standard errors. `later` is the plan's message for later steps, `probability` the share of draws
+# All candidates as a table, largest mean gain first; the chosen one has the largest gain minus its
+# standard error. `later` is the plan's message for later steps, `probability` the share of draws
 # in which the candidate beats silence, and `p(switch)` the probability of a change of lanes now.
 
 # %%
@@ -304,9 +304,9 @@ plot_action(decision)
 #
 # - `patience=3`, the default, compares a message with the same message one or two steps later, as
 #   it may become needless. `patience=1` compares it with permanent silence.
-# - `min_standard_errors=2`, the default in driving, requires that the gain of a message and of
-#   each of its items exceeds two of its standard errors. 0 chooses the largest mean gain; 20 drops
-#   small gains.
+# - `min_standard_errors=1`, the default in driving, requires that the gain of a message and of
+#   each of its items exceeds its standard error. 0 chooses the largest mean gain; 20 drops small
+#   gains.
 #
 # Messages of four communicators at four steps of the round above, from the step before the decisive
 # message on. All get the same past, with the messages of the default.

@@ -166,7 +166,9 @@ def plot_relevance(shares: pd.DataFrame) -> Picture:
     figure, panels = _panels(shares)
     looks = _looks(shares["model"])
     for ax, (place, here) in zip(panels, _by_place(shares), strict=True):
-        last = here.loc[here["rounds"].isin([0, here["rounds"].max()])]
+        # Rules have no rounds; what learned is shown once, after the most rounds of all.
+        own = here.groupby("model")["rounds"].transform("max")
+        last = here.loc[(here["rounds"] == own) & own.isin([0, here["rounds"].max()])]
         models, names = (list(dict.fromkeys(last[name])) for name in ("model", "modality"))
         width = 0.8 / len(models)
         for one in last.to_dict("records"):

@@ -93,6 +93,7 @@ def test_levels_that_would_flatten_the_curves_are_given_in_words():
 def test_bars_are_of_the_most_rounds_and_silence_is_named():
     place = Place("driving", "fog", "paper")
     shares = [
+        Share(place, "mirror", 0, "all", 5, Interval(0.8, 0.7, 0.9)),
         Share(place, "mirror", 1, "all", 5, Interval(0.9, 0.8, 1.0)),
         Share(place, "mirror", 20, "all", 5, Interval(0.6, 0.5, 0.7)),
         Share(place, "none", 0, "all", 0, None),
