@@ -272,9 +272,8 @@ def beliefs_have_density(human: HumanModel) -> bool:
     }
     sites = discrete_sites(human) | attention_sites(human)
     implants = {name: support[:1] for name, support in sites.items()}
-    view, _ = human.perceive(
-        implants, domain.nothing_known(1, device=device), observation, nothing, 0
-    )
+    known = human.nothing_known(1, device=device)
+    view, _ = human.perceive(implants, known, observation, nothing, 0)
     evidence = human.evidence(view, observation)
     none = torch.full((1,), len(domain.actions), device=device)
     state = human.believe(evidence.new_zeros(1, human.belief_size), evidence, none)

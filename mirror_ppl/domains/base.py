@@ -382,14 +382,23 @@ def total_reward(terms: Mapping[str, Tensor]) -> Tensor:
 
 
 def map_state(function: Callable[..., Tensor], *states: Any) -> Any:
-    """Apply a function to each tensor of one or several states, or of any dataclass of tensors."""
+    """Apply a function to each tensor of states, or of any dataclass of tensors or of such."""
+    if isinstance(states[0], Tensor):
+        return function(*states)
     kind = type(states[0])
     return kind(
         **{
-            field.name: function(*(getattr(state, field.name) for state in states))
+            field.name: map_state(function, *(getattr(state, field.name) for state in states))
             for field in fields(kind)
         }
     )
+
+
+def tensors_of(state: Any) -> list[Tensor]:
+    """Return the tensors of a dataclass of tensors, or of such, in the order of its fields."""
+    if isinstance(state, Tensor):
+        return [state]
+    return [part for field in fields(state) for part in tensors_of(getattr(state, field.name))]
 
 
 def roll_out(domain: Domain, start: Any, actions: Tensor) -> Any:

@@ -122,7 +122,7 @@ def _read(human: HumanModel, supports: Mapping[str, Tensor]) -> set[str]:
     sites = {**supports, **attention_sites(human)}
     implants = Readable({name: support[:1] for name, support in sites.items()})
     state = domain.initial(1, torch.Generator(device).manual_seed(0))
-    without: Any = domain.nothing_known(1, device=device)
+    without: Any = human.nothing_known(1, device=device)
     informed: Any = without
     with WithoutSites(BELIEVING):
         for step in range(domain.horizon):

@@ -100,7 +100,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                 if name in discrete_names(trace.trace)
             }
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
-            knowledge: Any = domain.nothing_known(people, device=device)
+            knowledge: Any = human.nothing_known(people, device=device)
             for step, now in enumerate(observed):
                 with WithoutSites(BELIEVING):
                     readable = Readable(discrete | latents, implants.keys())

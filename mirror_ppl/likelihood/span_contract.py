@@ -58,7 +58,7 @@ def _check_looks(
     observed: Sequence[Observation],
 ) -> None:
     """Check that no value of a site changes the percept outside of what its span declares."""
-    knowledge = human.domain.nothing_known(1, device=observed[0]["ego"].device)
+    knowledge = human.nothing_known(1, device=observed[0]["ego"].device)
     for step, now in enumerate(observed):
         can_be = human.domain.communicable(now)
         told = {name: torch.zeros_like(mask) for name, mask in can_be.items()}

@@ -10,13 +10,19 @@ n stands for people or histories that are tracked, m for distinct beliefs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Observation, RepeatedObservation, Visibility, map_state
+from mirror_ppl.domains.base import (
+    Observation,
+    RepeatedObservation,
+    Visibility,
+    map_state,
+    tensors_of,
+)
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, overrides
 from mirror_ppl.models.networks import Gaussian
@@ -105,7 +111,7 @@ class BeliefState:
         """Return the state of n people before the first step, when every belief is zero."""
         zero = next(human.parameters()).new_zeros(1, human.belief_size)
         own = torch.zeros(number, dtype=torch.long, device=zero.device)
-        knowledge = human.domain.nothing_known(number, device=zero.device)
+        knowledge = human.nothing_known(number, device=zero.device)
         return cls(human, zero, None, own, knowledge, memory=memory)
 
     @property
@@ -120,7 +126,7 @@ class BeliefState:
 
     def key(self) -> Tensor:
         """Return whole numbers ``[n, ...]``, equal where belief and knowledge are equal."""
-        known = [getattr(self.knowledge, part.name).flatten(1) for part in fields(self.knowledge)]
+        known = [part.flatten(1) for part in tensors_of(self.knowledge)]
         floats = [part for part in known if part.is_floating_point()]
         known = [part.long() for part in known if not part.is_floating_point()]
         if floats:

@@ -224,6 +224,10 @@ class HumanModel(nn.Module):
         own = reach.expand(*batch, -1).gather(-1, direction.expand(*batch, -1))
         return by_eye(self.domain, distance <= own)
 
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> Any:
+        """Return what people know before a round ``[*batch]``, by default the domain's."""
+        return self.domain.nothing_known(*batch, device=device)
+
     def perceive(
         self,
         implants: Implants,
@@ -236,7 +240,7 @@ class HumanModel(nn.Module):
 
         Args:
             implants: the discrete sites of :meth:`prior` and :meth:`round_latents`, ``[...]``.
-            knowledge: the domain's, of the step before.
+            knowledge: that of the step before, at first :meth:`nothing_known`.
             observation: everything that could be seen at this step, ``[..., K, F]``.
             told: what is communicated at this step, ``[..., K]``.
             step: the number of the step in its round, from 0.
@@ -338,7 +342,7 @@ class HumanModel(nn.Module):
             with pyro.plate("round", number, dim=-1):
                 with MaskObserved(rounds.mask.any(-1)):
                     latents = self.round_latents({**implants, **recorded_covariates(self, rounds)})
-                knowledge = self.domain.nothing_known(1, device=device)
+                knowledge = self.nothing_known(1, device=device)
                 belief = next(self.parameters()).new_zeros(people, number, self.belief_size)
                 action = torch.full((people, number), len(self.domain.actions), device=device)
                 state = belief

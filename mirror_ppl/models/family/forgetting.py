@@ -66,7 +66,7 @@ class Forgetting(SeveralBeliefs):
         step: int,
     ) -> tuple[View, Any]:
         """Return the views with and without knowledge from earlier steps."""
-        nothing = self.domain.nothing_known(1, device=observation["ego"].device)
+        nothing = super().nothing_known(1, device=observation["ego"].device)
         afresh, _ = super().perceive(implants, nothing, observation, told, step)
         view, after = super().perceive(implants, knowledge, observation, told, step)
         return joined({NOW: view, AFRESH: afresh}), after

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import pyro
@@ -19,20 +20,36 @@ from mirror_ppl.models.view import View
 
 NOTICES = "notices"
 """Site of the probability of noticing, at a step, the items in reach."""
-MISSED = ("missed 1", "missed 2")
-"""Beliefs after noticing nothing at this step; at this and the one before."""
-UNNOTICED = "unnoticed"
-"""The view of a person who notices nothing: messages, and what they already know."""
+MISSED = ("missed 1", "missed 2", "missed 3")
+"""Beliefs after noticing nothing at this step, and at one or two before."""
+UNNOTICED = ("unnoticed 1", "unnoticed 2", "unnoticed 3")
+"""Views of a person who notices nothing: messages, and what they knew before these steps."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """Knowledge after noticing what is in reach at this step, or not for one step or two.
+
+    Attributes:
+        noticed: the knowledge of a person who notices everything in reach.
+        missed_1: that of one who noticed nothing at this step.
+        missed_2: that of one who noticed nothing at this step and the one before.
+    """
+
+    noticed: Any
+    missed_1: Any
+    missed_2: Any
 
 
 class Noticing(SeveralBeliefs):
     """Notices items in reach with some probability at each step, else uses known items only::
 
         notices_p ~ Beta(1, 1)
-        zH_t^m    the belief if nothing was noticed for m steps: 1, or 2 and more
-        a_t       ~ sum_m notices (1 - notices)^m p(a | zH_t^m)
+        zH_t^m    the belief if nothing was noticed for m steps: 1, 2, or 3 and more
+        a_t       ~ sum_{m<3} notices (1 - notices)^m p(a | zH_t^m) + (1 - notices)^3 p(a | zH_t^3)
 
-    A person who notices again notices all items in reach. Messages are always noticed.
+    A person who notices again notices all items in reach, also those that were missed. Messages
+    are always noticed.
     """
 
     def __init__(self, self_model: SelfModel) -> None:
@@ -45,8 +62,8 @@ class Noticing(SeveralBeliefs):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Names of the views, with that of a person who notices nothing."""
-        return (*super().views, UNNOTICED)
+        """Names of the views, with those of a person who notices nothing."""
+        return (*super().views, *UNNOTICED)
 
     @property
     def beliefs(self) -> tuple[str, ...]:
@@ -58,15 +75,20 @@ class Noticing(SeveralBeliefs):
         one = next(self.self_model.parameters()).new_ones(())
         return super().prior() | {NOTICES: pyro.sample(NOTICES, dist.Beta(one, one))}
 
+    def nothing_known(self, *batch: int, device: torch.device | None = None) -> Known:
+        """Return what people know before a round, whatever they will notice."""
+        nothing = super().nothing_known(*batch, device=device)
+        return Known(nothing, nothing, nothing)
+
     def perceive(
         self,
         implants: Implants,
-        knowledge: Any,
+        knowledge: Known,
         observation: Observation,
         told: Visibility,
         step: int,
-    ) -> tuple[View, Any]:
-        """Return the views if the items in reach are noticed and if not."""
+    ) -> tuple[View, Known]:
+        """Return the views if the items in reach are noticed and if not, and knowledge after."""
 
         def nothing(seen: Observation) -> Visibility:
             return {
@@ -75,19 +97,28 @@ class Noticing(SeveralBeliefs):
                 if name != "ego"
             }
 
-        view, after = super().perceive(implants, knowledge, observation, told, step)
-        missed, _ = perceived_by(nothing, self.domain, implants, knowledge, observation, told)
-        return joined({NOW: view, UNNOTICED: missed}), after
+        view, noticed = super().perceive(implants, knowledge.noticed, observation, told, step)
+        views, known = {NOW: view}, [noticed]
+        before = (knowledge.noticed, knowledge.missed_1, knowledge.missed_2)
+        for name, own in zip(UNNOTICED, before, strict=True):
+            views[name], after = perceived_by(
+                nothing, self.domain, implants, own, observation, told
+            )
+            known.append(after)
+        return joined(views), Known(*known[:-1])
 
     def after(self, before, evidence, action, still) -> dict[str, Tensor]:
-        """Return the beliefs after one step, also if nothing was noticed for one step or two."""
+        """Return the beliefs after one step, also if nothing was noticed for one to three steps."""
         found = super().after(before, evidence, action, still)
-        for name, own in zip(MISSED, (NOW, *MISSED), strict=False):
-            found[name] = self.inferred(before[own], evidence[UNNOTICED], action, still)
+        for name, view, own in zip(MISSED, UNNOTICED, (NOW, *MISSED[:-1]), strict=True):
+            found[name] = self.inferred(before[own], evidence[view], action, still)
         return found
 
     def shares(self, implants: Implants) -> dict[str, Tensor]:
         """Return the probabilities of acting on each belief, with those after noticing nothing."""
         found, notices = super().shares(implants), implants[NOTICES]
-        once, more = (found[NOW] * (1 - notices) * part for part in (notices, 1 - notices))
-        return found | {NOW: found[NOW] * notices} | dict(zip(MISSED, (once, more), strict=True))
+        left = found[NOW]
+        for name in (NOW, *MISSED[:-1]):
+            found[name] = left * notices
+            left = left - found[name]
+        return found | {MISSED[-1]: left}
