@@ -13,6 +13,8 @@ r"""What settings of the planner are worth, on people who are reported nowhere e
         --min-standard-errors 0 1 2
     python -m benchmarks.planner_settings --domain driving --rounds 0 1 5 \
         --min-standard-errors 1 2 --seeds 105 106 107 108 109 110 111 112 113 114
+    python -m benchmarks.planner_settings --domain highway --population diverse --played 4 \
+        --seeds 100 101 102 --rounds 20 --min-standard-errors 0 1 2
 
 Each combination of the settings given, of `PlannerOptions`, is played by ``mirror`` for the same
 people, fitted to each number of rounds, in the setting in which they see least. Rows are added to

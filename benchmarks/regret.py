@@ -65,7 +65,7 @@ def main(options: Options) -> None:
         for patience in options.patience:
             pairing = Pairing(
                 posterior, None, None, 64, options.setting, options.population, 0, 10,
-                options.rounds, PlannerOptions(horizon=horizon, patience=patience),
+                options.rounds, PlannerOptions.of("driving", horizon=horizon, patience=patience),
                 options.seed, False,
             )  # fmt: skip
             parts = torch.stack([lost(pairing, number - 1) for number in options.people]).mean(0)
