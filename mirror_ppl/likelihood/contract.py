@@ -100,7 +100,9 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                 if name in discrete_names(trace.trace)
             }
             belief = next(human.parameters()).new_zeros(people, human.belief_size)
+            method = "nothing_known"
             knowledge: Any = human.nothing_known(people, device=device)
+            _check_knowledge("nothing_known returned {}", knowledge)
             for step, now in enumerate(observed):
                 with WithoutSites(BELIEVING):
                     readable = Readable(discrete | latents, implants.keys())
@@ -109,11 +111,7 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                         _check_sees(domain, human.sees(readable, now, step), people)
                     method = "perceive"
                     view, knowledge = human.perceive(readable, knowledge, now, told, step)
-                    if not is_dataclass(knowledge):
-                        raise HumanModelError(
-                            f"perceive returned {type(knowledge).__name__} as knowledge, expected "
-                            "a dataclass of tensors"
-                        )
+                    _check_knowledge("perceive returned {} as knowledge", knowledge)
                     method = "evidence"
                     evidence = human.evidence(view, now)
                     method = "believe"
@@ -142,6 +140,13 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
         where = describe(error, None if file is None else Path(file))
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
+
+
+def _check_knowledge(what: str, knowledge: Any) -> None:
+    """Check that knowledge is a dataclass, as its tensors are selected by people."""
+    if not is_dataclass(knowledge):
+        found = what.format(type(knowledge).__name__)
+        raise HumanModelError(f"{found}, expected a dataclass of tensors")
 
 
 def _check_sees(domain: Domain, masks: Any, people: int) -> None:

@@ -161,6 +161,16 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
             r"Mine\.perceive fails: RuntimeError.*mine\.py, line 9",
         ),
         ("perceive(self, implants)", "return None", r"Mine\.perceive fails: TypeError"),
+        (
+            "perceive(self, *now)",
+            "return super().perceive(*now)[0], {}",
+            "perceive returned dict as knowledge, expected a dataclass of tensors",
+        ),
+        (
+            "nothing_known(self, *batch, device=None)",
+            "return torch.zeros(*batch)",
+            "nothing_known returned Tensor, expected a dataclass of tensors",
+        ),
         ("perceive(self, *look)", "return None", r"Mine\.perceive fails: TypeError"),
         ("evidence(self, view, observation)", "return view.seen", r"Mine\.evidence fails: Attr"),
         ("believe(self, *now)", "return None", r"Mine\.believe fails"),
