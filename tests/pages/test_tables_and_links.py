@@ -12,6 +12,7 @@ from pyro import poutine
 from shown_pages import PAGES, blocks, commands, imported, page, table_of
 
 from mirror_ppl.commands import COMMANDS, assist, evaluate
+from mirror_ppl.communication.planners import PlannerOptions
 from mirror_ppl.domains import get_domain
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
 from mirror_ppl.inference.adaptive_importance import PRUNING_DRAWS, ImportanceOptions
@@ -162,6 +163,17 @@ def test_options_and_communicators_of_assist_are_as_on_the_page():
     assert shown == {name: str(getattr(options, name)) for name in shown}
     first = " ".join(row[0] for row in table_of(text, "Communicator"))
     assert tuple(re.findall(r"`([\w-]+)`", first)) == COMMUNICATORS
+
+
+def test_margins_of_the_worlds_are_on_the_page_and_in_the_help_of_assist():
+    worlds = ("highway", "driving", "search_rescue", "bomb_defusal")
+    margins = [PlannerOptions.of(world).min_standard_errors for world in worlds]
+    assert margins == [2, 1, 1, 0]
+    shown = {row[0]: row[2] for row in table_of(page("docs/communicator.md"), "Option")}
+    words = "2 in highway driving, 1 in driving and in search and rescue, 0 in bomb defusal"
+    assert words in shown["`--min-standard-errors`"]
+    source = " ".join((ROOT / "mirror_ppl/commands/assist.py").read_text().split())
+    assert "2 in highway, 1 in driving and search_rescue and 0 in bomb_defusal" in source
 
 
 def test_views_of_training_have_the_shares_of_the_page():
