@@ -45,14 +45,6 @@ def log_softmax_of_few(logits: Tensor) -> Tensor:
     return side_by_side.view(logits.shape[-1], *logits.shape[:-1]).movedim(0, -1)
 
 
-def log_add_exp(first: Tensor, second: Tensor) -> Tensor:
-    """Return ``torch.logaddexp`` of numbers, the second broadcast to the first.
-
-    ``torch`` takes ten times as long where the two are laid out differently in memory.
-    """
-    return torch.logaddexp(first, torch.zeros_like(first) + second)
-
-
 class GaussianHead(nn.Module):
     """Maps features ``[..., H]`` to a diagonal Gaussian of ``size`` dimensions."""
 

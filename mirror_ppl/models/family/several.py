@@ -19,7 +19,7 @@ from torch import Tensor
 from mirror_ppl.domains.base import Observation
 from mirror_ppl.models.human import HumanModel, Implants
 from mirror_ppl.models.implants import LEAST_PROBABILITY
-from mirror_ppl.models.networks import Gaussian, log_add_exp
+from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows
 
@@ -153,9 +153,9 @@ class SeveralBeliefs(HumanModel):
             if found is None:
                 found = part.new_full((number, *part.shape[1:]), -torch.inf)
             if len(rows) == number:
-                found = log_add_exp(part, found)
+                found = torch.logaddexp(found, part)
             else:
-                found[rows] = log_add_exp(part, found[rows])
+                found[rows] = torch.logaddexp(found[rows], part)
         assert found is not None
         return found
 
