@@ -1,6 +1,10 @@
 """Recordings for the tests of demonstrations and their files."""
 
+from functools import cache
+
 import torch
+
+from mirror_ppl.data import asset_path, load_demonstrations
 
 NAN = float("nan")
 
@@ -34,6 +38,15 @@ def fields(lengths, names="abcdefgh", seed=0):
         "action_entropy": 0.69 * torch.rand(P, B, T, generator=g),
         "provenance": {"command": "test", "seed": 3, "temperature": 0.1},
     }
+
+
+loaded = cache(load_demonstrations)
+
+
+def shipped(domain, setting, people, rounds, population="paper"):
+    """Recordings that ship: to simulate others takes long on the highway."""
+    every = loaded(asset_path(f"{domain}_{setting}_{population}.nc"))
+    return every.select_people(range(people)).select_rounds(range(rounds))
 
 
 RAGGED = [[3, 1], [], [2, 4, 1]]

@@ -58,6 +58,16 @@ def ragged(generator, name, rounds):
     return padded.select_rounds(slice(None))  # without padding that no round needs
 
 
+def first_steps(recordings, steps):
+    """The rounds of recordings, which end after so many steps at the latest."""
+    variables = recordings.variables()
+    variables |= {"length": variables["length"].clamp(max=steps)}
+    short = type(recordings).from_variables(
+        recordings.domain, recordings.setting, recordings.people, variables, recordings.provenance
+    )
+    return short.select_rounds(slice(None))  # without padding that no round needs
+
+
 def untrained(domain, people=("a",), seed=0):
     """Networks of SQIL that nobody trained: of any outputs, blind to their inputs."""
     generators = [torch.Generator().manual_seed(seed + place) for place in range(len(people))]

@@ -6,6 +6,7 @@ import pytest
 import torch
 from example_course import gone_through
 from example_person import DOMAIN, begun
+from example_recordings import shipped
 from example_rounds import untrained
 
 from mirror_ppl.baselines import NetworkPerson
@@ -19,16 +20,13 @@ from mirror_ppl.domains.driving import STAY, SWITCH
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.people import simulate
 
 ONLY = {NETWORK: torch.zeros(1, dtype=torch.long)}
 
 
 def recorded(domain, generator, rounds=3):
     """Rounds in the setting that shows less, in which a person received various messages."""
-    found = simulate(
-        domain, get_domain(domain).settings[-1], "paper", people=1, rounds=rounds, seed=0
-    )
+    found = shipped(domain, get_domain(domain).settings[-1], 1, rounds)
     told = {
         name: torch.rand(mask.shape, generator=generator) < 0.3 for name, mask in found.told.items()
     }

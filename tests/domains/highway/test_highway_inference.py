@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from example_rounds import first_steps
 
 import mirror_ppl
 from mirror_ppl.communication import Person, RoundSoFar
@@ -35,7 +36,7 @@ def fit(human):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnreliableWeights)
         return mirror_ppl.infer(
-            rounds.select_rounds(range(2)),
+            first_steps(rounds.select_rounds(range(2)), 12),
             human=human,
             engine="importance",
             settings={"proposals": 64, "enough": 16},
