@@ -45,7 +45,7 @@ def recordings():
 @pytest.mark.parametrize("guide", ["importance", "svi"])
 def test_engines_have_the_posterior_of_the_program(guide, change, recordings):
     """Importance within four standard errors; the Gaussian of svi within a fifth of the change."""
-    options = InferenceOptions(engine=guide, draws=2000 if guide == "importance" else 400)
+    options = InferenceOptions(engine=guide, draws=2000 if guide == "importance" else 100)
     found = infer(toy(change, self_model()), recordings, options, 0).draws["in_sight"].flatten()
     expected = exact_mean(change, recordings, self_model())
     if guide == "importance":

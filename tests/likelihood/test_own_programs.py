@@ -35,12 +35,16 @@ from mirror_ppl.training.guide_file import network_for
 __all__ = ["recordings"]
 
 
-class Asked(ToyHuman):
-    """The factor of `benchmarks.one_program.toy`, added by the program and not by its prior."""
+class Kept(ToyHuman):
+    """Keeps the implants for what a program adds."""
 
     def prior(self):
         self.implants = super().prior()
         return self.implants
+
+
+class Asked(Kept):
+    """The factor of `benchmarks.one_program.toy`, added by the program and not by its prior."""
 
     def model(self, rounds, world=False):
         super().model(rounds, world)
@@ -76,11 +80,14 @@ def test_rounds_can_be_added(recordings):
 
 @pytest.mark.parametrize("engine", ["svi", "nuts"])
 def test_the_program_of_a_user_is_run(engine, recordings):
-    settings = SVIOptions(steps=250) if engine == "svi" else NUTSOptions(warmup=30)
-    options = InferenceOptions(engine, 60, settings)
+    if engine == "svi":
+        options = InferenceOptions(engine, 60, SVIOptions(steps=120))
+    else:
+        options = InferenceOptions(engine, 30, NUTSOptions(warmup=20))
     found = infer(Asked(self_model()), recordings, options, 0).draws["in_sight"].flatten()
-    # Draws of a chain depend on each other: as many as a third of them count.
-    error = 0.03 if engine == "svi" else 4 * float(found.std()) / math.sqrt(20)
+    # Draws of a chain depend on each other: as many as a third of them count. Without the factor
+    # the mean is .37 instead of .86, and a standard deviation is .08.
+    error = 0.03 if engine == "svi" else 4 * float(found.std()) / math.sqrt(10)
     assert abs(found.mean() - exact_mean("factor", recordings, self_model())) < error
 
 
@@ -174,7 +181,7 @@ class More(Asked):
             pyro.sample("mood", dist.Normal(0.0, 1.0))
 
 
-class Tied(Asked):
+class Tied(Kept):
     """People who are alike, whoever they are."""
 
     def model(self, rounds, world=False):
@@ -194,9 +201,10 @@ def two_people(recordings):
 
 def test_what_ties_people_together_is_of_nobody_alone(recordings, monkeypatch):
     two = two_people(recordings)
-    found = infer(Tied(self_model()), two, InferenceOptions("nuts", 20, NUTSOptions(15)), 0)
+    found = infer(Tied(self_model()), two, InferenceOptions("nuts", 10, NUTSOptions(10)), 0)
     first, second = found.draws["in_sight"].squeeze(-1).T
-    assert (first - second).abs().mean() < 0.1  # .3 without the factor
+    # .19 without the factor, with which their difference has the standard deviation .045.
+    assert (first - second).abs().mean() < 0.1
     compiled = compile(Tied(self_model()), two)
     assert compiled.joint == ["tied"]
     with pytest.raises(HumanModelError, match='Tied.model has "tied" outside of a plate of people'):

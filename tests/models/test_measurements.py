@@ -52,7 +52,7 @@ def measured(rounds, **values):
 @pytest.mark.parametrize("engine", ["importance", "svi"])
 def test_a_measured_site_is_an_observed_site(engine, recordings):
     human = Answering(self_model())
-    options = InferenceOptions(engine, 2000 if engine == "importance" else 400)
+    options = InferenceOptions(engine, 2000 if engine == "importance" else 100)
     draws = infer(human, measured(recordings, answer=[0.7]), options, 0).draws
     found = draws["in_sight"].flatten()
     error = 4 * float(found.std()) / math.sqrt(400) if engine == "importance" else 0.03
@@ -73,10 +73,12 @@ def test_unmeasured_it_is_a_site_like_others(recordings):
 
 @pytest.mark.parametrize("engine", ["importance", "svi"])
 def test_each_person_has_their_own(engine):
-    rounds = simulate("driving", "fog", "paper", 4, 2, 100)
+    rounds = simulate("driving", "fog", "paper", 4, 1, 100)
     answers = [1.0, 5.0, math.nan, 1.0]
-    settings = SVIOptions(steps=150) if engine == "svi" else None
-    options = InferenceOptions(engine, 100, settings)
+    if engine == "svi":
+        options = InferenceOptions(engine, 30, SVIOptions(steps=80))
+    else:
+        options = InferenceOptions(engine, 100)
     some = measured(rounds, questionnaire=answers)
     draws = infer(Asked(robot_of_few_reaches()), some, options, 0).draws
     medians = draws["consistency"].median(0).values.flatten().tolist()
