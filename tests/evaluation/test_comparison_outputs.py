@@ -181,7 +181,13 @@ def fits(tmp_path_factory):
     some = every.select_people([0, 1]).select_rounds(range(4))
     save_demonstrations(folder / "some.nc", some)
     for seed in (0, 1):
-        options = fit.Options(folder / "some.nc", out=folder / f"{seed}", draws=12, explore=0)
+        options = fit.Options(
+            folder / "some.nc",
+            out=folder / f"{seed}",
+            human_model="one-radius",  # which is quick
+            draws=12,
+            explore=0,
+        )
         fit.main(fit.Options(**{**vars(options), "seed": seed}))
     return folder
 
@@ -193,7 +199,7 @@ def test_folders_of_fits_are_compared(fits, tmp_path, capsys, by):
     assert command(compare, fits / "0", fits / "1", "--by", by, *outputs) == 0
     out, err = capsys.readouterr()
     assert err == "" and all(len(line) <= 80 for line in out.splitlines() if "a." not in line)
-    assert "mirror 0" in out and "mirror 1" in out
+    assert "one-radius 0" in out and "one-radius 1" in out
     results = json.loads((tmp_path / "a.json").read_text())
     models = {entry["label"]: entry for entry in results["models"]}
     assert len(models) == 2
@@ -202,5 +208,5 @@ def test_folders_of_fits_are_compared(fits, tmp_path, capsys, by):
     for seed in (0, 1):
         summary = json.loads((fits / f"{seed}" / "summary.json").read_text())
         expected = [-person["test"]["nll"] for person in summary["people"]]
-        people = models[f"mirror {seed}"]["people"]
+        people = models[f"one-radius {seed}"]["people"]
         assert [person["log_density"] for person in people] == pytest.approx(expected, abs=1e-5)

@@ -8,7 +8,7 @@ from mirror_ppl.errors import InputError
 from mirror_ppl.inference.workers import PART, PEOPLE_OF_A_PROCESS, People, Workers
 from mirror_ppl.timing import clocked, stage
 
-PEOPLE = 6
+PEOPLE = 4
 SMALL = {"draws": 20, "train_rounds": 3, "explore": 1}
 RADIUS = SMALL | {"human": "one-radius"}
 """A model with few combinations of perceptual implants, which is quick."""
@@ -16,7 +16,9 @@ RADIUS = SMALL | {"human": "one-radius"}
 
 @pytest.fixture(scope="module")
 def recordings():
-    return mirror_ppl.load_recordings(population="diverse").part(range(PEOPLE))
+    """Three rounds to learn from, and one to predict."""
+    everybody = mirror_ppl.load_recordings(population="diverse")
+    return everybody.part(range(PEOPLE)).select_rounds(range(4))
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 TOY = ("--human-model", "toy.py:Toy")
+QUICK = ("--demos", "some.nc", *TOY, "--explore", 0)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def folder(toy, tmp_path_factory):
         patch.chdir(folder)
         status = command(
             fit, "--demos", "some.nc", *TOY, "--pooling", "partial", "--train-rounds", 4,
-            "--draws", 60, "--out", "pooled",
+            "--draws", 60, "--explore", 0, "--out", "pooled",
         )  # fmt: skip
     assert status == 0
     return folder
@@ -109,7 +110,7 @@ def toy_rates(population):
 def test_a_population_is_a_prior_of_others(inside, capsys):
     """Without rounds, people are the newcomer; with rounds, more is known."""
     for rounds, out in ((0, "none"), (1, "one")):
-        args = "--demos", "some.nc", *TOY, "--draws", 60, "--train-rounds", rounds, "--out", out
+        args = *QUICK, "--draws", 60, "--train-rounds", rounds, "--out", out
         assert command(fit, *args, "--prior-from", "pooled/posterior.nc") == 0
     before, after = (
         az.from_netcdf(f"{name}/posterior.nc")["posterior"] for name in ("none", "one")
@@ -120,7 +121,7 @@ def test_a_population_is_a_prior_of_others(inside, capsys):
     assert float(right.mean()) > float((before["reach"] == 3).mean())
     capsys.readouterr()
     # By itself, nobody without rounds is known better than by the prior.
-    assert command(fit, "--demos", "some.nc", *TOY, "--train-rounds", 0, "--out", "own") == 0
+    assert command(fit, *QUICK, "--train-rounds", 0, "--out", "own") == 0
     own = az.from_netcdf("own/posterior.nc")["posterior"]["reach"]
     assert abs(float((own == 3).mean()) - 1 / 7) < 0.06  # 1,600 draws: s.d. 0.01
     assert "Held-out actions" in capsys.readouterr().out
@@ -130,7 +131,7 @@ def test_runs_with_and_without_a_population_do_not_continue_each_other(inside, t
     from mirror_ppl.inference import engines
     from mirror_ppl.inference.results.fitting import fit_people
 
-    demonstrations = load_demonstrations(inside / "some.nc")
+    demonstrations = load_demonstrations(inside / "some.nc").select_people([0, 1])
     options = engines.InferenceOptions(draws=20)
     checkpoint = inside / "some.checkpoint"
     fit_people(toy, demonstrations, options, 0, 2, checkpoint=checkpoint)
