@@ -22,6 +22,7 @@ from mirror_ppl.inference.amortized import AmortizedOptions, evidence_of, sample
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, guide_screening, reference_places
 from mirror_ppl.inference.calibration.study import CalibrationOptions, calibrate, prior_people
 from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer
+from mirror_ppl.inference.nuts import NUTSOptions
 from mirror_ppl.inference.sampler import Sampler
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, rounds_of
@@ -35,7 +36,7 @@ from mirror_ppl.training import guide as guide_training
 from mirror_ppl.training.guide import GuideOptions, train_guide
 from mirror_ppl.training.guide_file import load_guide, network_for, save_guide
 
-TRAINING = GuideOptions(people=150, rounds=(1, 3), steps=600, batch=64, together=50)
+TRAINING = GuideOptions(people=150, rounds=(1, 3), steps=300, batch=64, together=50)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,7 @@ def test_importance_finds_the_exact_posterior(toy, recordings, network, guide):
 
 
 def test_variational_posteriors_are_about_right(toy, recordings):
-    found = infer(toy, recordings, options_of("svi"), 1)
+    found = infer(toy, recordings, replace(options_of("svi"), draws=100), 1)
     exact = toy_posterior(toy, recordings)
     bins = torch.arange(exact.reach.shape[1])[:, None, None]
     share = (found.draws["reach"][..., 0] == bins).double().mean(1).T
@@ -110,7 +111,7 @@ def test_variational_posteriors_are_about_right(toy, recordings):
 
 def test_hamiltonian_draws_are_of_the_exact_posterior(toy, recordings):
     one = recordings.select_people([0])
-    found = infer(toy, one, InferenceOptions("nuts", 150), 1)
+    found = infer(toy, one, InferenceOptions("nuts", 150, NUTSOptions(warmup=50)), 1)
     exact = toy_posterior(toy, one)
     for site in RATES:
         off = (found.draws[site][..., 0].double().mean(0) - exact.mean(site)).abs()
