@@ -1,5 +1,7 @@
 """Short fits by the command, and what they leave in a folder."""
 
+from example_rounds import first_steps
+
 from mirror_ppl.data import asset_path, load_demonstrations
 
 RESULTS = {
@@ -13,9 +15,9 @@ RESULTS = {
 
 
 def two_people():
-    """Two people in fog, four rounds each: three to learn from, one held out."""
+    """Two people in fog, four short rounds each: three to learn from, one held out."""
     every = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    return every.select_people([0, 3]).select_rounds(range(4))
+    return first_steps(every.select_people([0, 3]).select_rounds(range(4)), 6)
 
 
 def content(folder):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from example_rounds import first_steps
 from matplotlib.text import Text
 from running import command
 
@@ -27,10 +28,10 @@ REFUSED = ("two\nlines", "tab\t", "n" * 101, "", " ", "ana ", "\ud800")
 
 @pytest.fixture(scope="module")
 def some():
-    """As many people, with two rounds each."""
+    """As many people, with two short rounds each."""
     every = load_demonstrations(asset_path("driving_fog_paper.nc"))
     every = every.select_people(range(len(STRANGE))).select_rounds(range(2))
-    return replace(every, people=STRANGE)
+    return replace(first_steps(every, 3), people=STRANGE)
 
 
 def test_strange_ids_are_fitted_and_shown(some, tmp_path, capsys):
