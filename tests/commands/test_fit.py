@@ -31,6 +31,13 @@ def folder(some, tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def whole(folder):
+    """A fit of many steps, of a model that is quick."""
+    assert command(fit, *short_fit(folder, "whole", *RADIUS, steps=80)) == 0
+    return folder / "whole"
+
+
 def summary_of(folder):
     """The summary of results but for their times."""
     summary = json.loads((folder / "summary.json").read_text())
@@ -87,15 +94,14 @@ def test_posterior_opens_without_this_package_and_agrees_with_the_summary(folder
         group.close()
 
 
-def test_one_seed_gives_one_summary(folder):
-    assert command(fit, *short_fit(folder, "one", *RADIUS)) == 0
+def test_one_seed_gives_one_summary(folder, whole):
     torch.manual_seed(99)
-    assert command(fit, *short_fit(folder, "again", *RADIUS)) == 0
-    assert summary_of(folder / "again") == summary_of(folder / "one")
-    assert command(fit, *short_fit(folder, "other", *RADIUS), "--seed", 1) == 0
+    assert command(fit, *short_fit(folder, "again", *RADIUS, steps=80)) == 0
+    assert summary_of(folder / "again") == summary_of(whole)
+    assert command(fit, *short_fit(folder, "other", *RADIUS, steps=80), "--seed", 1) == 0
     other = summary_of(folder / "other")
     assert other.pop("seed") == 1
-    assert other["people"] != summary_of(folder / "one")["people"]
+    assert other["people"] != summary_of(whole)["people"]
 
 
 def test_fit_says_what_it_found_and_where_it_lies(folder, capsys):
@@ -120,7 +126,7 @@ def test_shipped_recordings_are_those_that_are_asked_for():
             assert recordings.shape == (10, 40, 15)
 
 
-def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, monkeypatch):
+def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, whole, monkeypatch):
     args = [str(arg) for arg in short_fit(folder, "killed", *RADIUS, steps=80)]
     process = subprocess.Popen(
         [sys.executable, "-m", "mirror_ppl.fit", *args], stderr=subprocess.PIPE
@@ -149,5 +155,4 @@ def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, mo
     assert done[0] in (26, 51, 76)  # from a checkpoint, of which there is one in 25 steps
     assert set(content(folder / "killed")) >= RESULTS_OF_RADIUS
     assert not checkpoint.exists()
-    assert command(fit, *short_fit(folder, "whole", *RADIUS, steps=80)) == 0
-    assert summary_of(folder / "killed") == summary_of(folder / "whole")
+    assert summary_of(folder / "killed") == summary_of(whole)

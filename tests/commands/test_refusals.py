@@ -10,6 +10,8 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.training.self_model_options import SelfModelOptions
 
+QUICK = {"human_model": "no-implants", "draws": 4, "explore": 0}
+
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf"), 0.0, -1.0, 1e30])
 @pytest.mark.parametrize(
@@ -35,7 +37,7 @@ def test_nothing_is_simulated_for_a_file_that_cannot_be_written(tmp_path, monkey
 
 
 def test_messages_are_in_the_posterior_file(tmp_path):
-    options = fit.Options(out=tmp_path, people=("person-01",), train_rounds=1, draws=4, explore=0)
+    options = fit.Options(out=tmp_path, people=("person-01",), train_rounds=1, **QUICK)
     fit.main(options)
     with xr.open_dataset(tmp_path / "posterior.nc", group="constant_data") as constants:
         assert constants["told_visual"].dims[:3] == ("person", "round", "step")
@@ -63,9 +65,7 @@ def test_a_fit_says_that_nothing_was_held_out(tmp_path, capsys):
     recordings = tmp_path / "short.nc"
     everybody = load_demonstrations(asset_path("driving_fog_paper.nc"))
     save_demonstrations(recordings, everybody.select_people([0]).select_rounds([0]))
-    options = fit.Options(
-        demos=recordings, domain="driving", out=tmp_path / "fit", draws=4, explore=0
-    )
+    options = fit.Options(demos=recordings, domain="driving", out=tmp_path / "fit", **QUICK)
     fit.main(options)
     assert "No rounds were held out" in capsys.readouterr().out
 
