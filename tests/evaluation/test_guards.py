@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from example_groups import FewReaches
 
 from mirror_ppl.communication.hearing import HearingPerson, hearing
 from mirror_ppl.communication.messages import Channels
@@ -20,7 +21,7 @@ from mirror_ppl.evaluation.study import Assistance, Prediction, assist, predict
 from mirror_ppl.evaluation.study_summary import ways_to_oracle
 from mirror_ppl.inference.results.summary import summarize
 
-GROUP = Group("driving", "fog", "paper", 2, 100)
+GROUP = FewReaches("driving", "fog", "paper", 2, 100)
 LEARNED_FROM = 2
 QUICK = ["mirror", "no-implants", "base-rate", "logistic", "bc", "bc-pooled", "sqil"]
 

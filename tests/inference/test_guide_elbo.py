@@ -19,9 +19,14 @@ def toy():
 
 
 @pytest.fixture(scope="module")
-def group(toy):
-    generator = torch.Generator().manual_seed(0)
-    return next(simulated_groups(toy, (2,), generator))
+def groups(toy):
+    found = simulated_groups(toy, (2,), torch.Generator().manual_seed(0))
+    return list(itertools.islice(found, 5))
+
+
+@pytest.fixture(scope="module")
+def group(groups):
+    return groups[0]
 
 
 @torch.no_grad()
@@ -44,9 +49,7 @@ def test_a_group_is_what_was_simulated(toy, group):
     assert torch.equal(group.steps[:, 0], recorded)
 
 
-def test_the_elbo_teaches_the_network_where_people_are(toy):
-    groups = simulated_groups(toy, (2,), torch.Generator().manual_seed(0))
-    groups = list(itertools.islice(groups, 5))
+def test_the_elbo_teaches_the_network_where_people_are(toy, groups):
     torch.manual_seed(0)
     network = AmortizedGuide(reference_places(toy)).eval()
     before = surprise(network, groups)

@@ -338,7 +338,7 @@ def test_train_makes_a_guide_that_fit_and_calibrate_use(tmp_path, monkeypatch, c
     assert command(calibrate_command, *human, *guide, *small, "--out", tmp_path / "c") == 0
     demos = tmp_path / "some.nc"
     assert command(simulate, "--people", 1, "--rounds", 2, "--out", demos) == 0
-    fit_args = ("--demos", demos, "--draws", 9, "--out", tmp_path / "f")
+    fit_args = ("--demos", demos, "--draws", 9, "--explore", 0, "--out", tmp_path / "f")
     assert command(fit, *human, *guide, *fit_args) == 0
     summary = json.loads((tmp_path / "f" / "summary.json").read_text())
     assert summary["guide"] == "amortized"

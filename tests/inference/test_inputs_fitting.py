@@ -9,6 +9,7 @@ import pytest
 import torch
 from example_person import DOMAIN, human, implants
 from example_recordings import RAGGED, fields
+from few_reaches import robot_of_few_reaches
 from refused import refused
 
 from mirror_ppl.data import Demonstrations
@@ -106,9 +107,11 @@ def test_a_checkpoint_is_a_file(one, tmp_path):
 
 
 def test_numbers_of_numpy_make_the_same_fit(two):
-    own = fit_people(human(), two, InferenceOptions(draws=3), seed=1, train_rounds=2)
-    options = InferenceOptions(draws=np.int64(3))
-    other = fit_people(human(), two, options, seed=np.int64(1), train_rounds=np.int64(2))
+    person = HumanModel(robot_of_few_reaches())
+    options = InferenceOptions("importance", draws=3)
+    own = fit_people(person, two, options, seed=1, train_rounds=2)
+    options = InferenceOptions("importance", draws=np.int64(3))
+    other = fit_people(person, two, options, seed=np.int64(1), train_rounds=np.int64(2))
     assert json.dumps(own.summary) == json.dumps(other.summary)
 
 

@@ -335,7 +335,7 @@ def test_evidence_is_of_actions_alone(few_reaches):
             return implants
 
     rounds = of_kind(HumanModel(few_reaches), 100)
-    fit = mirror_ppl.infer(rounds, human=Asked(few_reaches), engine="importance")
+    fit = mirror_ppl.infer(rounds, human=Asked(few_reaches), engine="importance", explore=0)
     assert fit.summary["people"][0]["log_evidence"] is None
 
 
