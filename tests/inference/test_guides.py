@@ -36,7 +36,7 @@ from mirror_ppl.training import guide as guide_training
 from mirror_ppl.training.guide import GuideOptions, train_guide
 from mirror_ppl.training.guide_file import load_guide, network_for, save_guide
 
-TRAINING = GuideOptions(people=150, rounds=(1, 3), steps=300, batch=64, together=50)
+TRAINING = GuideOptions(people=100, rounds=(1, 3), steps=300, batch=64, together=50)
 
 
 @pytest.fixture(scope="module")
