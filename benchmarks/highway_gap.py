@@ -4,12 +4,18 @@ r"""What highway messages lose to the greedy oracle at a decision, and why: for 
         --train-rounds 20 --explore 0 --out runs/highway_0
     python -m benchmarks.highway_gap runs/highway_0/posterior.nc
     python -m benchmarks.highway_gap runs/highway_0/posterior.nc --receive mirror --rounds 2
+    python -m mirror_ppl.simulate --domain highway --setting fog --population diverse \
+        --people 10 --rounds 20 --seed 1 --out runs/highway_1.nc
+    python -m mirror_ppl.fit --demos runs/highway_1.nc --train-rounds 20 --explore 0 \
+        --out runs/highway_1
+    python -m benchmarks.highway_gap runs/highway_1/posterior.nc --receive mirror --rounds 4 \
+        --seed 1
 
 Simulated drivers play rounds in silence, or receive messages of ``mirror``. At every sixth decision
 messages of up to two items are chosen in several ways, and judged as the oracle judges them: by the
-driver's true choices and the expert's values of the true state, less the cost. The last commands
-write a row for each driver to docs/results/highway_gap.csv. Without a file, the table of the rows
-that are there is printed.
+driver's true choices and the expert's values of the true state, less the cost. This writes a row
+for each driver to docs/results/highway_gap.csv. Without a file, the table of the rows that are
+there is printed, in which decisions count alike.
 """
 
 from __future__ import annotations
@@ -145,7 +151,7 @@ def measured(path: Path, people: int, rounds: int, seed: int, receive: str) -> l
                 )
         print(f"decision {step + 1} of {world.horizon}", end="\r", flush=True)
     return [
-        {"receive": receive, "person": name, "decisions": str(len(own))}
+        {"receive": receive, "seed": str(seed), "person": name, "decisions": str(len(own))}
         | {way: f"{np.mean([gain[way] for gain in own]):.4f}" for way in WAYS}
         for name, own in zip(names, found, strict=True)
     ]
@@ -165,14 +171,15 @@ def table(rows: Sequence[dict[str, str]]) -> str:
     cells = {way: [f"| {label}"] for way, label in WAYS.items()}
     for receive in RECEIVED:
         some = [row for row in rows if row["receive"] == receive]
-        own = {way: np.array([float(row[way]) for row in some]) for way in WAYS}
+        decisions = np.array([int(row["decisions"]) for row in some])
+        sums = {way: decisions * np.array([float(row[way]) for row in some]) for way in WAYS}
         drawn = np.random.default_rng(0).integers(len(some), size=(10_000, len(some)))
-        for way, gain in own.items():
-            shares = 100 * gain[drawn].mean(1) / own["best"][drawn].mean(1)
+        for way, gain in sums.items():
+            shares = 100 * gain[drawn].sum(1) / sums["best"][drawn].sum(1)
             low, high = np.quantile(shares, (0.05, 0.95))
-            share = 100 * gain.mean() / own["best"].mean()
+            share = 100 * gain.sum() / sums["best"].sum()
             interval = "" if way == "best" else f"{share:.0f} [{low:.0f}, {high:.0f}]"
-            cells[way] += [f"{gain.mean():.1f}", interval]
+            cells[way] += [f"{gain.sum() / decisions.sum():.1f}", interval]
     return "\n".join([*lines, *(" | ".join(own) + " |" for own in cells.values())])
 
 
@@ -189,7 +196,8 @@ def main() -> None:
     given = parser.parse_args()
     rows = rows_in(ROWS)
     if given.file is not None:
-        kept = [row for row in rows if row["receive"] != given.receive]
+        new_rows = (given.receive, str(given.seed))
+        kept = [row for row in rows if (row["receive"], row["seed"]) != new_rows]
         new = measured(given.file, given.people, given.rounds, given.seed, given.receive)
         rows = rows_in(ROWS, kept + new)
     print(table(rows))
