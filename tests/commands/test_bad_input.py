@@ -41,14 +41,14 @@ def put(name, index, value):
 
 
 BROKEN = {
-    "wrong shape": (lambda data: data.isel(time=slice(0, 15)), "ego has shape"),
+    "wrong shape": (lambda data: data.isel(time=slice(0, 5)), "ego has shape"),
     "missing variable": (lambda data: data.drop_vars("visual"), "variable visual is missing"),
     "nan": (
         put("visual", (1, 2, 5, 0, 0), math.nan),
         "visual of front-left, distance_ahead is nan",
     ),
-    "action too high": (put("action", (0, 3, 7), 2), "action is 2, expected a whole number from 0"),
-    "action too low": (put("action", (0, 3, 7), -1), "action is -1, expected a whole number"),
+    "action too high": (put("action", (0, 3, 4), 2), "action is 2, expected a whole number from 0"),
+    "action too low": (put("action", (0, 3, 4), -1), "action is -1, expected a whole number"),
     "no steps": (put("length", (1, 0), 0), "length is 0, expected at least 1"),
     "unknown domain": (lambda data: data.assign_attrs(domain="flying"), 'unknown domain "flying"'),
     "other format": (lambda data: data.assign_attrs(format="csv"), "attribute format is 'csv'"),
