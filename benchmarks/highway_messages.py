@@ -13,39 +13,15 @@ file it prints the table of the rows that are there.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks._assist_rows import rows_of
 from benchmarks._rows import rows_in
 
 ROWS = Path(__file__).parents[1] / "docs/results/highway_messages.csv"
 NAMES = {"none": "silence", "all": "everything", "nearest": "nearest hidden car"}
 """Names of communicators in the table, where they are words."""
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    """Return a row for each communicator of a run of `assist`."""
-    results = json.loads(path.read_text())
-    rounds = results["options"]["rounds"]
-    rows = []
-    for name, own in results["communicators"].items():
-        row = {
-            "communicator": name,
-            "people": len(own["net_by_person"]),
-            "rounds": rounds,
-            **{key: own[key] for key in ("task", "cost", "net", "net_se", "mishaps")},
-            **own["items"],
-        }
-        for key in ("over_none", "way_to_oracle"):
-            found = own.get(key) or dict.fromkeys(("mean", "low", "high"), "")
-            row |= {f"{key}_{part}": found[part] for part in ("mean", "low", "high")}
-        rows.append(row)
-    rows.sort(key=lambda row: row["net"])
-    return [
-        {key: f"{x:.4f}" if isinstance(x, float) else str(x) for key, x in row.items()}
-        for row in rows
-    ]
 
 
 def table(rows: Sequence[dict[str, str]]) -> str:

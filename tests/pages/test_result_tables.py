@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from benchmarks import example_world, highway_gap, highway_messages, planner_settings
+from benchmarks import (
+    driving_messages,
+    example_world,
+    highway_gap,
+    highway_messages,
+    planner_settings,
+)
 from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
@@ -126,3 +132,28 @@ def test_the_table_of_reaches_is_what_its_rows_say():
         in words
     )
     assert f"the base rate {base}." in words
+
+
+def test_the_tables_of_messages_in_driving_are_what_their_rows_say():
+    page = (DOCS / "communicator.md").read_text()
+    rows = rows_in(driving_messages.ROWS)
+    for name, expected in (
+        ("fog", driving_messages.fog_table),
+        ("elsewhere", driving_messages.short_table),
+    ):
+        found = page.partition(f"<!-- {name} -->\n")[2].partition("\n<!-- end -->")[0]
+        assert found == expected(rows)
+    words = " ".join(page.split())
+    mean, low, high = (
+        f"{value:.2f}".removeprefix("0") for value in driving_messages.above_nearest(rows)
+    )
+    assert f"`mirror` gains {mean} [{low}, {high}] more a round than `nearest`" in words
+    gains = []
+    for where in driving_messages.ELSEWHERE:
+        own = driving_messages.of(rows, *where)
+        net = [driving_messages.net_of_people(own[name]) for name in ("mirror", "none")]
+        gains.extend(net[0] - net[1])
+    assert len(gains) == 30 and min(gains) >= 0.05
+    assert (
+        "each of the thirty people of the last table does better than in silence, by 0.05" in words
+    )
