@@ -43,6 +43,8 @@ from mirror_ppl.randomness import forked, seed_everything
 
 PRUNING_DRAWS = 4
 WIDTH_DRAWS = 100
+TOGETHER = 25
+"""Draws whose discrete sites are drawn at once."""
 
 
 @dataclass(frozen=True)
@@ -288,10 +290,11 @@ def draw_implants(
     Draws are independent of each other.
     """
     drawn: list[Draws] = []
-    for done in range(number):
+    for done in range(0, number, TOGETHER):
         report("draw", done, number, "")
-        one = {name: value[None] for name, value in guide().items()}
-        drawn.append(compiled.sample_discrete(one))
+        each = [guide() for _ in range(min(TOGETHER, number - done))]
+        some = {name: torch.stack([one[name] for one in each]) for name in each[0]}
+        drawn.append(compiled.sample_discrete(some, len(each)))
     report("draw", number, number, "")
     order = sample_sites(compiled.human, 1)
     return {name: torch.cat([one[name] for one in drawn]) for name in order}

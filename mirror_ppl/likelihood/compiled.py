@@ -35,6 +35,9 @@ from mirror_ppl.models.prior import Draws, draw_prior, values_of
 from mirror_ppl.models.sites import discrete_names, latent_sites, sample_nodes
 from mirror_ppl.randomness import forked
 
+AT_ONCE = 2**22
+"""Log densities, of draws, people and combinations, that are kept at once."""
+
 
 class Compiled(ABC):
     """Recorded rounds of P people under a human program.
@@ -199,13 +202,25 @@ class ViewTables(Compiled):
         """Log-probabilities ``[S, P, B, T, A]`` of actions, each given the earlier ones."""
         return predict_actions(self.human, self.table, draws)
 
-    def _with_discrete(self, continuous: Mapping[str, Tensor]) -> Draws:
+    @torch.no_grad()
+    def sample_discrete(self, continuous: Mapping[str, Tensor], number: int = 1) -> Draws:
+        """Draws ``[S, P, 1, ...]`` of all sites, see :meth:`Compiled.sample_discrete`."""
         if not (self.sums_over_combinations and self.acts_on_beliefs):
-            return super()._with_discrete(continuous)
-        one = {name: value[None] for name, value in continuous.items()}
-        joint = log_joints(self.human, self.table, one)[0]
-        drawn = draw_combinations(self.human, self.table, joint, 1)
-        return {**continuous, **{name: value[0] for name, value in drawn.items()}}
+            return super().sample_discrete(continuous, number)
+        if not continuous:
+            joint = log_joints(self.human, self.table, {})[0]
+            return draw_combinations(self.human, self.table, joint, number)
+        number = len(next(iter(continuous.values())))
+        size = max(1, AT_ONCE // (self.people * self.table.index.shape[-1]))
+        drawn = []
+        for begin in range(0, number, size):
+            some = {name: value[begin : begin + size] for name, value in continuous.items()}
+            drawn += [
+                draw_combinations(self.human, self.table, joint, 1)
+                for joint in log_joints(self.human, self.table, some)
+            ]
+        sights = {name: torch.cat([one[name] for one in drawn]) for name in drawn[0]}
+        return {**continuous, **sights}
 
 
 class Sequential(Compiled):
