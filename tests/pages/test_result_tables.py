@@ -6,6 +6,7 @@ import pytest
 from benchmarks import (
     driving_messages,
     example_world,
+    hearing,
     highway_gap,
     highway_messages,
     planner_settings,
@@ -157,3 +158,19 @@ def test_the_tables_of_messages_in_driving_are_what_their_rows_say():
     assert (
         "each of the thirty people of the last table does better than in silence, by 0.05" in words
     )
+
+
+def test_what_is_said_of_who_does_not_hear_is_what_the_rows_say():
+    found = hearing.summary(rows_in(hearing.ROWS))
+    words = " ".join((DOCS / "trust.md").read_text().split())
+    assert found["drivers"] == 20 and found["sure"] == found["sure and right"]
+    for claim in (
+        f"is sure of {found['sure']} of the {found['channels']} channels",
+        f"is right for {found['channels found']} of {found['channels']}",
+        f"for {found['of these, hard-of-hearing is more probable']} of the {found['others']}",
+        f"`mirror` for {found['of these, mirror is more probable']} of the "
+        f"{found['hear all']} others",
+        f"hold {found['held by hard-of-hearing']} of {found['thresholds']} thresholds "
+        f"({found['held by mirror']} with `mirror`)",
+    ):
+        assert claim in words, claim
