@@ -11,7 +11,8 @@ def rows_of(path: Path, with_people: bool = False) -> list[dict[str, str]]:
 
     Args:
         path: what ``assist --json`` wrote.
-        with_people: whether to add setting, population, and the net return of each person.
+        with_people: whether to add setting, population, what items were about, and the net return
+            of each person.
     """
     results = json.loads(path.read_text())
     recorded = results["posterior"]

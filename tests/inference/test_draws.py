@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from mirror_ppl.domains import get_domain
 from mirror_ppl.inference.svi import continuous_guide, draw_implants
+from mirror_ppl.likelihood import compiled
 from mirror_ppl.likelihood.compiled import Compiled, ViewTables
 from mirror_ppl.likelihood.enumeration import draw_combinations
 from mirror_ppl.likelihood.predictive import predict_actions
@@ -57,7 +58,7 @@ def assert_follows(draws, probabilities, tests=1):
 class Enumerated(ViewTables):
     """Draws discrete sites as programs do that are not compiled."""
 
-    _with_discrete = Compiled._with_discrete
+    sample_discrete = Compiled.sample_discrete
 
 
 def test_draws_of_combinations_follow_their_weights(few, table):
@@ -82,6 +83,23 @@ def test_both_ways_of_drawing_follow_the_exact_posterior(few, rounds, method, ca
     joint = log_joint(few, table, policy)
     for person in range(2):
         assert_follows(combination[:, person], joint[person].softmax(-1), tests=4)
+
+
+@pytest.mark.parametrize("at_once", [1, 100, 10**6])
+def test_many_draws_are_drawn_as_one_by_one(few, rounds, seed, monkeypatch, at_once):
+    monkeypatch.setattr(compiled, "AT_ONCE", at_once)
+    whole = ViewTables(few, build_view_table(few, rounds.select_people([0, 1])))
+    given = {
+        name: value * torch.linspace(0.2, 1, 30).view(-1, *(1,) * value.dim())
+        for name, value in some_policy(few, 2).items()
+    }
+    torch.manual_seed(seed)
+    found = whole.sample_discrete(given)
+    torch.manual_seed(seed)
+    each = [whole.sample_discrete({n: v[[d]] for n, v in given.items()}) for d in range(30)]
+    assert found.keys() == each[0].keys() == {*SITES, *given}
+    for name, value in found.items():
+        assert torch.equal(value, torch.cat([one[name] for one in each])), name
 
 
 def test_sites_beyond_perception_are_drawn_with_it(self_model, rounds):

@@ -83,11 +83,11 @@ def test_the_program_of_a_user_is_run(engine, recordings):
     if engine == "svi":
         options = InferenceOptions(engine, 60, SVIOptions(steps=120))
     else:
-        options = InferenceOptions(engine, 30, NUTSOptions(warmup=20))
+        options = InferenceOptions(engine, 60, NUTSOptions(warmup=30))
     found = infer(Asked(self_model()), recordings, options, 0).draws["in_sight"].flatten()
     # Draws of a chain depend on each other: as many as a third of them count. Without the factor
     # the mean is .37 instead of .86, and a standard deviation is .08.
-    error = 0.03 if engine == "svi" else 4 * float(found.std()) / math.sqrt(10)
+    error = 0.03 if engine == "svi" else 4 * float(found.std()) / math.sqrt(20)
     assert abs(found.mean() - exact_mean("factor", recordings, self_model())) < error
 
 
