@@ -6,7 +6,7 @@ Drivers in fog whose channels reach them or not, each with probability one half;
 from the prior of ``hard-of-hearing``. At each step each item that may be communicated is so with
 probability .1. Fitted to 20 rounds are ``hard-of-hearing`` and ``mirror``, which takes all messages
 for heard. This writes a row for each driver to docs/results/hearing.csv; seeds that are there are
-not done again. The summary of all rows is printed.
+not done again. The table of all rows is printed.
 """
 
 from __future__ import annotations
@@ -68,33 +68,38 @@ def measured(human: HardOfHearing, seed: int) -> list[dict[str, str]]:
     return rows
 
 
-def summary(rows: Sequence[dict[str, str]]) -> dict[str, int]:
-    """Count what was found of all drivers."""
+def table(rows: Sequence[dict[str, str]]) -> str:
+    """Return the table of docs/trust.md."""
     channels = [name.removeprefix("p_") for name in rows[0] if name.startswith("p_")]
     each = [(row[name] == "1", float(row[f"p_{name}"])) for row in rows for name in channels]
-    hears_all = [all(row[name] == "1" for name in channels) for row in rows]
+    sure = [(reaches, p) for reaches, p in each if abs(p - 0.5) > 0.45]
+    hears = [all(row[name] == "1" for name in channels) for row in rows]
     favours = [float(row["log_bayes_factor"]) > 0 for row in rows]
-    thresholds = 4 * len(rows)
-    return {
-        "drivers": len(rows),
-        "channels": len(each),
-        "channels found": sum(hears == (p > 0.5) for hears, p in each),
-        "sure": sum(abs(p - 0.5) > 0.45 for _, p in each),
-        "sure and right": sum(abs(p - 0.5) > 0.45 and hears == (p >= 0.5) for hears, p in each),
-        "hear all": sum(hears_all),
-        "of these, mirror is more probable": sum(
-            not more for heard, more in zip(hears_all, favours, strict=True) if heard
+    pairs = list(zip(hears, favours, strict=True))
+    held = {
+        name: sum(int(row[f"held_by_{name}"]) for row in rows)
+        for name in ("hard-of-hearing", "mirror")
+    }
+
+    def right(some: Sequence[tuple[bool, float]]) -> int:
+        return sum(reaches == (p > 0.5) for reaches, p in some)
+
+    counts = {
+        "channels of which the more probable answer is right": (right(each), len(each)),
+        "the same, of channels with a probability above .95 or below .05": (right(sure), len(sure)),
+        "drivers with a channel that does not reach them, for whom `hard-of-hearing` is more "
+        "probable than `mirror`": (sum(not a and b for a, b in pairs), len(rows) - sum(hears)),
+        "drivers whom both reach, for whom `mirror` is more probable": (
+            sum(a and not b for a, b in pairs),
+            sum(hears),
         ),
-        "others": len(rows) - sum(hears_all),
-        "of these, hard-of-hearing is more probable": sum(
-            more for heard, more in zip(hears_all, favours, strict=True) if not heard
-        ),
-        "thresholds": thresholds,
         **{
-            f"held by {name}": sum(int(row[f"held_by_{name}"]) for row in rows)
-            for name in ("hard-of-hearing", "mirror")
+            f"thresholds held by 90% intervals of `{name}`": (count, 4 * len(rows))
+            for name, count in held.items()
         },
     }
+    lines = [f"| {name} | {count} of {number} |" for name, (count, number) in counts.items()]
+    return "\n".join(["| Count | |", "|---|---|", *lines])
 
 
 def main() -> None:
@@ -111,8 +116,7 @@ def main() -> None:
         if str(seed) not in {row["seed"] for row in rows}:
             rows = rows_in(ROWS, rows + measured(human, seed))
             print(f"seed {seed} is done", flush=True)
-    for name, count in summary(rows).items():
-        print(f"{name}: {count}")
+    print(table(rows))
 
 
 if __name__ == "__main__":

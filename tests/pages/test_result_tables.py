@@ -10,6 +10,7 @@ from benchmarks import (
     highway_gap,
     highway_messages,
     planner_settings,
+    pooling,
 )
 from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
@@ -160,17 +161,13 @@ def test_the_tables_of_messages_in_driving_are_what_their_rows_say():
     )
 
 
-def test_what_is_said_of_who_does_not_hear_is_what_the_rows_say():
-    found = hearing.summary(rows_in(hearing.ROWS))
-    words = " ".join((DOCS / "trust.md").read_text().split())
-    assert found["drivers"] == 20 and found["sure"] == found["sure and right"]
-    for claim in (
-        f"is sure of {found['sure']} of the {found['channels']} channels",
-        f"is right for {found['channels found']} of {found['channels']}",
-        f"for {found['of these, hard-of-hearing is more probable']} of the {found['others']}",
-        f"`mirror` for {found['of these, mirror is more probable']} of the "
-        f"{found['hear all']} others",
-        f"hold {found['held by hard-of-hearing']} of {found['thresholds']} thresholds "
-        f"({found['held by mirror']} with `mirror`)",
+def test_tables_of_hearing_and_of_people_together_are_what_their_rows_say():
+    page = (DOCS / "trust.md").read_text()
+    for name, expected in (
+        ("hearing", hearing.table(rows_in(hearing.ROWS))),
+        ("together", pooling.together_table(rows_in(pooling.ROWS))),
     ):
-        assert claim in words, claim
+        found = page.partition(f"<!-- {name} -->\n")[2].partition("\n<!-- end -->")[0]
+        assert found == expected
+    assert all(int(row["seed"]) < 100 for row in rows_in(hearing.ROWS))
+    assert all(int(row["seed"]) >= 100 for row in rows_in(pooling.ROWS))
