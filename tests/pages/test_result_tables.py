@@ -79,23 +79,26 @@ def test_the_table_of_what_messages_to_drivers_lose_is_what_its_rows_say():
     rows = rows_in(highway_gap.ROWS)
     found = page.partition("<!-- gap -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == highway_gap.table(rows)
-    for receive, decisions in (("none", 400), ("mirror", 160)):
+    for receive, drivers, decisions in (("none", 10, 400), ("mirror", 20, 474)):
         own = [row for row in rows if row["receive"] == receive]
-        assert len(own) == 10 and sum(int(row["decisions"]) for row in own) == decisions
+        assert len(own) == drivers and sum(int(row["decisions"]) for row in own) == decisions
     words = " ".join(page.split())
-    cells = [line.split(" | ") for line in found.splitlines()[-3:-1]]
-    state, choices = (cell[-1].split()[0] for cell in cells)
+    cells = [line.split(" | ") for line in found.splitlines()[-3:]]
+    state, choices, lidar = (cell[-1].split()[0] for cell in cells)
     assert f"it would gain {state}% with the values of the true state, and {choices}% with" in words
-    values, choices, best = (
-        np.array([float(row[way]) for row in own])
-        for way in ("true_values", "true_choices", "best")
+    assert f"values of the state that the lidar shows would gain {lidar}%" in words
+    count = np.array([int(row["decisions"]) for row in own])
+    values, choices, best, mirror = (
+        count * np.array([float(row[way]) for row in own])
+        for way in ("true_values", "true_choices", "best", "mirror")
     )
     apart = values - choices
     drawn = np.random.default_rng(0).integers(len(own), size=(10_000, len(own)))
-    low, high = np.quantile(100 * apart[drawn].mean(1) / best[drawn].mean(1), (0.05, 0.95))
-    share = 100 * apart.mean() / best.mean()
-    assert f"the difference, {share:.0f} points [{low:.0f}, {high:.0f}], comes from one" in words
-    assert apart.max() > apart.sum()  # without that driver the others are below 0 together
+    low, high = np.quantile(100 * apart[drawn].sum(1) / best[drawn].sum(1), (0.05, 0.95))
+    share = 100 * apart.sum() / best.sum()
+    assert f"the difference is {share:.0f} points [{low:.0f}, {high:.0f}]" in words
+    left = np.sort(best - mirror)
+    assert 0.6 < left[-3:].sum() / left.sum() < 0.7  # "two thirds"
 
 
 def test_the_example_of_a_random_world_is_what_its_rows_say():
