@@ -25,6 +25,7 @@ import numpy as np
 
 from benchmarks._assist_rows import rows_of
 from benchmarks._rows import rows_in
+from mirror_ppl.evaluation.study_summary import interval as people_interval
 
 ROWS = Path(__file__).parents[1] / "docs/results/driving_messages.csv"
 Rows = Sequence[dict[str, str]]
@@ -97,13 +98,11 @@ def net_of_people(row: dict[str, str]) -> np.ndarray:
     return np.array(row["net_by_person"].split(), dtype=float)
 
 
-def above_nearest(rows: Rows) -> tuple[float, float, float]:
-    """Return what ``mirror`` gains above ``nearest`` in fog: mean, bootstrap over people (90%)."""
+def above_nearest(rows: Rows) -> str:
+    """Return what ``mirror`` gains above ``nearest`` in fog, with the interval over people."""
     own = of(rows, "fog", "paper")
-    gain = net_of_people(own["mirror"]) - net_of_people(own["nearest"])
-    drawn = np.random.default_rng(0).integers(len(gain), size=(10_000, len(gain)))
-    low, high = np.quantile(gain[drawn].mean(1), (0.05, 0.95))
-    return float(gain.mean()), float(low), float(high)
+    gain = people_interval(net_of_people(own["mirror"]) - net_of_people(own["nearest"]))
+    return f"{gain.mean:.2f} [{gain.low:.2f}, {gain.high:.2f}]".replace("0.", ".")
 
 
 def main() -> None:
@@ -115,7 +114,7 @@ def main() -> None:
     given = parser.parse_args().files
     rows = rows_in(ROWS, [row for file in given for row in rows_of(file, with_people=True)])
     print(fog_table(rows), short_table(rows), sep="\n\n")
-    print("\nmirror above nearest in fog: {:.2f} [{:.2f}, {:.2f}]".format(*above_nearest(rows)))
+    print(f"\nmirror above nearest in fog: {above_nearest(rows)}")
 
 
 if __name__ == "__main__":

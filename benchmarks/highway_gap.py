@@ -161,6 +161,13 @@ def _at(parts: dict[str, Tensor], one: int, two: int) -> dict[str, Tensor]:
     return {name: part[one, two] for name, part in parts.items()}
 
 
+def share_of_best(gain: np.ndarray, best: np.ndarray) -> str:
+    """Return drivers' gains ``[n]`` in % of the best, with the interval over drivers."""
+    drawn = np.random.default_rng(0).integers(len(gain), size=(10_000, len(gain)))
+    low, high = np.quantile(100 * gain[drawn].sum(1) / best[drawn].sum(1), (0.05, 0.95))
+    return f"{100 * gain.sum() / best.sum():.0f} [{low:.0f}, {high:.0f}]"
+
+
 def table(rows: Sequence[dict[str, str]]) -> str:
     """Return the table of the page; intervals are of a bootstrap over drivers."""
     lines = [
@@ -173,12 +180,8 @@ def table(rows: Sequence[dict[str, str]]) -> str:
         some = [row for row in rows if row["receive"] == receive]
         decisions = np.array([int(row["decisions"]) for row in some])
         sums = {way: decisions * np.array([float(row[way]) for row in some]) for way in WAYS}
-        drawn = np.random.default_rng(0).integers(len(some), size=(10_000, len(some)))
         for way, gain in sums.items():
-            shares = 100 * gain[drawn].sum(1) / sums["best"][drawn].sum(1)
-            low, high = np.quantile(shares, (0.05, 0.95))
-            share = 100 * gain.sum() / sums["best"].sum()
-            interval = "" if way == "best" else f"{share:.0f} [{low:.0f}, {high:.0f}]"
+            interval = "" if way == "best" else share_of_best(gain, sums["best"])
             cells[way] += [f"{gain.sum() / decisions.sum():.1f}", interval]
     return "\n".join([*lines, *(" | ".join(own) + " |" for own in cells.values())])
 
@@ -196,8 +199,8 @@ def main() -> None:
     given = parser.parse_args()
     rows = rows_in(ROWS)
     if given.file is not None:
-        new_rows = (given.receive, str(given.seed))
-        kept = [row for row in rows if (row["receive"], row["seed"]) != new_rows]
+        again = (given.receive, str(given.seed))
+        kept = [row for row in rows if (row["receive"], row["seed"]) != again]
         new = measured(given.file, given.people, given.rounds, given.seed, given.receive)
         rows = rows_in(ROWS, kept + new)
     print(table(rows))

@@ -92,8 +92,9 @@ def same_people(human: HumanModel, who: tuple[str, str, int], seed: int, rounds:
         "seed": str(seed),
         "rounds": str(rounds),
     }
-    kept = rows_in(ROWS) if ROWS.exists() else []
-    if any(where.items() <= row.items() for row in kept):
+    rows = rows_in(ROWS) if ROWS.exists() else []
+    kept = [row for row in rows if not where.items() <= row.items()]
+    if len(rows) - len(kept) == number:
         return
     people = simulate("driving", setting, population, number, 40, seed)
     new = [where | {"person": name} for name in people.people]
@@ -108,7 +109,8 @@ def same_people(human: HumanModel, who: tuple[str, str, int], seed: int, rounds:
 
 
 def together_table(rows: Sequence[dict[str, str]]) -> str:
-    """Return the table of docs/trust.md; errors are over people."""
+    """Return the table of docs/trust.md, of people in fog; errors are over people."""
+    rows = [row for row in rows if row["setting"] == "fog"]
     amounts = sorted({int(row["rounds"]) for row in rows})
     lines = [
         "| Together, against each alone: gain in nats per action ± standard error | "

@@ -92,11 +92,8 @@ def test_the_table_of_what_messages_to_drivers_lose_is_what_its_rows_say():
         count * np.array([float(row[way]) for row in own])
         for way in ("true_values", "true_choices", "best", "mirror")
     )
-    apart = values - choices
-    drawn = np.random.default_rng(0).integers(len(own), size=(10_000, len(own)))
-    low, high = np.quantile(100 * apart[drawn].sum(1) / best[drawn].sum(1), (0.05, 0.95))
-    share = 100 * apart.sum() / best.sum()
-    assert f"the difference is {share:.0f} points [{low:.0f}, {high:.0f}]" in words
+    apart = highway_gap.share_of_best(values - choices, best).replace(" ", " points ", 1)
+    assert f"the difference is {apart}" in words
     left = np.sort(best - mirror)
     assert 0.6 < left[-3:].sum() / left.sum() < 0.7  # "two thirds"
 
@@ -149,10 +146,15 @@ def test_the_tables_of_messages_in_driving_are_what_their_rows_say():
         found = page.partition(f"<!-- {name} -->\n")[2].partition("\n<!-- end -->")[0]
         assert found == expected(rows)
     words = " ".join(page.split())
-    mean, low, high = (
-        f"{value:.2f}".removeprefix("0") for value in driving_messages.above_nearest(rows)
-    )
-    assert f"`mirror` gains {mean} [{low}, {high}] more a round than `nearest`" in words
+    above = driving_messages.above_nearest(rows)
+    assert f"`mirror` gains {above} more a round than `nearest`" in words
+    readme = (DOCS.parent / "README.md").read_text()
+    for population in ("paper", "diverse"):
+        own = driving_messages.of(rows, "fog", population)
+        names = ("none", "nearest", "mirror", "oracle")
+        net = " | ".join(f"{float(own[name]['net']):.2f}" for name in names)
+        way = driving_messages.interval(own["mirror"], "way_to_oracle", ".0f", 100)
+        assert f"(`{population}`) | {net} | {way} |" in readme
     gains = []
     for where in driving_messages.ELSEWHERE:
         own = driving_messages.of(rows, *where)
