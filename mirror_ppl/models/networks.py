@@ -27,6 +27,10 @@ from mirror_ppl.models.sizes import Sizes
 MIN_SCALE = 0.01
 PIXEL_SCALE = 0.1
 """Least scale of a pixel, so that the many constant pixels do not dominate the density."""
+SMOOTHING = 0.75
+"""Intervals by which learned returns are smoothed, as in the source of `ReturnNetwork`."""
+START = 20.0
+"""How many times less probable, in nats, the far end of all intervals is than 0 at first."""
 
 
 class Gaussian(NamedTuple):
@@ -244,7 +248,79 @@ class QNetwork(nn.Module):
         self.body = layers((hidden, hidden, hidden))
         self.value = nn.Linear(hidden, 1)
 
+    def features(self, latent: Tensor) -> Tensor:
+        """Return what the last layer reads, ``[..., A, H]``, at ``latent`` ``[..., Z]``."""
+        return self.body(torch.relu(self.latent(latent)[..., None, :] + self.action.weight))
+
     def forward(self, latent: Tensor) -> Tensor:
         """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
-        first = torch.relu(self.latent(latent)[..., None, :] + self.action.weight)
-        return self.value(self.body(first)).squeeze(-1)
+        return self.value(self.features(latent)).squeeze(-1)
+
+
+class ReturnNetwork(QNetwork):
+    """``p(G_t | z_t, a_t)`` of the return: three layers to probabilities of intervals.
+
+    ``Q(z_t, a_t)`` is the mean. Where returns differ little but for rare accidents, a network
+    that is taught means by squared errors learns little besides the accidents; one that is taught
+    probabilities by cross entropy learns both (HL-Gauss; Farebrother et al., *Stop regressing*,
+    2024).
+
+    Args:
+        latent: dimensions Z.
+        actions: their number.
+        hidden: units of a layer.
+        returns: number of intervals.
+        least: where the first interval begins.
+        most: where the last one ends.
+    """
+
+    edges: Tensor
+
+    def __init__(
+        self, latent: int, actions: int, hidden: int, returns: int, least: float, most: float
+    ) -> None:
+        super().__init__(latent, actions, hidden)
+        self.value = nn.Linear(hidden, returns)
+        self.register_buffer("edges", torch.linspace(least, most, returns + 1))
+        with torch.no_grad():
+            # Near 0 at first, as other Q-networks.
+            self.value.bias.copy_(-self.middles.abs() * START / (most - least))
+
+    @property
+    def middles(self) -> Tensor:
+        """Middles of the intervals ``[R]``."""
+        return (self.edges[1:] + self.edges[:-1]) / 2
+
+    def log_probabilities(self, latent: Tensor) -> Tensor:
+        """Return logs of the probabilities ``[..., A, R]`` at ``latent`` ``[..., Z]``."""
+        return torch.log_softmax(self.value(self.features(latent)), -1)
+
+    def mean(self, log_probabilities: Tensor) -> Tensor:
+        """Return the mean ``[..., A]`` of a distribution ``[..., A, R]``."""
+        return log_probabilities.exp() @ self.middles
+
+    def forward(self, latent: Tensor) -> Tensor:
+        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
+        return self.mean(self.log_probabilities(latent))
+
+    def smoothed(self, returns: Tensor) -> Tensor:
+        """Return the distribution ``[..., R]`` that is learned of ``returns`` ``[...]``.
+
+        It is a Gaussian around the return with a standard deviation of ``SMOOTHING`` intervals, so
+        that what is learned of a return holds for similar ones. Returns outside of all intervals
+        count as the nearest that is not.
+        """
+        least, most = self.edges[0], self.edges[-1]
+        width = SMOOTHING * (self.edges[1] - self.edges[0])
+        off = (self.edges - returns.clamp(least, most)[..., None]) / width
+        below = torch.special.ndtr(off)
+        inside = below[..., 1:] - below[..., :-1]
+        return inside / inside.sum(-1, keepdim=True)
+
+
+def q_network(sizes: Sizes, actions: int) -> QNetwork:
+    """Return a new Q-network: a `ReturnNetwork` if ``sizes.returns`` is not 0."""
+    size = sizes.latent, actions, sizes.q_network
+    if not sizes.returns:
+        return QNetwork(*size)
+    return ReturnNetwork(*size, sizes.returns, sizes.least_return, sizes.most_return)

@@ -31,9 +31,9 @@ from mirror_ppl.models.networks import (
     Encoder,
     Gaussian,
     ImageDecoder,
-    QNetwork,
     Reward,
     Transition,
+    q_network,
 )
 from mirror_ppl.models.sites import latent_values
 from mirror_ppl.models.sizes import Sizes, sizes_of
@@ -94,7 +94,7 @@ class SelfModel(nn.Module):
                 else ImageDecoder(len(m.items), m.image, sizes)
             )
         self.reward = Reward(latent, actions, sizes.reward)
-        self.q_network = QNetwork(latent, actions, sizes.q_network)
+        self.q_network = q_network(sizes, actions)
         self.scales: dict[str, tuple[float, ...]] = {"ego": (1.0,) * len(domain.ego_features)} | {
             modality.name: modality.scales for modality in domain.modalities
         }
@@ -114,9 +114,10 @@ class SelfModel(nn.Module):
             pyro.sample("reward", dist.Normal(mean, scale).to_event(1), obs=rounds.rewards)
         return z
 
-    def guide(self, rounds: Rounds) -> Tensor:
+    def guide(self, rounds: Rounds, evidence: Tensor | None = None) -> Tensor:
         """Run the guide, the encoder on visible items; returns ``z`` ``[B, T + 1, Z]``."""
-        evidence = self.evidence(rounds.observation, rounds.visible, rounds.actions)
+        if evidence is None:
+            evidence = self.evidence(rounds.observation, rounds.visible, rounds.actions)
         nothing = evidence.new_zeros(*evidence.shape[:-2], self.latent)
         with pyro.plate("self_model_round", evidence.shape[0]):
             return pyro.sample(
@@ -129,9 +130,14 @@ class SelfModel(nn.Module):
                 ),
             )
 
-    def elbo(self, rounds: Rounds) -> tuple[Tensor, Tensor]:
-        """Return the one-particle ELBO in nats, summed over rounds, and its sample of ``z``."""
-        guide_trace = poutine.trace(self.guide).get_trace(rounds)
+    def elbo(self, rounds: Rounds, evidence: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the one-particle ELBO in nats, summed over rounds, and its sample of ``z``.
+
+        Args:
+            rounds: under views.
+            evidence: of these rounds from :meth:`evidence`, if it is known already.
+        """
+        guide_trace = poutine.trace(self.guide).get_trace(rounds, evidence)
         replayed = poutine.replay(self.model, trace=guide_trace)
         model_trace = poutine.trace(replayed).get_trace(rounds)
         bound = model_trace.log_prob_sum() - guide_trace.log_prob_sum()
@@ -170,9 +176,8 @@ class SelfModel(nn.Module):
 
     def evidence(self, observation: Observation, visible: Visibility, actions: Tensor) -> Tensor:
         """Return the encoder's evidence ``[..., T + 1, H]``, of ``x_t, v_t, a_{t-1}``."""
-        embedded = self.encoder.embed(self.domain.symbols(observation))
-        steps = self.encoder.previous_actions(actions)
-        return self.encoder.combine(embedded, visible) + steps[..., : embedded["ego"].shape[-2], :]
+        evidence = self.encoder.evidence(self.domain.symbols(observation), visible)
+        return evidence + self.encoder.previous_actions(actions)[..., : evidence.shape[-2], :]
 
     def believe(self, evidence: Tensor, still: Tensor | None = None) -> Tensor:
         """Return beliefs ``[..., T, Z]``: the encoder's means, each step from the last mean.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mirror_ppl.domains.base import Domain
+from mirror_ppl.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,9 @@ class Sizes:
         decoder: of ``p(x^m_t | z_t)`` where the modality is not an image.
         reward: of ``p(r_t | z_t, a_t)``.
         q_network: of ``Q(z_t, a_t)``.
+        returns: intervals of the Q-network's distribution of returns; at 0 it has values alone.
+        least_return: where the first of these intervals begins.
+        most_return: where the last one ends.
         image: of the layers between a convolution and the features, and of those before an image
             decoder's deconvolution.
         channels: of the one convolution, and of the deconvolution; the kernel is 3 by 3.
@@ -32,6 +36,17 @@ class Sizes:
     decoder: int = 32
     reward: int = 32
     q_network: int = 128
+    returns: int = 0
+    least_return: int = 0
+    most_return: int = 0
+
+    def __post_init__(self) -> None:
+        if self.returns and not (self.returns > 1 and self.least_return < self.most_return):
+            raise InputError(
+                f"returns must be at least 2 intervals that end above where they begin, not "
+                f"{self.returns} from {self.least_return} to {self.most_return}"
+            )
+
     image: int = 48
     channels: int = 4
     stride: int = 3

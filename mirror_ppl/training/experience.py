@@ -346,8 +346,7 @@ def drive(
         observation = domain.observe(supposed(domain, plan, now, knowledge))
         taken = plan.taken(domain, knowledge, observation)
         visible = {name: mask | taken[name] for name, mask in visible.items()}
-        embedded = self_model.encoder.embed(domain.symbols(observation))
-        evidence = self_model.encoder.combine(embedded, visible)[:, 0]
+        evidence = self_model.encoder.evidence(domain.symbols(observation), visible)[:, 0]
         evidence = evidence + self_model.encoder.action(previous)
         belief = self_model.encoder(belief, evidence).mean
         action = self_model.action_values(belief).argmax(-1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mirror_ppl.models.networks import ReturnNetwork
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.training.experience import Experience
 from mirror_ppl.training.self_model_options import SelfModelOptions
@@ -40,12 +41,12 @@ def self_model_loss(
             Training alternates.
     """
     rounds = lived.rounds
-    bound, z = self_model.elbo(rounds)
+    evidence = self_model.evidence(rounds.observation, rounds.visible, rounds.actions)
+    bound, z = self_model.elbo(rounds, evidence)
     batch, steps = rounds.actions.shape
     negative_elbo = -bound / (batch * (steps + 1))
     belief = z[:, :-1]
     if on_means:
-        evidence = self_model.evidence(rounds.observation, rounds.visible, rounds.actions)
         belief = self_model.believe(evidence[:, :-1])
     belief = belief[:, lived.steps]
     goal = (
@@ -53,21 +54,37 @@ def self_model_loss(
     )
     assert goal is not None
     # Once a round is over (possibly in every round) actions do not matter.
-    values = self_model.action_values(belief)
-    error = (values - goal)[~lived.over]
-    unlike = error - error.mean(-1, keepdim=True)
-    bellman, apart = (part.pow(2).mean() if len(part) else part.sum() for part in (error, unlike))
-    total = options.world_weight * negative_elbo + bellman + options.difference_weight * apart
+    live = ~lived.over
+    goal, sure = goal[live], lived.informed[live]
+    network = self_model.q_network
+    if isinstance(network, ReturnNetwork):
+        predicted = network.log_probabilities(belief)[live]
+        values = network.mean(predicted)
+        fit = options.return_weight * _cross_entropy(network.smoothed(goal), predicted)
+        bellman = _mean((values.detach() - goal).pow(2))
+    else:
+        values = self_model.action_values(belief)[live]
+        error = values - goal
+        bellman = _mean(error.pow(2))
+        fit = bellman
+        if options.difference_weight:
+            unlike = error - error.mean(-1, keepdim=True)
+            fit = fit + options.difference_weight * _mean(unlike.pow(2))
+    total = options.world_weight * negative_elbo + fit
     if options.choice_weight:
-        sure = lived.informed & ~lived.over
-        total = total + options.choice_weight * _cross_entropy(goal[sure], values[sure])
+        chosen, likely = torch.softmax(goal[sure], -1), torch.log_softmax(values[sure], -1)
+        total = total + options.choice_weight * _cross_entropy(chosen, likely)
     return Loss(total, negative_elbo.detach(), bellman.detach())
 
 
-def _cross_entropy(goal: Tensor, values: Tensor) -> Tensor:
-    """Return the mean cross entropy of softmax choices at values ``[n, A]``; 0 if n is 0."""
-    each = -(torch.softmax(goal, -1) * torch.log_softmax(values, -1)).sum(-1)
-    return each.mean() if len(each) else each.sum()
+def _cross_entropy(goal: Tensor, log_probabilities: Tensor) -> Tensor:
+    """Return the mean cross entropy ``-sum goal log_probabilities`` over the last dimension."""
+    return _mean(-(goal * log_probabilities).sum(-1))
+
+
+def _mean(each: Tensor) -> Tensor:
+    """Return the mean; 0 of nothing."""
+    return each.mean() if each.numel() else each.sum()
 
 
 def _bootstrapped(
@@ -82,8 +99,8 @@ def _bootstrapped(
     goals = []
     with torch.no_grad():
         for action, outcome in enumerate(lived.outcomes):
-            embedded = self_model.encoder.embed(self_model.domain.symbols(outcome.observation))
-            evidence = self_model.encoder.combine(embedded, outcome.visible)
+            symbols = self_model.domain.symbols(outcome.observation)
+            evidence = self_model.encoder.evidence(symbols, outcome.visible)
             evidence = evidence + self_model.encoder.action.weight[action]
             value = target(self_model.encoder(belief, evidence).mean).amax(-1)
             over = outcome.over

@@ -124,7 +124,7 @@ def test_a_robot_is_taught_and_judged_by_the_rules_that_it_was_taught(tmp_path):
             super().__init__()
             self.action = encoder.action
 
-        def embed(self, symbols):
+        def evidence(self, symbols, visible):
             observation = {
                 "ego": torch.nn.functional.pad(
                     symbols["ego"].argmax(-1, keepdim=True).float(), [0, 1]
@@ -133,10 +133,7 @@ def test_a_robot_is_taught_and_judged_by_the_rules_that_it_was_taught(tmp_path):
                 "verbal": symbols["verbal"].argmax(-1, keepdim=True).float(),
             }
             values = WORLD.as_believed.reference_values(WORLD.state_behind(observation), 0.9)
-            return {"ego": torch.nn.functional.pad(values, [0, 128 - 5])}
-
-        def combine(self, embedded, visible, *others):
-            return embedded["ego"]
+            return torch.nn.functional.pad(values, [0, 128 - 5])
 
         def previous_actions(self, actions):
             return torch.zeros(*actions.shape[:-1], actions.shape[-1] + 1, 128)

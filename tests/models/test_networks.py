@@ -6,16 +6,19 @@ from example_implants import ACTIONS, LATENT
 from example_networks import DRIVING, ITEMS, encoder
 from torch import nn
 
+from mirror_ppl.errors import InputError
 from mirror_ppl.models.networks import (
     MIN_SCALE,
     Decoder,
     GaussianHead,
     QNetwork,
+    ReturnNetwork,
     Reward,
     Transition,
     log_softmax_of_few,
 )
 from mirror_ppl.models.self_model import SelfModel
+from mirror_ppl.models.sizes import Sizes
 
 SYMBOLS = {"ego": 2, "visual": 50, "verbal": 53}
 
@@ -81,6 +84,41 @@ def test_q_network_has_three_layers_of_128_on_state_and_action():
         first = torch.relu(torch.cat([z, chosen], -1) @ weight.T + network.latent.bias)
         expected = network.value(network.body(first)).squeeze(-1)
         torch.testing.assert_close(network(z)[:, action], expected)
+
+
+def test_return_network_has_one_more_output_for_each_interval():
+    network = ReturnNetwork(LATENT, ACTIONS, 16, returns=5, least=-4.0, most=6.0).double()
+    assert linear_sizes(network) == [(48, 16), (16, 16), (16, 16), (16, 5)]
+    assert network.middles.tolist() == [-3.0, -1.0, 1.0, 3.0, 5.0]
+    z = torch.randn(3, LATENT, dtype=torch.float64)
+    probabilities = network.log_probabilities(z).exp()
+    assert probabilities.shape == (3, ACTIONS, 5)
+    by_hand = sum(probabilities[..., i] * middle for i, middle in enumerate((-3, -1, 1, 3, 5)))
+    torch.testing.assert_close(network(z), by_hand)
+
+
+def test_returns_are_learned_as_gaussians_over_intervals():
+    """Of intervals of 2 the standard deviation is 1.5, by hand from the normal distribution."""
+    network = ReturnNetwork(LATENT, ACTIONS, 16, returns=100, least=-100.0, most=100.0).double()
+    found = network.smoothed(torch.tensor([[0.0, 1.0], [3.3, 1000.0]], dtype=torch.float64))
+    assert found.shape == (2, 2, 100)
+    torch.testing.assert_close(found.sum(-1), torch.ones(2, 2, dtype=torch.float64))
+    normal = torch.distributions.Normal(0.0, 1.5)
+    beside, beyond = (float(normal.cdf(torch.tensor(x)) - 0.5) for x in (2.0, 4.0))
+    # 0 is an edge: the intervals on both sides are alike; 1 is the middle of one.
+    assert found[0, 0, 49:52].tolist() == pytest.approx([beside, beside, beyond - beside], abs=1e-6)
+    middle = 2 * float(normal.cdf(torch.tensor(1.0)) - 0.5)
+    assert float(found[0, 1, 50]) == pytest.approx(middle, abs=1e-6)
+    # The mean is the return, but for rounding to intervals, of which almost nothing is left.
+    assert float(found[1, 0] @ network.middles) == pytest.approx(3.3, abs=0.01)
+    # A return beyond all intervals counts as the last of them.
+    assert torch.equal(found[1, 1], network.smoothed(torch.tensor(100.0, dtype=torch.float64)))
+
+
+def test_sizes_refuse_intervals_that_are_none():
+    for sizes in ({"returns": 1, "most_return": 5}, {"returns": 4}, {"returns": -1}):
+        with pytest.raises(InputError, match="returns must be at least 2 intervals that end above"):
+            Sizes(**sizes)
 
 
 def test_self_model_is_put_together_from_them():

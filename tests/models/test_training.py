@@ -121,6 +121,45 @@ def test_choices_are_learned_where_all_that_counts_is_known():
     torch.testing.assert_close(found - without, 7 * entropy)
 
 
+def test_distributions_of_returns_are_learned_by_cross_entropy():
+    """By hand, of two moments that go on, in place of squared errors; and it can be learned."""
+    sizes = replace(sizes_of(DRIVING), returns=40, least_return=-20, most_return=20)
+    torch.manual_seed(0)
+    robot = SelfModel(DRIVING, sizes, EMBEDDINGS["words"])
+    network = robot.q_network
+    options = SelfModelOptions(
+        distil=True, window=3, world_weight=0.0, return_weight=3.0, difference_weight=5.0
+    )
+    lived = experience(
+        DRIVING,
+        Course.of(DRIVING, two_cars_near(), STAY4[:, :3]),
+        fixed_views(DRIVING, 1, torch.Generator(), speech=True),
+        discount=0.9,
+    )
+    lived = replace(lived, over=torch.tensor([[False, False, True]]))
+
+    def loss():
+        torch.manual_seed(0)
+        return self_model_loss(robot, network, lived, options, True)
+
+    with torch.no_grad():
+        rounds, goal = lived.rounds, lived.exact[0, :2]
+        evidence = robot.evidence(rounds.observation, rounds.visible, rounds.actions)
+        belief = robot.believe(evidence[:, :2])[0]
+        found = loss()
+        wanted = -(network.smoothed(goal) * network.log_probabilities(belief)).sum(-1).mean()
+        torch.testing.assert_close(found.total, 3 * wanted)
+        # Squared errors of the means are what is reported.
+        torch.testing.assert_close(found.bellman, (network(belief) - goal).square().mean())
+    optimizer = torch.optim.Adam(robot.parameters(), 3e-3)
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss().total.backward()
+        optimizer.step()
+    # Probabilities of intervals of 1 give means within .1 of the returns.
+    assert loss().bellman < 0.1**2 < found.bellman
+
+
 class ShortDriving(Driving):
     """Rounds of three steps that all begin alike."""
 

@@ -90,6 +90,17 @@ def test_weights_know_their_sizes(tmp_path):
     assert (model.sizes, model.latent, model.encoder.ego.out_features) == (sizes, 8, 16)
 
 
+def test_weights_hold_the_intervals_of_returns(tmp_path):
+    path = tmp_path / "a.safetensors"
+    sizes = Sizes(returns=8, least_return=-3, most_return=1)
+    saved = SelfModel(DRIVING, sizes)
+    save_self_model(saved, path, CARD)
+    model, _ = load_self_model(path)
+    assert model.q_network.edges.tolist() == [-3, -2.5, -2, -1.5, -1, -0.5, 0, 0.5, 1]
+    z = torch.randn(3, model.latent)
+    torch.testing.assert_close(model.action_values(z), saved.action_values(z))
+
+
 def test_no_weights_ship_for_an_unknown_domain():
     with pytest.raises(AssetError, match="there is no self-model of bomb yet"):
         shipped_weights("bomb")
