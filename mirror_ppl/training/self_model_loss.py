@@ -55,15 +55,15 @@ def self_model_loss(
     assert goal is not None
     # Once a round is over (possibly in every round) actions do not matter.
     live = ~lived.over
-    goal, sure = goal[live], lived.informed[live]
+    belief, goal, sure = belief[live], goal[live], lived.informed[live]
     network = self_model.q_network
     if isinstance(network, ReturnNetwork):
-        predicted = network.log_probabilities(belief)[live]
+        predicted = network.log_probabilities(belief)
         values = network.mean(predicted)
         fit = options.return_weight * _cross_entropy(network.smoothed(goal), predicted)
         bellman = _mean((values.detach() - goal).pow(2))
     else:
-        values = self_model.action_values(belief)[live]
+        values = self_model.action_values(belief)
         error = values - goal
         bellman = _mean(error.pow(2))
         fit = bellman

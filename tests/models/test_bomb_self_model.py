@@ -90,7 +90,7 @@ def test_errors_that_all_actions_share_count_once(generator):
     def total(weight, off):
         torch.manual_seed(1)
         options = SelfModelOptions(world_weight=0.0, difference_weight=weight)
-        self_model.action_values = lambda belief: full.exact + off
+        self_model.action_values = lambda belief: (full.exact + off)[~some.over]
         try:
             return self_model_loss(
                 self_model, self_model.q_network, some, options, on_means=True
