@@ -11,6 +11,7 @@ from benchmarks import (
     highway_messages,
     planner_settings,
     pooling,
+    sbc,
 )
 from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
@@ -166,10 +167,11 @@ def test_the_tables_of_messages_in_driving_are_what_their_rows_say():
     )
 
 
-def test_tables_of_hearing_and_of_people_together_are_what_their_rows_say():
+def test_tables_of_trust_are_what_their_rows_say():
     page = (DOCS / "trust.md").read_text()
     for name, expected in (
         ("hearing", hearing.table(rows_in(hearing.ROWS))),
+        ("calibration", sbc.table(rows_in(sbc.ROWS))),
         ("together", pooling.together_table(rows_in(pooling.ROWS))),
     ):
         found = page.partition(f"<!-- {name} -->\n")[2].partition("\n<!-- end -->")[0]
