@@ -192,7 +192,7 @@ def plot_relevance(shares: pd.DataFrame) -> Picture:
 
 
 def _title(ax: Axes, place: Place) -> None:
-    ax.set_title(" ".join(place).replace("_", " "), fontsize=10)
+    ax.set_title(", ".join(place), fontsize=10)
     ax.spines[["top", "right"]].set_visible(False)
 
 
