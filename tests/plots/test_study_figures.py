@@ -61,7 +61,7 @@ def test_curves_have_a_panel_for_each_place_and_level_lines():
     curve, level = fog.lines
     assert list(curve.get_xdata()) == [1, 20] and list(curve.get_ydata()) == [0.3, 0.1]
     assert set(level.get_ydata()) == {0.5}
-    assert [fog.get_title(), other.get_title()] == ["driving fog paper", "driving clear paper"]
+    assert [fog.get_title(), other.get_title()] == ["driving, fog, paper", "driving, clear, paper"]
     assert {line.get_label() for line in other.lines} == {"bc", "people's own entropy"}
     (legend,) = picture.legends
     assert [text.get_text() for text in legend.get_texts()] == [
