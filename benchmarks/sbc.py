@@ -16,23 +16,34 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from benchmarks._rows import rows_in
+from mirror_ppl.domains import get_domain
 from mirror_ppl.inference.calibration.ranks import FAILURE_RATE, LEVELS, Calibration
-from mirror_ppl.models.variants import VARIANTS
+from mirror_ppl.models.loading import model_name
 
 ROWS = Path(__file__).parents[1] / "docs/results/calibration.csv"
-STUDY = ("domain", "human_model", "engine", "people")
-"""Columns that say what was calibrated."""
+STUDY = ("domain", "human_model", "engine")
+"""Columns that say what was calibrated, in the setting in which people see less."""
+ROUNDS = [1, 5, 20]
 PERCENT = [round(100 * level) for level in LEVELS]
 LABELS = {"search_rescue": "search and rescue", "bomb_defusal": "bomb defusal"}
 
 
-def new_rows(calibration: Calibration, engine: str) -> list[dict[str, str]]:
-    """Return the rows of a calibration."""
-    about, names = calibration.data.attrs, {kind.__name__: name for name, kind in VARIANTS.items()}
+def new_rows(calibration: Calibration) -> list[dict[str, str]]:
+    """Return the rows of a calibration.
+
+    Raises:
+        SystemExit: it is of other numbers of rounds or of another setting than the table.
+    """
+    about, rounds = calibration.data.attrs, calibration.data["rounds"].values.tolist()
+    usual = get_domain(about["domain"]).settings[-1]
+    if rounds != ROUNDS or about["setting"] != usual:
+        raise SystemExit(
+            f"the table is of {ROUNDS} rounds in {usual}, not of {rounds} in {about['setting']}"
+        )
     study = {
         "domain": about["domain"],
-        "human_model": names.get(about["human_model"], about["human_model"]),
-        "engine": engine,
+        "human_model": model_name(about["human_model"]),
+        "engine": about["engine"],
         "people": str(calibration.people),
     }
     return [
@@ -40,7 +51,8 @@ def new_rows(calibration: Calibration, engine: str) -> list[dict[str, str]]:
         | {
             "implant": row["site"].replace("_", " "),
             "rounds": str(row["rounds"]),
-            "p": f"{row['p_value']:.5f}",
+            "p": f"{row['p_value']:.3g}",
+            "rejected": str(int(row["p_value"] < FAILURE_RATE)),
             **{f"within_{q}": f"{100 * row[f'coverage_{q}']:.1f}" for q in PERCENT},
             "contraction": _number(row["contraction"], 2),
             "unreliable_weights": _number(100 * row["high_pareto_k"], 0),
@@ -49,10 +61,10 @@ def new_rows(calibration: Calibration, engine: str) -> list[dict[str, str]]:
     ]
 
 
-def added(rows: Sequence[dict[str, str]], new: Sequence[dict[str, str]]) -> list[dict[str, str]]:
-    """Return rows with new ones in place of those of the same world, human model and engine."""
-    done = {_study(row)[:3] for row in new}
-    return [*(row for row in rows if _study(row)[:3] not in done), *new]
+def replaced(rows: Sequence[dict[str, str]], new: Sequence[dict[str, str]]) -> list[dict[str, str]]:
+    """Return rows with new ones in place of those of the same study, or at the end."""
+    studies = {key: list(own) for key, own in itertools.groupby(rows, _study)}
+    return [row for own in (studies | {_study(new[0]): list(new)}).values() for row in own]
 
 
 def table(rows: Iterable[dict[str, str]]) -> str:
@@ -62,19 +74,20 @@ def table(rows: Iterable[dict[str, str]]) -> str:
         "50% | 80% | 90% (coverage, mean) | 90%, range over implants and rounds |",
         "|---|---|---|---|---|---|---|",
     ]
-    for (domain, human, engine, people), group in itertools.groupby(rows, _study):
+    for (domain, human, engine), group in itertools.groupby(rows, _study):
         own = list(group)
         rejected: dict[str, int] = {}
         for row in own:
-            if float(row["p"]) <= FAILURE_RATE:
+            if row["rejected"] == "1":
                 rejected[row["implant"]] = rejected.get(row["implant"], 0) + 1
         which = ", ".join(f"`{name.replace(' ', '_')}`, {n}" for name, n in rejected.items())
-        least = f"{min(float(row['p']) for row in own):.3f}".lstrip("0")
+        least = min(float(row["p"]) for row in own)
+        shown = "<.001" if least < 0.001 else f"{least:.3f}".lstrip("0")
         within = {q: [float(row[f"within_{q}"]) for row in own] for q in PERCENT}
         means = " | ".join(f"{sum(each) / len(each):.1f}" for each in within.values())
         lines.append(
-            f"| {LABELS.get(domain, domain)}, `{human}`, `{engine}`, {people} | "
-            f"{which or 'none'} of {len(own)} | {least} | {means} | "
+            f"| {LABELS.get(domain, domain)}, `{human}`, `{engine}`, {own[0]['people']} | "
+            f"{which or 'none'} of {len(own)} | {shown} | {means} | "
             f"{min(within[90]):.0f} to {max(within[90]):.0f} |"
         )
     return "\n".join(lines)
@@ -94,12 +107,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("file", nargs="?", type=Path, help="calibration.nc of `calibrate`")
-    parser.add_argument("--engine", default="importance", help="engine that was calibrated")
     given = parser.parse_args()
     rows = rows_in(ROWS)
     if given.file is not None:
-        new = new_rows(Calibration.load(given.file), given.engine)
-        rows = rows_in(ROWS, added(rows, new))
+        rows = rows_in(ROWS, replaced(rows, new_rows(Calibration.load(given.file))))
     print(table(rows))
 
 

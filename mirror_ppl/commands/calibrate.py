@@ -133,6 +133,7 @@ def main(options: Options) -> int:
         )
         tested = partial(_infer, human, settings, network)
         calibration = calibrate(human, tested, trial, setting, options.seed, runner)
+        calibration.data.attrs["engine"] = guide
         drawn = {folder / name: plot(calibration).content() for name, plot in pictures.items()}
         write_together({folder / "calibration.nc": calibration.content(), **drawn})
         runner.clean()

@@ -27,10 +27,13 @@ from mirror_ppl.models.sizes import Sizes
 MIN_SCALE = 0.01
 PIXEL_SCALE = 0.1
 """Least scale of a pixel, so that the many constant pixels do not dominate the density."""
+MARGIN = 3
+"""Bins of values beyond the least and the largest value."""
 SMOOTHING = 0.75
-"""Intervals by which learned returns are smoothed, as in the source of `ReturnNetwork`."""
-START = 20.0
-"""How many times less probable, in nats, the far end of all intervals is than 0 at first."""
+"""Standard deviation of the Gaussians around target values, in bins (Farebrother et al.)."""
+START = 0.05
+"""Distance from the value next to 0 at which a bin of a new network is less probable by a factor of
+*e*, as a share of the range of values."""
 
 
 class Gaussian(NamedTuple):
@@ -241,86 +244,80 @@ class Reward(nn.Module):
 class QNetwork(nn.Module):
     """``Q(z_t, a_t)``: three layers to the discounted return of each action."""
 
-    def __init__(self, latent: int, actions: int, hidden: int = 128) -> None:
+    def __init__(self, latent: int, actions: int, hidden: int = 128, outputs: int = 1) -> None:
         super().__init__()
         self.latent = nn.Linear(latent, hidden)
         self.action = nn.Embedding(actions, hidden)
         self.body = layers((hidden, hidden, hidden))
-        self.value = nn.Linear(hidden, 1)
+        self.value = nn.Linear(hidden, outputs)
 
-    def features(self, latent: Tensor) -> Tensor:
-        """Return what the last layer reads, ``[..., A, H]``, at ``latent`` ``[..., Z]``."""
-        return self.body(torch.relu(self.latent(latent)[..., None, :] + self.action.weight))
+    def output(self, latent: Tensor) -> Tensor:
+        """Return what the last layer gives for each action, ``[..., A, outputs]``."""
+        first = torch.relu(self.latent(latent)[..., None, :] + self.action.weight)
+        return self.value(self.body(first))
 
     def forward(self, latent: Tensor) -> Tensor:
         """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
-        return self.value(self.features(latent)).squeeze(-1)
+        return self.output(latent).squeeze(-1)
 
 
-class ReturnNetwork(QNetwork):
-    """``p(G_t | z_t, a_t)`` of the return: three layers to probabilities of intervals.
+class BinnedQNetwork(QNetwork):
+    """``Q(z_t, a_t)`` as the mean of a categorical distribution over bins of values.
 
-    ``Q(z_t, a_t)`` is the mean. Where returns differ little but for rare accidents, a network
-    that is taught means by squared errors learns little besides the accidents; one that is taught
-    probabilities by cross entropy learns both (HL-Gauss; Farebrother et al., *Stop regressing*,
-    2024).
+    It is learned by the cross entropy of target values that are smoothed by a Gaussian (HL-Gauss;
+    Farebrother et al., *Stop regressing*, 2024). The spread of the distribution is that of the
+    targets given ``z_t``, and of the smoothing.
 
     Args:
         latent: dimensions Z.
-        actions: their number.
+        actions: their number A.
         hidden: units of a layer.
-        returns: number of intervals.
-        least: where the first interval begins.
-        most: where the last one ends.
+        bins: number of bins with centres from ``least`` to ``most``; three more follow on either
+            side, so that targets at the ends are smoothed like others.
+        least: least value; lower targets count as this one.
+        most: largest value.
     """
 
-    edges: Tensor
+    centres: Tensor
 
     def __init__(
-        self, latent: int, actions: int, hidden: int, returns: int, least: float, most: float
+        self, latent: int, actions: int, hidden: int, bins: int, least: float, most: float
     ) -> None:
-        super().__init__(latent, actions, hidden)
-        self.value = nn.Linear(hidden, returns)
-        self.register_buffer("edges", torch.linspace(least, most, returns + 1))
+        super().__init__(latent, actions, hidden, bins + 2 * MARGIN)
+        self.least, self.most, self.width = least, most, (most - least) / (bins - 1)
+        places = torch.arange(-MARGIN, bins + MARGIN)
+        self.register_buffer("centres", least + self.width * places)
+        nearest = min(max(0.0, least), most)
         with torch.no_grad():
-            # Near 0 at first, as other Q-networks.
-            self.value.bias.copy_(-self.middles.abs() * START / (most - least))
-
-    @property
-    def middles(self) -> Tensor:
-        """Middles of the intervals ``[R]``."""
-        return (self.edges[1:] + self.edges[:-1]) / 2
+            self.value.bias.copy_(-(self.centres - nearest).abs() / (START * (most - least)))
 
     def log_probabilities(self, latent: Tensor) -> Tensor:
-        """Return logs of the probabilities ``[..., A, R]`` at ``latent`` ``[..., Z]``."""
-        return torch.log_softmax(self.value(self.features(latent)), -1)
+        """Return logs of the bins' probabilities ``[..., A, V]`` at ``latent`` ``[..., Z]``."""
+        return torch.log_softmax(self.output(latent), -1)
 
     def mean(self, log_probabilities: Tensor) -> Tensor:
-        """Return the mean ``[..., A]`` of a distribution ``[..., A, R]``."""
-        return log_probabilities.exp() @ self.middles
+        """Return the values ``[..., A]`` of distributions ``[..., A, V]``."""
+        return log_probabilities.exp() @ self.centres
 
     def forward(self, latent: Tensor) -> Tensor:
         """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
         return self.mean(self.log_probabilities(latent))
 
-    def smoothed(self, returns: Tensor) -> Tensor:
-        """Return the distribution ``[..., R]`` that is learned of ``returns`` ``[...]``.
+    def target(self, values: Tensor) -> Tensor:
+        """Return the probabilities of bins ``[..., V]`` that are learned of ``values`` ``[...]``.
 
-        It is a Gaussian around the return with a standard deviation of ``SMOOTHING`` intervals, so
-        that what is learned of a return holds for similar ones. Returns outside of all intervals
-        count as the nearest that is not.
+        They are those of a Gaussian around the value.
         """
-        least, most = self.edges[0], self.edges[-1]
-        width = SMOOTHING * (self.edges[1] - self.edges[0])
-        off = (self.edges - returns.clamp(least, most)[..., None]) / width
-        below = torch.special.ndtr(off)
+        edges = torch.cat([self.centres, self.centres[-1:] + self.width]) - self.width / 2
+        off = edges - values.clamp(self.least, self.most)[..., None]
+        below = torch.special.ndtr(off / (SMOOTHING * self.width))
         inside = below[..., 1:] - below[..., :-1]
         return inside / inside.sum(-1, keepdim=True)
 
 
 def q_network(sizes: Sizes, actions: int) -> QNetwork:
-    """Return a new Q-network: a `ReturnNetwork` if ``sizes.returns`` is not 0."""
+    """Return a new Q-network, with bins if there are ``sizes.value_bins``."""
     size = sizes.latent, actions, sizes.q_network
-    if not sizes.returns:
+    if not sizes.value_bins:
         return QNetwork(*size)
-    return ReturnNetwork(*size, sizes.returns, sizes.least_return, sizes.most_return)
+    return BinnedQNetwork(*size, sizes.value_bins, sizes.least_value, sizes.most_value)

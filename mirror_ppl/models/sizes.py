@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mirror_ppl.checks import real_number, whole_number
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.errors import InputError
+
+LARGEST = 1e6
+"""Largest absolute value that bins may have."""
 
 
 @dataclass(frozen=True)
@@ -19,9 +23,10 @@ class Sizes:
         decoder: of ``p(x^m_t | z_t)`` where the modality is not an image.
         reward: of ``p(r_t | z_t, a_t)``.
         q_network: of ``Q(z_t, a_t)``.
-        returns: intervals of the Q-network's distribution of returns; at 0 it has values alone.
-        least_return: where the first of these intervals begins.
-        most_return: where the last one ends.
+        value_bins: bins of values over which the Q-network has a distribution, at least 2; at 0 it
+            has values alone.
+        least_value: centre of the first of these bins; no return should be less.
+        most_value: centre of the last one.
         image: of the layers between a convolution and the features, and of those before an image
             decoder's deconvolution.
         channels: of the one convolution, and of the deconvolution; the kernel is 3 by 3.
@@ -36,22 +41,24 @@ class Sizes:
     decoder: int = 32
     reward: int = 32
     q_network: int = 128
-    returns: int = 0
-    least_return: int = 0
-    most_return: int = 0
-
-    def __post_init__(self) -> None:
-        if self.returns and not (self.returns > 1 and self.least_return < self.most_return):
-            raise InputError(
-                f"returns must be at least 2 intervals that end above where they begin, not "
-                f"{self.returns} from {self.least_return} to {self.most_return}"
-            )
-
+    value_bins: int = 0
+    least_value: float = 0.0
+    most_value: float = 0.0
     image: int = 48
     channels: int = 4
     stride: int = 3
     features: int = 16
     code: int = 8
+
+    def __post_init__(self) -> None:
+        if self.value_bins:
+            whole_number(self.value_bins, "value_bins", 2)
+            least = real_number(self.least_value, "least_value", -LARGEST, LARGEST)
+            most = real_number(self.most_value, "most_value", -LARGEST, LARGEST)
+            if not least < most:
+                raise InputError(
+                    f"least_value must be below most_value, not {least:g} and {most:g}"
+                )
 
 
 def sizes_of(domain: Domain, paper: bool = False) -> Sizes:

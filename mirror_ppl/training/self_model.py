@@ -6,6 +6,9 @@ samples rounds from all experience so far, each under a newly drawn view, and mi
 
     - ELBO / (B (T + 1)) * world_weight  +  mean squared Bellman error of both actions.
 
+Where the Q-network has bins of values, their cross entropy takes the place of squared errors, which
+are then only reported.
+
 With ``distil``, the planner's values take the place of outcomes, in every view: values of the true
 state, or in some rounds of the state that an observer who makes assumptions believes in. The error
 that is reported is then that of the regression.
@@ -30,6 +33,7 @@ from mirror_ppl.checkpoints import read_checkpoint, save_checkpoint
 from mirror_ppl.domains.base import Domain, map_state
 from mirror_ppl.domains.registry import code_of
 from mirror_ppl.domains.world import World, offers
+from mirror_ppl.errors import InputError
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes, sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
@@ -68,6 +72,7 @@ def train_self_model(
 
     Raises:
         AssetError: a file or package of that embedding is missing.
+        InputError: the options do not fit the world, or ``kind`` does not fit the sizes.
         CheckpointError: if the checkpoint belongs to another run (domain, options or seed) or
             cannot be read.
     """
@@ -95,6 +100,11 @@ class _Trainer:
         kind: type[SelfModel],
     ) -> None:
         require_fitting(domain, options)
+        if sizes.value_bins and kind.action_values is not SelfModel.action_values:
+            raise InputError(
+                f"value_bins must be 0, as {kind.__name__} has an action_values of its own, which "
+                "cannot be learned by bins"
+            )
         self.domain = domain
         self.options = options
         self.run_id = {

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mirror_ppl.models.networks import ReturnNetwork
+from mirror_ppl.models.networks import BinnedQNetwork
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.training.experience import Experience
 from mirror_ppl.training.self_model_options import SelfModelOptions
@@ -15,7 +15,7 @@ from mirror_ppl.training.self_model_options import SelfModelOptions
 
 @dataclass(frozen=True)
 class Loss:
-    """Parts of the loss of one gradient step."""
+    """Parts of the loss of one gradient step; ``bellman`` is the mean squared error of values."""
 
     total: Tensor
     negative_elbo: Tensor
@@ -57,10 +57,10 @@ def self_model_loss(
     live = ~lived.over
     belief, goal, sure = belief[live], goal[live], lived.informed[live]
     network = self_model.q_network
-    if isinstance(network, ReturnNetwork):
+    if isinstance(network, BinnedQNetwork):
         predicted = network.log_probabilities(belief)
         values = network.mean(predicted)
-        fit = options.return_weight * _cross_entropy(network.smoothed(goal), predicted)
+        fit = options.bin_weight * _cross_entropy(network.target(goal), predicted)
         bellman = _mean((values.detach() - goal).pow(2))
     else:
         values = self_model.action_values(belief)

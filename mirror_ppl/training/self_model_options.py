@@ -41,9 +41,9 @@ class SelfModelOptions:
             ``distil`` the same for all rounds of a phase.
         difference_weight: weight of errors in the differences between actions, added to the errors
             themselves. Choices of people depend on these differences alone.
-        return_weight: weight of the cross entropy, in nats, of distributions of returns. In worlds
-            whose Q-network learns them (``Sizes.returns``) it takes the place of squared errors,
-            also of those in differences.
+        bin_weight: weight of the cross entropy, in nats, of bins of values. In worlds whose
+            Q-network has bins (``Sizes.value_bins``) it takes the place of squared errors, also of
+            those in differences.
         choice_weight: weight of the cross entropy, in nats, of choices in proportion to the
             exponential of learned values, if they were made so by the planner's. Of observers who
             know all decisive items, and only with ``distil``: others would take what is likely for
@@ -82,7 +82,7 @@ class SelfModelOptions:
     window: int = 0
     stride: int = 1
     difference_weight: float = 0.0
-    return_weight: float = 100.0
+    bin_weight: float = 1.0
     choice_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     assumed: float = ASSUMPTION_PROBABILITY

@@ -1,5 +1,7 @@
 """Networks: their sizes, and what masks hide of their inputs."""
 
+import re
+
 import pytest
 import torch
 from example_implants import ACTIONS, LATENT
@@ -9,10 +11,10 @@ from torch import nn
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.networks import (
     MIN_SCALE,
+    BinnedQNetwork,
     Decoder,
     GaussianHead,
     QNetwork,
-    ReturnNetwork,
     Reward,
     Transition,
     log_softmax_of_few,
@@ -86,39 +88,67 @@ def test_q_network_has_three_layers_of_128_on_state_and_action():
         torch.testing.assert_close(network(z)[:, action], expected)
 
 
-def test_return_network_has_one_more_output_for_each_interval():
-    network = ReturnNetwork(LATENT, ACTIONS, 16, returns=5, least=-4.0, most=6.0).double()
-    assert linear_sizes(network) == [(48, 16), (16, 16), (16, 16), (16, 5)]
-    assert network.middles.tolist() == [-3.0, -1.0, 1.0, 3.0, 5.0]
+def test_binned_q_network_has_an_output_for_each_bin():
+    network = BinnedQNetwork(LATENT, ACTIONS, 16, bins=3, least=-1.0, most=3.0).double()
+    assert linear_sizes(network) == [(48, 16), (16, 16), (16, 16), (16, 9)]
+    # Three bins more on either side.
+    assert network.centres.tolist() == [-7, -5, -3, -1, 1, 3, 5, 7, 9]
     z = torch.randn(3, LATENT, dtype=torch.float64)
     probabilities = network.log_probabilities(z).exp()
-    assert probabilities.shape == (3, ACTIONS, 5)
-    by_hand = sum(probabilities[..., i] * middle for i, middle in enumerate((-3, -1, 1, 3, 5)))
+    assert probabilities.shape == (3, ACTIONS, 9)
+    by_hand = sum(probabilities[..., i] * (2 * i - 7) for i in range(9))
     torch.testing.assert_close(network(z), by_hand)
 
 
-def test_returns_are_learned_as_gaussians_over_intervals():
-    """Of intervals of 2 the standard deviation is 1.5, by hand from the normal distribution."""
-    network = ReturnNetwork(LATENT, ACTIONS, 16, returns=100, least=-100.0, most=100.0).double()
-    found = network.smoothed(torch.tensor([[0.0, 1.0], [3.3, 1000.0]], dtype=torch.float64))
-    assert found.shape == (2, 2, 100)
+@pytest.mark.parametrize("ends", [(-20.0, 20.0), (-200.0, 5.0), (-30.0, 0.0), (5.0, 20.0)])
+def test_binned_values_begin_next_to_0(ends):
+    least, most = ends
+    network = BinnedQNetwork(LATENT, ACTIONS, 16, 60, least, most)
+    with torch.no_grad():
+        network.value.weight.zero_()
+    values = network(torch.zeros(1, LATENT))
+    # The distance to the value next to 0 is at most that of an exponential distribution.
+    assert (values - min(max(0.0, least), most)).abs().max() < 0.05 * (most - least)
+
+
+def test_bins_are_learned_as_gaussians_around_values():
+    """Of bins of width 2 the standard deviation is 1.5, by hand from the normal distribution."""
+    network = BinnedQNetwork(LATENT, ACTIONS, 16, bins=101, least=-100.0, most=100.0).double()
+    values = torch.tensor([[0.0, 1.0], [3.3, 1000.0]], dtype=torch.float64)
+    found = network.target(values)
+    assert found.shape == (2, 2, 107)
     torch.testing.assert_close(found.sum(-1), torch.ones(2, 2, dtype=torch.float64))
     normal = torch.distributions.Normal(0.0, 1.5)
-    beside, beyond = (float(normal.cdf(torch.tensor(x)) - 0.5) for x in (2.0, 4.0))
-    # 0 is an edge: the intervals on both sides are alike; 1 is the middle of one.
-    assert found[0, 0, 49:52].tolist() == pytest.approx([beside, beside, beyond - beside], abs=1e-6)
-    middle = 2 * float(normal.cdf(torch.tensor(1.0)) - 0.5)
-    assert float(found[0, 1, 50]) == pytest.approx(middle, abs=1e-6)
-    # The mean is the return, but for rounding to intervals, of which almost nothing is left.
-    assert float(found[1, 0] @ network.middles) == pytest.approx(3.3, abs=0.01)
-    # A return beyond all intervals counts as the last of them.
-    assert torch.equal(found[1, 1], network.smoothed(torch.tensor(100.0, dtype=torch.float64)))
+    near, far = (float(normal.cdf(torch.tensor(x)) - 0.5) for x in (1.0, 3.0))
+    # 0 is the centre of bin 53; 1 lies between this one and the next.
+    assert found[0, 0, 52:55].tolist() == pytest.approx([far - near, 2 * near, far - near])
+    assert found[0, 1, 53:55].tolist() == pytest.approx(
+        2 * [float(normal.cdf(torch.tensor(2.0))) - 0.5]
+    )
+    # What is beyond the ends counts as at the ends.
+    assert torch.equal(found[1, 1], network.target(torch.tensor(100.0, dtype=torch.float64)))
 
 
-def test_sizes_refuse_intervals_that_are_none():
-    for sizes in ({"returns": 1, "most_return": 5}, {"returns": 4}, {"returns": -1}):
-        with pytest.raises(InputError, match="returns must be at least 2 intervals that end above"):
-            Sizes(**sizes)
+@pytest.mark.parametrize("value", [-4.0, -3.8, 0.0, 1.3, 5.9, 6.0])
+def test_bins_have_the_means_that_they_are_learned_from(value):
+    """Also at the ends; of a Gaussian over bins of 4 / 3 standard deviations little is lost."""
+    network = BinnedQNetwork(LATENT, ACTIONS, 16, bins=6, least=-4.0, most=6.0)
+    mean = network.mean(network.target(torch.tensor(value)).log())
+    assert float(mean) == pytest.approx(value, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"value_bins": 1}, "value_bins must be at least 2, not 1"),
+        ({"value_bins": 2.5}, "value_bins must be a whole number, not 2.5"),
+        ({"least_value": float("-inf")}, "least_value must be from -1e+06 to 1e+06, not -inf"),
+        ({"least_value": 2.0}, "least_value must be below most_value, not 2 and 1"),
+    ],
+)
+def test_sizes_refuse_bins_that_make_no_sense(wrong, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        Sizes(**{"value_bins": 4, "least_value": 0.0, "most_value": 1.0, **wrong})
 
 
 def test_self_model_is_put_together_from_them():

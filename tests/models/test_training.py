@@ -12,8 +12,9 @@ from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.domains.highway import Highway
 from mirror_ppl.domains.world import World
-from mirror_ppl.errors import CheckpointError
+from mirror_ppl.errors import CheckpointError, InputError
 from mirror_ppl.evaluation.self_model import fixed_views
+from mirror_ppl.models.networks import BinnedQNetwork
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import sizes_of
 from mirror_ppl.models.speech import EMBEDDINGS
@@ -121,14 +122,14 @@ def test_choices_are_learned_where_all_that_counts_is_known():
     torch.testing.assert_close(found - without, 7 * entropy)
 
 
-def test_distributions_of_returns_are_learned_by_cross_entropy():
+def test_bins_of_values_are_learned_by_cross_entropy():
     """By hand, of two moments that go on, in place of squared errors; and it can be learned."""
-    sizes = replace(sizes_of(DRIVING), returns=40, least_return=-20, most_return=20)
+    sizes = replace(sizes_of(DRIVING), value_bins=41, least_value=-20, most_value=20)
     torch.manual_seed(0)
     robot = SelfModel(DRIVING, sizes, EMBEDDINGS["words"])
     network = robot.q_network
     options = SelfModelOptions(
-        distil=True, window=3, world_weight=0.0, return_weight=3.0, difference_weight=5.0
+        distil=True, window=3, world_weight=0.0, bin_weight=3.0, difference_weight=5.0
     )
     lived = experience(
         DRIVING,
@@ -147,7 +148,7 @@ def test_distributions_of_returns_are_learned_by_cross_entropy():
         evidence = robot.evidence(rounds.observation, rounds.visible, rounds.actions)
         belief = robot.believe(evidence[:, :2])[0]
         found = loss()
-        wanted = -(network.smoothed(goal) * network.log_probabilities(belief)).sum(-1).mean()
+        wanted = -(network.target(goal) * network.log_probabilities(belief)).sum(-1).mean()
         torch.testing.assert_close(found.total, 3 * wanted)
         # Squared errors of the means are what is reported.
         torch.testing.assert_close(found.bellman, (network(belief) - goal).square().mean())
@@ -156,7 +157,7 @@ def test_distributions_of_returns_are_learned_by_cross_entropy():
         optimizer.zero_grad()
         loss().total.backward()
         optimizer.step()
-    # Probabilities of intervals of 1 give means within .1 of the returns.
+    # Bins of width 1 give values within .1.
     assert loss().bellman < 0.1**2 < found.bellman
 
 
@@ -220,6 +221,31 @@ def test_another_class_of_self_model_can_be_trained():
     trained = train_self_model(DRIVING, TINY, torch.Generator().manual_seed(0), kind=Other)
     assert type(trained) is Other
     assert_same(trained.state_dict(), train())
+
+
+BINS = replace(sizes_of(DRIVING), value_bins=9, least_value=-8.0, most_value=8.0)
+
+
+def test_bins_of_values_are_trained_on_bootstrapped_values():
+    trained = train_self_model(DRIVING, TINY, torch.Generator().manual_seed(0), sizes=BINS)
+    first = train_self_model(
+        DRIVING, replace(TINY, learning_rate=1e-9), torch.Generator().manual_seed(0), sizes=BINS
+    )
+    assert isinstance(trained.q_network, BinnedQNetwork)
+    for part in (trained.q_network.value.weight, trained.encoder.ego.weight):
+        assert torch.isfinite(part).all()
+    assert not torch.allclose(
+        trained.q_network.value.weight, first.q_network.value.weight, atol=1e-5
+    )
+
+
+def test_bins_cannot_be_learned_of_values_from_elsewhere():
+    class Other(SelfModel):
+        def action_values(self, belief):
+            return -super().action_values(belief)
+
+    with pytest.raises(InputError, match="value_bins must be 0, as Other has an action_values of"):
+        train_self_model(DRIVING, TINY, torch.Generator(), sizes=BINS, kind=Other)
 
 
 def test_rounds_are_seen_as_the_options_say(monkeypatch):

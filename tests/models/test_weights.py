@@ -90,13 +90,13 @@ def test_weights_know_their_sizes(tmp_path):
     assert (model.sizes, model.latent, model.encoder.ego.out_features) == (sizes, 8, 16)
 
 
-def test_weights_hold_the_intervals_of_returns(tmp_path):
+def test_weights_hold_bins_of_values(tmp_path):
     path = tmp_path / "a.safetensors"
-    sizes = Sizes(returns=8, least_return=-3, most_return=1)
+    sizes = Sizes(value_bins=3, least_value=-3, most_value=1)
     saved = SelfModel(DRIVING, sizes)
     save_self_model(saved, path, CARD)
     model, _ = load_self_model(path)
-    assert model.q_network.edges.tolist() == [-3, -2.5, -2, -1.5, -1, -0.5, 0, 0.5, 1]
+    assert model.q_network.centres.tolist() == [-9, -7, -5, -3, -1, 1, 3, 5, 7]
     z = torch.randn(3, model.latent)
     torch.testing.assert_close(model.action_values(z), saved.action_values(z))
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from benchmarks import (
     driving_messages,
@@ -17,6 +18,7 @@ from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
 from benchmarks.tables import DOCS, RESULTS, results_page, studies, study_page
+from mirror_ppl.inference.calibration.ranks import Calibration
 
 STUDIES = studies()
 
@@ -178,3 +180,41 @@ def test_tables_of_trust_are_what_their_rows_say():
         assert found == expected
     assert all(int(row["seed"]) < 100 for row in rows_in(hearing.ROWS))
     assert all(int(row["seed"]) >= 100 for row in rows_in(pooling.ROWS))
+
+
+def test_rows_of_a_calibration_take_the_place_of_those_that_were_there(rng):
+    """Of two people of bomb defusal, whose human model has a class of its own."""
+    place = rng.random((1, 3, 2))
+    data = xr.Dataset(
+        {
+            "rank": (("site", "rounds", "person"), (place * 10).astype(int)),
+            "place": (("site", "rounds", "person"), place),
+            **{name: (("site", "rounds", "person"), place) for name in ("width", "entropy")},
+            "probability": (("site", "rounds", "person"), place),
+            "pareto_k": (("site", "rounds", "person"), np.full_like(place, np.nan)),
+            "discrete": ("site", [False]),
+            **{f"prior_{n}": ("site", [2.0]) for n in ("width", "entropy", "probability")},
+        },
+        {"site": ["reads_type"], "rounds": [1, 5, 20]},
+        {
+            "draws": 9,
+            "domain": "bomb_defusal",
+            "setting": "unlabelled",
+            "human_model": "BombDefusalHuman",
+            "engine": "importance",
+        },
+    )
+    before = rows_in(sbc.ROWS)
+    new = sbc.new_rows(Calibration(data))
+    assert [(row["human_model"], row["implant"], row["rounds"]) for row in new] == [
+        ("mirror", "reads type", rounds) for rounds in ("1", "5", "20")
+    ]
+    assert new[0].keys() == before[0].keys()
+    after = sbc.replaced(before, new)
+    lines, old = (sbc.table(rows).splitlines() for rows in (after, before))
+    assert [a for a, b in zip(lines, old, strict=True) if a != b] == [
+        line for line in lines if line.startswith("| bomb defusal, `mirror`, `importance`, 2 |")
+    ]
+    assert len(after) == len(before) - 39 + 3
+    with pytest.raises(SystemExit, match="not of .* in labelled"):
+        sbc.new_rows(Calibration(data.assign_attrs(setting="labelled")))

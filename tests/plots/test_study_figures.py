@@ -35,7 +35,10 @@ def test_relevance_has_a_panel_for_each_place(monkeypatch):
         for setting in ("clear", "fog")
     ]
     picture = REPORTS["relevance"](rows).picture
-    assert [ax.get_title() for ax in picture.axes] == ["driving, clear, paper", "driving, fog, paper"]
+    assert [ax.get_title() for ax in picture.axes] == [
+        "driving, clear, paper",
+        "driving, fog, paper",
+    ]
     assert [len(ax.patches) for ax in picture.axes] == [2, 2]
 
 
