@@ -32,7 +32,8 @@ def new_rows(calibration: Calibration) -> list[dict[str, str]]:
     """Return the rows of a calibration.
 
     Raises:
-        SystemExit: it is of other numbers of rounds or of another setting than the table.
+        SystemExit: it is of other numbers of rounds or of another setting than the table, or does
+            not name its engine.
     """
     about, rounds = calibration.data.attrs, calibration.data["rounds"].values.tolist()
     usual = get_domain(about["domain"]).settings[-1]
@@ -40,6 +41,8 @@ def new_rows(calibration: Calibration) -> list[dict[str, str]]:
         raise SystemExit(
             f"the table is of {ROUNDS} rounds in {usual}, not of {rounds} in {about['setting']}"
         )
+    if "engine" not in about:
+        raise SystemExit("this calibration does not name its engine; calibrate again")
     study = {
         "domain": about["domain"],
         "human_model": model_name(about["human_model"]),

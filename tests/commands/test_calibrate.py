@@ -49,6 +49,7 @@ def test_it_prints_and_writes_what_it_found(tmp_path, capsys):
     calibration = Calibration.load(tmp_path / "out" / "calibration.nc")
     assert calibration.people == 10 and calibration.draws == 19
     assert calibration.data.attrs["human_model"] == "Toy"
+    assert calibration.data.attrs["engine"] == "importance"
     with Image.open(tmp_path / "out" / "ranks.png") as image:
         assert len(image.convert("L").getcolors()) > 10
 

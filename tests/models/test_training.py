@@ -94,16 +94,21 @@ def test_values_between_strides_are_not_computed():
     assert torch.equal(lived.over, lived.exact.isnan().any(-1))
 
 
-def test_choices_are_learned_where_all_that_counts_is_known():
-    """The cross entropy, by hand, of those of three moments that are known and go on."""
-    robot = SelfModel(DRIVING, sizes_of(DRIVING), EMBEDDINGS["words"])
-    options = SelfModelOptions(distil=True, window=3, world_weight=0.0)
-    lived = experience(
+def three_moments():
+    """A round in which everything is seen, with exact values."""
+    return experience(
         DRIVING,
         Course.of(DRIVING, two_cars_near(), STAY4[:, :3]),
         fixed_views(DRIVING, 1, torch.Generator(), speech=True),
         discount=0.9,
     )
+
+
+def test_choices_are_learned_where_all_that_counts_is_known():
+    """The cross entropy, by hand, of those of three moments that are known and go on."""
+    robot = SelfModel(DRIVING, sizes_of(DRIVING), EMBEDDINGS["words"])
+    options = SelfModelOptions(distil=True, window=3, world_weight=0.0)
+    lived = three_moments()
     lived = replace(lived, informed=torch.tensor([[True, False, True]]))
     lived = replace(lived, over=torch.tensor([[False, False, True]]))
     with torch.no_grad():
@@ -131,12 +136,7 @@ def test_bins_of_values_are_learned_by_cross_entropy():
     options = SelfModelOptions(
         distil=True, window=3, world_weight=0.0, bin_weight=3.0, difference_weight=5.0
     )
-    lived = experience(
-        DRIVING,
-        Course.of(DRIVING, two_cars_near(), STAY4[:, :3]),
-        fixed_views(DRIVING, 1, torch.Generator(), speech=True),
-        discount=0.9,
-    )
+    lived = three_moments()
     lived = replace(lived, over=torch.tensor([[False, False, True]]))
 
     def loss():

@@ -218,3 +218,6 @@ def test_rows_of_a_calibration_take_the_place_of_those_that_were_there(rng):
     assert len(after) == len(before) - 39 + 3
     with pytest.raises(SystemExit, match="not of .* in labelled"):
         sbc.new_rows(Calibration(data.assign_attrs(setting="labelled")))
+    del data.attrs["engine"]
+    with pytest.raises(SystemExit, match="does not name its engine"):
+        sbc.new_rows(Calibration(data))
