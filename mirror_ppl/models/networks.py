@@ -34,6 +34,8 @@ SMOOTHING = 0.75
 START = 0.05
 """Distance from the value next to 0 at which a bin of a new network is less probable by a factor of
 *e*, as a share of the range of values."""
+TINY = 1e-30
+"""Least probability whose logarithm is taken."""
 
 
 class Gaussian(NamedTuple):
@@ -313,6 +315,24 @@ class BinnedQNetwork(QNetwork):
         below = torch.special.ndtr(off / (SMOOTHING * self.width))
         inside = below[..., 1:] - below[..., :-1]
         return inside / inside.sum(-1, keepdim=True)
+
+    def threshold_cross_entropy(self, target: Tensor, log_probabilities: Tensor) -> Tensor:
+        """Return cross entropies ``[..., A]`` of being below a threshold, over all thresholds.
+
+        Of each edge between bins: whether the value is below it. They are summed and multiplied by
+        the width of a bin, which is their integral over thresholds. (It is the logarithmic relative
+        of the continuous ranked probability score; Gneiting and Raftery 2007.) So it counts how
+        far away wrong values are, which the cross entropy of bins does not.
+
+        Args:
+            target: probabilities of bins that are learned ``[..., A, V]``.
+            log_probabilities: logs of the distribution's ``[..., A, V]``.
+        """
+        found = log_probabilities.exp()
+        below = found.cumsum(-1)[..., :-1].clamp(min=TINY).log()
+        above = found.flip(-1).cumsum(-1).flip(-1)[..., 1:].clamp(min=TINY).log()
+        wanted = target.cumsum(-1)[..., :-1].clamp(max=1.0)
+        return -self.width * (wanted * below + (1 - wanted) * above).sum(-1)
 
 
 def q_network(sizes: Sizes, actions: int) -> QNetwork:

@@ -60,7 +60,11 @@ def self_model_loss(
     if isinstance(network, BinnedQNetwork):
         predicted = network.log_probabilities(belief)
         values = network.mean(predicted)
-        fit = options.bin_weight * _cross_entropy(network.target(goal), predicted)
+        target_bins = network.target(goal)
+        fit = options.bin_weight * _cross_entropy(target_bins, predicted)
+        if options.threshold_weight:
+            apart = network.threshold_cross_entropy(target_bins, predicted)
+            fit = fit + options.threshold_weight * _mean(apart)
         bellman = _mean((values.detach() - goal).pow(2))
     else:
         values = self_model.action_values(belief)

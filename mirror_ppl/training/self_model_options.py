@@ -44,6 +44,9 @@ class SelfModelOptions:
         bin_weight: weight of the cross entropy, in nats, of bins of values. In worlds whose
             Q-network has bins (``Sizes.value_bins``) it takes the place of squared errors, also of
             those in differences.
+        threshold_weight: weight of the cross entropy, in nats times units of value, of whether a
+            value is below a threshold, integrated over thresholds; of bins alone. It makes errors
+            count by how far away wrong values are.
         choice_weight: weight of the cross entropy, in nats, of choices in proportion to the
             exponential of learned values, if they were made so by the planner's. Of observers who
             know all decisive items, and only with ``distil``: others would take what is likely for
@@ -83,6 +86,7 @@ class SelfModelOptions:
     stride: int = 1
     difference_weight: float = 0.0
     bin_weight: float = 1.0
+    threshold_weight: float = 0.0
     choice_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     assumed: float = ASSUMPTION_PROBABILITY

@@ -1,5 +1,6 @@
 """Networks: their sizes, and what masks hide of their inputs."""
 
+import math
 import re
 
 import pytest
@@ -135,6 +136,22 @@ def test_bins_have_the_means_that_they_are_learned_from(value):
     network = BinnedQNetwork(LATENT, ACTIONS, 16, bins=6, least=-4.0, most=6.0)
     mean = network.mean(network.target(torch.tensor(value)).log())
     assert float(mean) == pytest.approx(value, abs=0.01)
+
+
+def test_thresholds_count_how_far_away_values_are():
+    """By hand, of bins of width 2 around -8, -6, -4, -2, 0, 2, 4, 6, 8 and 10."""
+    network = BinnedQNetwork(LATENT, ACTIONS, 16, bins=4, least=-2.0, most=4.0)
+    assert network.centres.tolist() == list(range(-8, 11, 2))
+    target = torch.tensor([0.0, 0.0, 0.25, 0.75, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    found = torch.tensor([0.0, 0.0, 0.5, 0.0, 0.25, 0.25, 0.0, 0.0, 0.0, 0.0])
+    # Below -3: .25 is wanted, .5 found; below -1: all is wanted, .5 found; below 1: .75 found.
+    by_hand = -2 * (math.log(0.5) + math.log(0.5) + math.log(0.75))
+    entropy = network.threshold_cross_entropy(target, found.log())
+    assert float(entropy) == pytest.approx(by_hand)
+    # The same distribution costs its own entropy, and three bins away three times the width more.
+    sure = torch.eye(10)
+    at = [float(network.threshold_cross_entropy(sure[2], sure[k].log())) for k in (2, 3, 5)]
+    assert at[0] == 0 and at[2] == pytest.approx(3 * at[1]) and at[1] > 100
 
 
 @pytest.mark.parametrize(

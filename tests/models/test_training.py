@@ -134,7 +134,12 @@ def test_bins_of_values_are_learned_by_cross_entropy():
     robot = SelfModel(DRIVING, sizes, EMBEDDINGS["words"])
     network = robot.q_network
     options = SelfModelOptions(
-        distil=True, window=3, world_weight=0.0, bin_weight=3.0, difference_weight=5.0
+        distil=True,
+        window=3,
+        world_weight=0.0,
+        bin_weight=3.0,
+        threshold_weight=0.5,
+        difference_weight=5.0,
     )
     lived = three_moments()
     lived = replace(lived, over=torch.tensor([[False, False, True]]))
@@ -148,8 +153,10 @@ def test_bins_of_values_are_learned_by_cross_entropy():
         evidence = robot.evidence(rounds.observation, rounds.visible, rounds.actions)
         belief = robot.believe(evidence[:, :2])[0]
         found = loss()
-        wanted = -(network.target(goal) * network.log_probabilities(belief)).sum(-1).mean()
-        torch.testing.assert_close(found.total, 3 * wanted)
+        bins, learned = network.target(goal), network.log_probabilities(belief)
+        wanted = -3 * (bins * learned).sum(-1).mean()
+        wanted = wanted + 0.5 * network.threshold_cross_entropy(bins, learned).mean()
+        torch.testing.assert_close(found.total, wanted)
         # Squared errors of the means are what is reported.
         torch.testing.assert_close(found.bellman, (network(belief) - goal).square().mean())
     optimizer = torch.optim.Adam(robot.parameters(), 3e-3)
@@ -246,6 +253,12 @@ def test_bins_cannot_be_learned_of_values_from_elsewhere():
 
     with pytest.raises(InputError, match="value_bins must be 0, as Other has an action_values of"):
         train_self_model(DRIVING, TINY, torch.Generator(), sizes=BINS, kind=Other)
+
+
+def test_thresholds_need_bins():
+    options = replace(TINY, threshold_weight=1.0)
+    with pytest.raises(InputError, match="threshold_weight must be 0, as driving's"):
+        train_self_model(DRIVING, options, torch.Generator())
 
 
 def test_rounds_are_seen_as_the_options_say(monkeypatch):
