@@ -218,8 +218,6 @@ class Runner:
         self, places: list[int], task: Callable[[int], Callable[[], tuple[int, Outcome[Result]]]]
     ) -> Iterator[tuple[int, Outcome[Result]]]:
         """Outcomes by place, in the order in which cells end."""
-        from joblib import effective_n_jobs
-
         left = dict.fromkeys(places)
         while left:
             try:
@@ -227,6 +225,8 @@ class Runner:
                     del left[place]
                     yield place, outcome
             except WorkerError:
+                from joblib import effective_n_jobs
+
                 suspects = list(left)[: DISPATCHED * effective_n_jobs(self.jobs)]
                 for place in suspects:
                     own = task(place)

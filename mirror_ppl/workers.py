@@ -50,12 +50,12 @@ def run_tasks(
         HumanModelError: a task failed in code of a user.
         WorkerError: a process was killed.
     """
-    from joblib import Parallel, delayed
-
     if here and jobs == 1:
         for task in tasks:  # not by map(), which a StopIteration of a task would end
             yield _guarded(task)
         return
+    from joblib import Parallel, delayed
+
     with warnings.catch_warnings():
         # Processes that have used much memory are replaced by new ones; nothing is lost.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given")
