@@ -115,14 +115,21 @@ def _centres(visual: Tensor, x: Tensor, lane: Tensor) -> Tensor:
         lane: of these points ``[..., 36]``.
     """
     seen, motion = visual[..., 0] < RANGE, visual[..., 1:]
-    one = (motion[..., None, :] - motion[..., None, :, :]).abs().amax(-1) < SAME
-    one = one & ((x[..., None] - x[..., None, :]).abs() <= LENGTH)
+    # Each part for itself, as the last dimension would be too short to be fast.
+    apart = [_differences(motion[..., part].contiguous()) for part in range(2)]
+    one = torch.maximum(*apart) < SAME
+    one = one & (_differences(x) <= LENGTH)
     one = one & (lane[..., None] == lane[..., None, :]) & seen[..., None, :]
     least = torch.where(one, x[..., None, :], math.inf).amin(-1)
     most = torch.where(one, x[..., None, :], -math.inf).amax(-1)
     abreast = (least + most) / 2
     beyond = torch.where(least >= 0, least + LENGTH / 2, most - LENGTH / 2)
     return torch.where((least < 0) & (most > 0), abreast, beyond)
+
+
+def _differences(values: Tensor) -> Tensor:
+    """Return absolute differences ``[..., n, n]`` of values ``[..., n]``."""
+    return (values[..., None] - values[..., None, :]).abs_()
 
 
 def _angles(visual: Tensor) -> Tensor:
@@ -134,8 +141,7 @@ def _angles(visual: Tensor) -> Tensor:
     sectors = torch.arange(SECTORS, dtype=visual.dtype, device=visual.device)
     seen = visual[..., 0] < RANGE
     following, motion = seen.roll(-1, -1), visual[..., 1:]
-    same = (motion - motion.roll(-1, -2)).abs().amax(-1) < SAME
-    same = same & seen & following
+    same = ((motion - motion.roll(-1, -2)).abs() < SAME).all(-1) & seen & following
     side = same.to(visual.dtype) - same.roll(1, -1).to(visual.dtype)
     return (sectors + side / 2) * SECTOR
 

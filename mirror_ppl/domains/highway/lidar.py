@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.domains.highway.geometry import clearance, corners, seen_from
+from mirror_ppl.domains.highway.road import LENGTH
 from mirror_ppl.domains.highway.state import HighwayState
 
 SECTORS = 36
@@ -66,9 +67,12 @@ def nearest_in(boxes: Tensor, middles: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         Distances in metres ``[..., D]`` of the nearest point within each sector, infinite if there
-        is none, and indices ``[..., D]`` of the boxes that these points belong to.
+        is none in range, and indices ``[..., D]`` of the boxes that these points belong to.
     """
-    distance = distances(boxes, middles)
+    # Remembered cars are few, and absent ones far away.
+    near = torch.hypot(boxes[..., 0], boxes[..., 1]) < RANGE + LENGTH
+    distance = boxes.new_full((*near.shape, len(middles)), math.inf)
+    distance[near] = distances(boxes[near], middles)
     least, index = distance.min(-2)
     return least, index
 
