@@ -316,13 +316,14 @@ class BinnedQNetwork(QNetwork):
         inside = below[..., 1:] - below[..., :-1]
         return inside / inside.sum(-1, keepdim=True)
 
-    def threshold_cross_entropy(self, target: Tensor, log_probabilities: Tensor) -> Tensor:
-        """Return cross entropies ``[..., A]`` of being below a threshold, over all thresholds.
+    def ranked_cross_entropy(self, target: Tensor, log_probabilities: Tensor) -> Tensor:
+        """Return the ranked cross entropy ``[..., A]``, in nats times units of value.
 
-        Of each edge between bins: whether the value is below it. They are summed and multiplied by
-        the width of a bin, which is their integral over thresholds. (It is the logarithmic relative
-        of the continuous ranked probability score; Gneiting and Raftery 2007.) So it counts how
-        far away wrong values are, which the cross entropy of bins does not.
+        It is the cross entropy of whether the value lies below the edge between two bins, summed
+        over edges and multiplied by the width of a bin. So it counts how far away wrong values are;
+        the cross entropy of bins does so only within the smoothing. With squared errors of
+        probabilities in place of logarithms it would be the continuous ranked probability score
+        (Gneiting and Raftery, *Strictly proper scoring rules*, 2007).
 
         Args:
             target: probabilities of bins that are learned ``[..., A, V]``.

@@ -84,7 +84,11 @@ class View:
             imagined = self.imagined[name]
             key = random_keys(imagined.shape[-2:].numel(), imagined.device, kind)
             key = key.view(imagined.shape[-2:])
-            # Few items are taken for granted; the others are skipped.
+            if 2 * int(mask.sum()) > mask.numel():
+                for part, own in zip(imagined.unbind(-1), key.unbind(-1), strict=True):
+                    total = total + torch.where(mask, as_whole_numbers(part) * own, 0).sum(-1)
+                continue
+            # Where few items are taken for granted, the others are skipped.
             place = mask.nonzero(as_tuple=True)
             value = as_whole_numbers(imagined.expand(*mask.shape, -1)[place])
             value = (value * key[place[-1]]).sum(-1)

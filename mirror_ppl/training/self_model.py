@@ -72,7 +72,7 @@ def train_self_model(
 
     Raises:
         AssetError: a file or package of that embedding is missing.
-        InputError: the options do not fit the world or the sizes, or ``kind`` not the sizes.
+        InputError: the options do not fit the world or the sizes, or ``kind`` cannot have bins.
         CheckpointError: if the checkpoint belongs to another run (domain, options or seed) or
             cannot be read.
     """
@@ -105,9 +105,9 @@ class _Trainer:
                 f"value_bins must be 0, as {kind.__name__} has an action_values of its own, which "
                 "cannot be learned by bins"
             )
-        if options.threshold_weight and not sizes.value_bins:
+        if options.ranked_weight and not sizes.value_bins:
             raise InputError(
-                f"threshold_weight must be 0, as {domain.name}'s Q-network has no value_bins"
+                f"ranked_weight must be 0, as {domain.name}'s Q-network has no value_bins"
             )
         self.domain = domain
         self.options = options

@@ -62,9 +62,9 @@ def self_model_loss(
         values = network.mean(predicted)
         target_bins = network.target(goal)
         fit = options.bin_weight * _cross_entropy(target_bins, predicted)
-        if options.threshold_weight:
-            apart = network.threshold_cross_entropy(target_bins, predicted)
-            fit = fit + options.threshold_weight * _mean(apart)
+        if options.ranked_weight:
+            apart = network.ranked_cross_entropy(target_bins, predicted)
+            fit = fit + options.ranked_weight * _mean(apart)
         bellman = _mean((values.detach() - goal).pow(2))
     else:
         values = self_model.action_values(belief)

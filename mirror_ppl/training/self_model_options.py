@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -44,9 +45,8 @@ class SelfModelOptions:
         bin_weight: weight of the cross entropy, in nats, of bins of values. In worlds whose
             Q-network has bins (``Sizes.value_bins``) it takes the place of squared errors, also of
             those in differences.
-        threshold_weight: weight of the cross entropy, in nats times units of value, of whether a
-            value is below a threshold, integrated over thresholds; of bins alone. It makes errors
-            count by how far away wrong values are.
+        ranked_weight: weight of `BinnedQNetwork.ranked_cross_entropy`, in nats times units of
+            value, added to that of bins. It makes errors count by how far away wrong values are.
         choice_weight: weight of the cross entropy, in nats, of choices in proportion to the
             exponential of learned values, if they were made so by the planner's. Of observers who
             know all decisive items, and only with ``distil``: others would take what is likely for
@@ -86,7 +86,7 @@ class SelfModelOptions:
     stride: int = 1
     difference_weight: float = 0.0
     bin_weight: float = 1.0
-    threshold_weight: float = 0.0
+    ranked_weight: float = 0.0
     choice_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     assumed: float = ASSUMPTION_PROBABILITY
@@ -113,6 +113,9 @@ class SelfModelOptions:
             raise InputError(
                 f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
             )
+        for name in ("difference_weight", "bin_weight", "ranked_weight", "choice_weight"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name} must be at least 0 and finite, not {getattr(self, name)}")
         if self.window < 0 or self.length < 0:
             raise InputError("window and length must not be negative")
         if self.distil and self.exact:

@@ -146,12 +146,24 @@ def test_thresholds_count_how_far_away_values_are():
     found = torch.tensor([0.0, 0.0, 0.5, 0.0, 0.25, 0.25, 0.0, 0.0, 0.0, 0.0])
     # Below -3: .25 is wanted, .5 found; below -1: all is wanted, .5 found; below 1: .75 found.
     by_hand = -2 * (math.log(0.5) + math.log(0.5) + math.log(0.75))
-    entropy = network.threshold_cross_entropy(target, found.log())
+    entropy = network.ranked_cross_entropy(target, found.log())
     assert float(entropy) == pytest.approx(by_hand)
-    # The same distribution costs its own entropy, and three bins away three times the width more.
-    sure = torch.eye(10)
-    at = [float(network.threshold_cross_entropy(sure[2], sure[k].log())) for k in (2, 3, 5)]
-    assert at[0] == 0 and at[2] == pytest.approx(3 * at[1]) and at[1] > 100
+    # It is least at the target itself, and a uniform background costs the more the farther away.
+    smooth = 0.9 * torch.eye(10) + 0.01
+    entropy = [float(network.ranked_cross_entropy(smooth[4], smooth[k].log())) for k in range(10)]
+    assert entropy.index(min(entropy)) == 4
+    assert entropy[:5] == sorted(entropy[:5], reverse=True) and entropy[4:] == sorted(entropy[4:])
+
+
+def test_ranked_cross_entropy_moves_probability_towards_the_value():
+    network = BinnedQNetwork(LATENT, ACTIONS, 16, bins=4, least=-2.0, most=4.0)
+    logits = torch.zeros(10, requires_grad=True)
+    target = torch.eye(10)[7]
+    network.ranked_cross_entropy(target, torch.log_softmax(logits, -1)).backward()
+    assert logits.grad is not None
+    # Below the value the more, the farther away; above it likewise.
+    below, above = logits.grad[:8], logits.grad[7:]
+    assert (below.diff() < 0).all() and (above.diff() > 0).all() and below[7] < 0 < below[0]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Training of self-models: what is learned, that runs resume, and what is refused."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -138,7 +139,7 @@ def test_bins_of_values_are_learned_by_cross_entropy():
         window=3,
         world_weight=0.0,
         bin_weight=3.0,
-        threshold_weight=0.5,
+        ranked_weight=0.5,
         difference_weight=5.0,
     )
     lived = three_moments()
@@ -155,7 +156,7 @@ def test_bins_of_values_are_learned_by_cross_entropy():
         found = loss()
         bins, learned = network.target(goal), network.log_probabilities(belief)
         wanted = -3 * (bins * learned).sum(-1).mean()
-        wanted = wanted + 0.5 * network.threshold_cross_entropy(bins, learned).mean()
+        wanted = wanted + 0.5 * network.ranked_cross_entropy(bins, learned).mean()
         torch.testing.assert_close(found.total, wanted)
         # Squared errors of the means are what is reported.
         torch.testing.assert_close(found.bellman, (network(belief) - goal).square().mean())
@@ -256,8 +257,8 @@ def test_bins_cannot_be_learned_of_values_from_elsewhere():
 
 
 def test_thresholds_need_bins():
-    options = replace(TINY, threshold_weight=1.0)
-    with pytest.raises(InputError, match="threshold_weight must be 0, as driving's"):
+    options = replace(TINY, ranked_weight=1.0)
+    with pytest.raises(InputError, match="ranked_weight must be 0, as driving's"):
         train_self_model(DRIVING, options, torch.Generator())
 
 
@@ -358,6 +359,8 @@ def test_checkpoint_of_another_run_is_refused(tmp_path):
     ("name", "value", "message"),
     [
         ("phases", 0, "phases must be at least 1, not 0"),
+        ("ranked_weight", -1.0, "ranked_weight must be at least 0 and finite, not -1.0"),
+        ("bin_weight", math.nan, "bin_weight must be at least 0 and finite, not nan"),
         ("batch", -1, "batch must be at least 1, not -1"),
         ("epsilon", 1.5, r"epsilon must lie in \[0, 1\], not 1.5"),
         ("discount", -0.1, r"discount must lie in \[0, 1\], not -0.1"),

@@ -115,7 +115,7 @@ def _centres(visual: Tensor, x: Tensor, lane: Tensor) -> Tensor:
         lane: of these points ``[..., 36]``.
     """
     seen, motion = visual[..., 0] < RANGE, visual[..., 1:]
-    # Each part for itself, as the last dimension would be too short to be fast.
+    # One part of the motion at a time: operations over a dimension of two are slow.
     apart = [_differences(motion[..., part].contiguous()) for part in range(2)]
     one = torch.maximum(*apart) < SAME
     one = one & (_differences(x) <= LENGTH)

@@ -7,14 +7,14 @@ is nothing, as far as the driver knows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mirror_ppl.domains.base import Observation, Visibility, map_state
+from mirror_ppl.domains.base import Observation, RepeatedObservation, Visibility, map_state
 from mirror_ppl.domains.highway.estimate import Cars, cars_in, state_with
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS, scan
 from mirror_ppl.domains.highway.messages import GROUPS, group_of
@@ -74,16 +74,17 @@ def remember(
         hidden: returns where a car in each direction is out of sight, ``[..., 6]``, given the
             distance of its near end in metres.
     """
-    ego = observation["ego"]
-    visual = observation["visual"]
-    empty = visual.new_tensor([RANGE, 0.0, 0.0])
-    said = torch.where(heard, observation["verbal"][..., 0], float(NOTHING))
-    visual = torch.where(seen[..., None], visual, empty)
+    ego, visual, verbal = (observation[name] for name in ("ego", "visual", "verbal"))
+    said = torch.where(heard, verbal[..., 0], float(NOTHING))
+    # Nobody can tell an empty sector from one that is out of sight.
+    seen = seen & (visual[..., 0] < RANGE)
     sight = once_each(
-        lambda ego, visual, verbal: cars_in({"ego": ego, "visual": visual, "verbal": verbal}),
+        _in_sight,
         (ego, 1),
         (visual, 2),
-        (said[..., None], 2),
+        (seen, 1),
+        (said, 1),
+        key=[_numbers(observation), seen, said],
     )
     now = Memory(**vars(sight), age=torch.zeros_like(sight.x), own_speed=ego[..., 3:4])
     sentence = said.round().long()
@@ -91,6 +92,23 @@ def remember(
     # Told that nothing is there, a driver forgets a car.
     free = heard & (sentence == NOTHING)
     return replace(after, there=after.there & ~(free & ~now.there))
+
+
+def _in_sight(ego: Tensor, visual: Tensor, seen: Tensor, said: Tensor) -> Cars:
+    """Return the cars ``[n]`` in the sectors that are seen; ``said`` says which of them brake."""
+    empty = visual.new_tensor([RANGE, 0.0, 0.0])
+    shown = torch.where(seen[..., None], visual, empty)
+    return cars_in({"ego": ego, "visual": shown, "verbal": said[..., None]})
+
+
+def _numbers(observation: Observation) -> Tensor:
+    """Return whole numbers ``[..., n]`` that tell observations ``[...]`` apart."""
+    if isinstance(observation, RepeatedObservation):
+        return observation.row[..., None]
+    parts = observation["ego"], observation["visual"].flatten(-2), observation["verbal"].flatten(-2)
+    if parts[0].shape[:-1].numel() == 1:  # the same for everybody
+        return torch.zeros_like(parts[0][..., :1], dtype=torch.long)
+    return torch.cat([as_whole_numbers(part) for part in parts], -1)
 
 
 def imagined(memory: Memory, observation: Observation) -> Observation:
@@ -115,7 +133,9 @@ def out_of_sight(sees: Callable[[Observation], Visibility], observation: Observa
     return hidden
 
 
-def once_each(function: Callable[..., Any], *parts: tuple[Tensor, int]) -> Any:
+def once_each(
+    function: Callable[..., Any], *parts: tuple[Tensor, int], key: Sequence[Tensor] = ()
+) -> Any:
     """Apply a function of batches to each distinct row of them once.
 
     Many people who see differently far know of the same cars.
@@ -123,22 +143,27 @@ def once_each(function: Callable[..., Any], *parts: tuple[Tensor, int]) -> Any:
     Args:
         function: of tensors ``[n, ...]``, to a tensor ``[n, ...]`` or a dataclass of such.
         parts: tensors ``[..., *]`` and their numbers of dimensions ``*``.
+        key: numbers ``[..., k]`` that tell different rows apart; the parts unless given.
     """
-    batch = broadcast_shapes(*(part.shape[: part.dim() - own] for part, own in parts))
-    flat = [
-        part.expand(*batch, *part.shape[part.dim() - own :]).reshape(
-            -1, *part.shape[part.dim() - own :]
-        )
-        for part, own in parts
-    ]
-    rows = torch.cat([as_whole_numbers(part).flatten(1) for part in flat], 1)
+    shapes = [part.shape[: part.dim() - own] for part, own in parts]
+    shape = broadcast_shapes(*shapes)
+    batch = shape or (1,)
+    key = key or [part.flatten(part.dim() - own) for part, own in parts]
+    numbers = [as_whole_numbers(part).expand(*batch, part.shape[-1]) for part in key]
+    rows = torch.cat(numbers, -1).flatten(0, -2)
     first, index = distinct_rows(rows)
     if len(first) == len(rows):  # in their order, so that all are rounded as without this
         first = index = torch.arange(len(rows), device=rows.device)
-    found = function(*(part[first] for part in flat))
+    place = torch.unravel_index(first, batch)
+    found = function(
+        *(
+            part.expand(*batch, *part.shape[len(own) :])[place]
+            for (part, _), own in zip(parts, shapes, strict=True)
+        )
+    )
 
     def spread(part: Tensor) -> Tensor:
-        return part[index].view(*batch, *part.shape[1:])
+        return part[index].view(*shape, *part.shape[1:])
 
     return spread(found) if isinstance(found, Tensor) else map_state(spread, found)
 

@@ -66,10 +66,11 @@ def nearest_in(boxes: Tensor, middles: Tensor) -> tuple[Tensor, Tensor]:
         middles: directions of sectors in radians ``[D]``.
 
     Returns:
-        Distances in metres ``[..., D]`` of the nearest point within each sector, infinite if there
-        is none in range, and indices ``[..., D]`` of the boxes that these points belong to.
+        Distances in metres ``[..., D]`` of the nearest point within each sector, at least
+        ``RANGE`` and possibly infinite if there is none in range, and indices ``[..., D]`` of the
+        boxes that these points belong to.
     """
-    # Remembered cars are few, and absent ones far away.
+    # Most cars of an estimated state are absent, which means far away.
     near = torch.hypot(boxes[..., 0], boxes[..., 1]) < RANGE + LENGTH
     distance = boxes.new_full((*near.shape, len(middles)), math.inf)
     distance[near] = distances(boxes[near], middles)

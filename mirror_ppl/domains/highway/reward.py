@@ -103,7 +103,7 @@ def proximities(state: HighwayState) -> tuple[Tensor, Tensor, Tensor]:
     """Return metres to the nearest car ahead, behind and anywhere, each ``[...]``.
 
     The first two are distances of the lidar's sectors, the last one the least of all sectors, but
-    without its range; they are infinite where there is no car.
+    without its range; they are possibly infinite beyond its range, and where there is no car.
     """
     boxes = seen_boxes(state)
     middles = torch.tensor([AHEAD, BACK], dtype=boxes.dtype, device=boxes.device) * SECTOR

@@ -7,7 +7,15 @@ import torch
 from highway_states import state_of
 
 from mirror_ppl.domains.highway.geometry import clearance, corners, overlap
-from mirror_ppl.domains.highway.lidar import RANGE, RESOLUTION, SECTOR, SECTORS, distances, scan
+from mirror_ppl.domains.highway.lidar import (
+    RANGE,
+    RESOLUTION,
+    SECTOR,
+    SECTORS,
+    distances,
+    nearest_in,
+    scan,
+)
 
 DEGREE = math.pi / 180
 HALF = RESOLUTION / 2 + 1e-9
@@ -89,6 +97,19 @@ def test_inside_a_box_everything_is_at_no_distance():
     boxes = torch.tensor([[1.0, 0.5, 0.3]])
     assert (distances(boxes, torch.arange(SECTORS) * SECTOR) == 0).all()
     assert clearance(boxes).item() == 0
+
+
+def test_cars_out_of_range_do_not_matter(generator):
+    spread = torch.tensor([400.0, 10.0, 0.6])
+    boxes = (torch.rand(200, 6, 3, generator=generator) - 0.5) * spread
+    middles = torch.arange(SECTORS) * SECTOR
+    least, which = nearest_in(boxes, middles)
+    every, index = distances(boxes, middles).min(-2)
+    hit = every < RANGE
+    assert 0 < hit.sum() < hit.numel()
+    torch.testing.assert_close(least[hit], every[hit], rtol=0, atol=0)
+    assert torch.equal(which[hit], index[hit])
+    assert (least[~hit] >= RANGE).all()
 
 
 def test_sectors_agree_with_points_along_the_sides(generator):
