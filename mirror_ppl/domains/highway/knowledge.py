@@ -154,7 +154,9 @@ def once_each(
     first, index = distinct_rows(rows)
     if len(first) == len(rows):  # in their order, so that all are rounded as without this
         first = index = torch.arange(len(rows), device=rows.device)
-    place = torch.unravel_index(first, batch)
+    place, rest = (), first
+    for size in reversed(batch):
+        place, rest = (rest % size, *place), rest // size
     found = function(
         *(
             part.expand(*batch, *part.shape[len(own) :])[place]
