@@ -65,9 +65,12 @@ def new_rows(calibration: Calibration) -> list[dict[str, str]]:
 
 
 def replaced(rows: Sequence[dict[str, str]], new: Sequence[dict[str, str]]) -> list[dict[str, str]]:
-    """Return rows with new ones in place of those of the same study, or at the end."""
+    """Return rows with new ones in place of those of the same study, or as their world's last."""
     studies = {key: list(own) for key, own in itertools.groupby(rows, _study)}
-    return [row for own in (studies | {_study(new[0]): list(new)}).values() for row in own]
+    studies[_study(new[0])] = list(new)
+    worlds = list(dict.fromkeys(world for world, *_ in studies))
+    order = sorted(studies, key=lambda study: worlds.index(study[0]))
+    return [row for study in order for row in studies[study]]
 
 
 def table(rows: Iterable[dict[str, str]]) -> str:

@@ -138,7 +138,7 @@ def test_bins_have_the_means_that_they_are_learned_from(value):
     assert float(mean) == pytest.approx(value, abs=0.01)
 
 
-def test_thresholds_count_how_far_away_values_are():
+def test_ranked_cross_entropy_counts_how_far_away_values_are():
     """By hand, of bins of width 2 around -8, -6, -4, -2, 0, 2, 4, 6, 8 and 10."""
     network = BinnedQNetwork(LATENT, ACTIONS, 16, bins=4, least=-2.0, most=4.0)
     assert network.centres.tolist() == list(range(-8, 11, 2))

@@ -256,7 +256,7 @@ def test_bins_cannot_be_learned_of_values_from_elsewhere():
         train_self_model(DRIVING, TINY, torch.Generator(), sizes=BINS, kind=Other)
 
 
-def test_thresholds_need_bins():
+def test_ranked_cross_entropy_needs_bins():
     options = replace(TINY, ranked_weight=1.0)
     with pytest.raises(InputError, match="ranked_weight must be 0, as driving's"):
         train_self_model(DRIVING, options, torch.Generator())

@@ -216,6 +216,10 @@ def test_rows_of_a_calibration_take_the_place_of_those_that_were_there(rng):
         line for line in lines if line.startswith("| bomb defusal, `mirror`, `importance`, 2 |")
     ]
     assert len(after) == len(before) - 39 + 3
+    first = [row | {"domain": "driving", "human_model": "other"} for row in new]
+    after = sbc.replaced(before, first)
+    last = max(n for n, row in enumerate(before) if row["domain"] == "driving")
+    assert after[last + 1 : last + 4] == first and after[: last + 1] == before[: last + 1]
     with pytest.raises(SystemExit, match="not of .* in labelled"):
         sbc.new_rows(Calibration(data.assign_attrs(setting="labelled")))
     del data.attrs["engine"]

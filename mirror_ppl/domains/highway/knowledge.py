@@ -76,7 +76,7 @@ def remember(
     """
     ego, visual, verbal = (observation[name] for name in ("ego", "visual", "verbal"))
     said = torch.where(heard, verbal[..., 0], float(NOTHING))
-    # Nobody can tell an empty sector from one that is out of sight.
+    # An empty sector is like one that is out of sight.
     seen = seen & (visual[..., 0] < RANGE)
     sight = once_each(
         _in_sight,
@@ -102,7 +102,7 @@ def _in_sight(ego: Tensor, visual: Tensor, seen: Tensor, said: Tensor) -> Cars:
 
 
 def _numbers(observation: Observation) -> Tensor:
-    """Return whole numbers ``[..., n]`` that tell observations ``[...]`` apart."""
+    """Return whole numbers ``[..., n]`` that differ between observations ``[...]``."""
     if isinstance(observation, RepeatedObservation):
         return observation.row[..., None]
     parts = observation["ego"], observation["visual"].flatten(-2), observation["verbal"].flatten(-2)
@@ -143,7 +143,7 @@ def once_each(
     Args:
         function: of tensors ``[n, ...]``, to a tensor ``[n, ...]`` or a dataclass of such.
         parts: tensors ``[..., *]`` and their numbers of dimensions ``*``.
-        key: numbers ``[..., k]`` that tell different rows apart; the parts unless given.
+        key: numbers ``[..., k]`` that differ between different rows; the parts unless given.
     """
     shapes = [part.shape[: part.dim() - own] for part, own in parts]
     shape = broadcast_shapes(*shapes)
