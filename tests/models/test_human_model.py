@@ -203,6 +203,28 @@ def test_numbers_of_views_are_equal_where_views_are(human, recordings):
             assert (changed.numbers() != numbers).all()
 
 
+def test_numbers_of_views_do_not_depend_on_how_many_items_are_taken(generator):
+    """One view has one number among views that take few items for granted, and among others."""
+    share = torch.tensor([0.1, 0.9]).repeat_interleave(50)[:, None]
+    taken = torch.rand(100, 6, generator=generator) < share
+    values = torch.rand(100, 6, 3, generator=generator)
+
+    def numbers(rows, imagined=values):
+        view = View({"visual": ~taken}, {"visual": taken}, {"visual": imagined})
+        return view.map(lambda part: part[rows]).numbers()
+
+    few, many = range(50), range(50, 100)
+    assert torch.equal(numbers(range(100)), torch.cat([numbers(few), numbers(many)]))
+    # The last row among few, and the first among many.
+    assert torch.equal(numbers([*few, 99])[-1:], numbers([99]))
+    assert torch.equal(numbers([0, *many])[:1], numbers([0]))
+    for rows in (few, many):
+        for feature in range(3):
+            other = values.clone()
+            other[:, 2, feature] += 0.5
+            assert torch.equal(numbers(rows, other) != numbers(rows), taken[rows, 2])
+
+
 def test_steps_by_hand_are_those_of_the_round(human, recordings):
     implants = {site: torch.randint(len(BINS), (7,)) for site in SIGHTS}
     implants |= {site: torch.randint(2, (7,)) for site in ASSUMED}

@@ -1,11 +1,13 @@
 """What people know of cars on the highway: in the human model as in simulated drivers."""
 
+from dataclasses import fields
+
 import pytest
 import torch
 from highway_states import state_of
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.domains.base import by_eye
+from mirror_ppl.domains.base import RepeatedObservation, by_eye
 from mirror_ppl.domains.highway import Highway, expert
 from mirror_ppl.domains.highway.knowledge import REMEMBERED, imagined, once_each
 from mirror_ppl.domains.highway.lidar import RANGE
@@ -68,6 +70,43 @@ def test_people_in_the_model_remember_as_simulated_drivers_do(monkeypatch):
             assert torch.equal(ours, theirs)
         some += int((memory.age[memory.there] > 0).sum())
     assert some > 10  # cars that are remembered
+
+
+@pytest.mark.parametrize(("rounds", "repeated"), [(1, False), (3, True), (3, False)])
+def test_people_know_what_they_would_know_in_a_round_alone(rounds, repeated):
+    """Of rounds that many people see: each as if it were observed once, and by them alone."""
+    recordings = load_demonstrations(asset_path("highway_fog_diverse.nc")).select_people([0])
+    every = {name: value[0, [0] * rounds] for name, value in recordings.observation().items()}
+    # The same sectors see cars in every round, each round's a little nearer than the one's before.
+    distance = every["visual"][..., 0]
+    nearer = 0.5 * torch.arange(rounds).view(-1, 1, 1)
+    every["visual"][..., 0] = torch.where(distance < RANGE, distance - nearer, distance)
+    row = torch.arange(rounds).repeat(2)
+    reach = torch.tensor([10.0, 45.0]).repeat_interleave(rounds)
+
+    def seen_by(people):
+        return lambda now: by_eye(WORLD, now["visual"][..., 0] <= reach[people, None])
+
+    everybody = torch.arange(len(row))
+    together = WORLD.nothing_known(len(row))
+    alone = [WORLD.nothing_known(1) for _ in everybody]
+    for step in range(12):
+        now = at_step(every, step)
+        if repeated:
+            now = RepeatedObservation(now, row)
+        elif rounds > 1:
+            now = {name: value[row] for name, value in now.items()}
+        told = {name: mask[:1] for name, mask in nobody_speaks(now).items()}
+        sees = seen_by(everybody)
+        together = WORLD.learn(together, now, {**told, **sees(now)}, sees)
+        for one in everybody.tolist():
+            own, sees = at_step(every, step), seen_by([one])
+            own = {name: value[row[one], None] for name, value in own.items()}
+            alone[one] = WORLD.learn(alone[one], own, {**told, **sees(own)}, sees)
+            for field in fields(together):
+                many, single = (getattr(each, field.name) for each in (together, alone[one]))
+                assert torch.equal(many.expand(len(row), -1)[one], single[0])
+    assert len({tuple(x.tolist()) for x in together.x}) > rounds
 
 
 def test_what_is_imagined_is_what_the_lidar_would_see_of_remembered_cars():
