@@ -1,11 +1,11 @@
-"""How well the expert drives on the highway, beside random actions and beside doing nothing.
+"""How well the expert and the robot drive on the highway, beside random actions and nothing.
 
     python -m benchmarks.highway
 
 Rounds of manoeuvres, as people drive; rounds of steering and acceleration, in the batched physics
 and in the Gymnasium environment on highway-env; all from the same starts. Doing nothing is to keep
-the lane at full speed, or no steering and no pedal. No driver depends on what can be seen, so that
-there is one row for both settings.
+the lane at full speed, or no steering and no pedal. The robot drives by the shipped self-model, in
+clear weather or with everything said, too; the others do not depend on what can be seen.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import DirectHighway, Highway, HighwayState, expert
 from mirror_ppl.domains.highway.manoeuvres import SPEEDS
 from mirror_ppl.domains.highway.pictures import picture
+from mirror_ppl.evaluation.self_model import fixed_views
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.training.experience import drive
 
 Driver = Callable[[HighwayState], Tensor]
 """Maps states to actions."""
@@ -40,6 +43,8 @@ class Options:
     """Seed of the rounds."""
     horizon: int = expert.ExpertOptions.horizon
     """Decisions that the expert looks ahead."""
+    drivers: tuple[str, ...] = ()
+    """Who drives: all unless given."""
     environment: bool = True
     """Whether to play the environment on highway-env too."""
     out: Path | None = None
@@ -89,6 +94,8 @@ def main(options: Options) -> None:
             len(Highway.actions), state.tick.shape, generator=noise
         ),
     }
+    for name, speech in (("robot", False), ("robot+said", True)):
+        manoeuvres[name] = robot(start, speech, torch.Generator().manual_seed(options.seed + 2))
     simulators: dict[str, tuple[Highway, Play, dict[str, Driver]]] = {
         "manoeuvres": (Highway(), play_batched, manoeuvres),
         "direct": (DirectHighway(), play_batched, direct),
@@ -96,13 +103,15 @@ def main(options: Options) -> None:
     if options.environment:
         simulators["highway-env"] = DirectHighway(), play_environment, direct
     rows = []
-    print(f"{'simulator':<12} {'driver':<8} {'return':>8} {'s.e.':>6} {'accidents':>9} {'s':>6}")
+    print(f"{'simulator':<12} {'driver':<10} {'return':>8} {'s.e.':>6} {'accidents':>9} {'s':>6}")
     for simulator, (world, play, drivers) in simulators.items():
         for name, driver in drivers.items():
+            if options.drivers and name not in options.drivers:
+                continue
             played = play(world, start, driver)
             error = played.total.std() / options.rounds**0.5
             print(
-                f"{simulator:<12} {name:<8} {played.total.mean():>8.1f} {error:>6.1f} "
+                f"{simulator:<12} {name:<10} {played.total.mean():>8.1f} {error:>6.1f} "
                 f"{played.accident.double().mean():>9.0%} {played.seconds:>6.0f}",
                 flush=True,
             )
@@ -112,6 +121,16 @@ def main(options: Options) -> None:
             writer = csv.DictWriter(file, list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
+
+
+def robot(start: HighwayState, speech: bool, generator: torch.Generator) -> Driver:
+    """Return the shipped self-model as a driver of rounds from these starts, step by step."""
+    self_model, _ = load_self_model(shipped_weights("highway"))
+    world, batch = self_model.domain, len(start.tick)
+    views = fixed_views(world, batch, generator, speech=speech)
+    actions = drive(self_model, start, views, world.horizon, generator).unbind(1)
+    steps = iter(actions)
+    return lambda state: next(steps)
 
 
 def play_batched(world: Highway, start: HighwayState, driver: Driver) -> Played:

@@ -233,3 +233,17 @@ def test_quality_of_the_self_model_is_that_of_the_card():
     assert shown == {
         name: pytest.approx(value, abs=6e-4) for name, value in card["quality"].items()
     }
+
+
+def test_quality_of_the_highway_s_self_model_is_that_of_the_card():
+    _, card = load_self_model(shipped_weights("highway"))
+    rows = table_of(page("docs/highway.md"), "View")
+    quality, views = card["quality"], ("full", "clear", "fog", "ahead only")
+    assert [row[1:] for row in rows] == [
+        [
+            f"{quality[f'return_{view}']:.1f}",
+            f"{quality[f'share_{view}']:.1%}",
+            f"{quality[f'agreement_{view}']:.1%}" if f"agreement_{view}" in quality else "",
+        ]
+        for view in views
+    ]
