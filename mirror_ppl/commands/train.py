@@ -14,8 +14,8 @@ LEAST_PEOPLE = 10
 PROGRAM = "python -m mirror_ppl.train"
 DESCRIPTION = """Train the robot's self-model from nothing, or a guide that infers people at once,
 measure it, and write its weights and a card with settings and quality. A self-model is measured
-against the exact planner; it takes about ten minutes in driving and half an hour in search_rescue
-and bomb_defusal. A guide learns from people who are drawn from the human model's prior; it takes
+against the exact planner; it takes about ten minutes in driving, half an hour in search_rescue and
+bomb_defusal, and more than an hour in highway. A guide learns from people who are drawn from the human model's prior; it takes
 about half an hour. The same command resumes a stopped run."""
 EXAMPLES = {
     "the self-model that ships, from nothing": (
@@ -51,10 +51,10 @@ class Options:
     one, of driving 40, of search_rescue 400, of bomb_defusal 200 and of highway 12."""
     steps: int | None = None
     """Of a self-model: gradient steps of a phase. Default: of driving 300,
-    of search_rescue 40, of bomb_defusal 30, of highway 1000."""
+    of search_rescue 40, of bomb_defusal 30, of highway 2500."""
     learning_rate: float | None = None
     """Of a self-model: learning rate at the start; it falls to a hundredth. Default: of driving
-    and highway 0.001, of the others 0.002."""
+    0.001, of search_rescue 0.002, of bomb_defusal 0.002, of highway 0.001."""
     speech: str = "words"
     """Of a self-model: what makes numbers of utterances, words or gpt2 (the supplement's; needs the
     extra "speech" and its weights)."""

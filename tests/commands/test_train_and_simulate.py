@@ -1,7 +1,10 @@
 """`python -m mirror_ppl.train` and `simulate`: what they write can be used."""
 
 import functools
+import inspect
+import re
 
+import pytest
 from example_fits import RADIUS, RESULTS_OF_RADIUS, content
 from running import command
 
@@ -9,6 +12,7 @@ from mirror_ppl.commands import fit, simulate, train
 from mirror_ppl.data import load_demonstrations
 from mirror_ppl.evaluation import self_model as evaluation
 from mirror_ppl.models.weights import load_self_model
+from mirror_ppl.training.self_model_options import SelfModelOptions
 
 
 def test_train_writes_weights_with_a_card(tmp_path, monkeypatch, capsys):
@@ -27,6 +31,15 @@ def test_train_writes_weights_with_a_card(tmp_path, monkeypatch, capsys):
     assert f"{card['quality']['share_clear']:.3f}" in trained
     assert command(train, "--card", path) == 0
     assert capsys.readouterr().out in trained
+
+
+@pytest.mark.parametrize("name", ["phases", "steps", "learning_rate"])
+def test_the_help_has_the_defaults_of_each_world(name):
+    source = inspect.getsource(train.Options)
+    text = " ".join(re.search(rf'    {name}: .*?"""(.*?)"""', source, re.DOTALL)[1].split())
+    shown = dict(re.findall(r"of (\w+) (\d[\d.]*\d)", text))
+    worlds = ("driving", "search_rescue", "bomb_defusal", "highway")
+    assert shown == {world: f"{getattr(SelfModelOptions.of(world), name):g}" for world in worlds}
 
 
 def test_simulate_writes_recordings_that_can_be_fitted(tmp_path, capsys):
