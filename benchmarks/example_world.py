@@ -21,8 +21,8 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks._assist_rows import rows_of
 from benchmarks._rows import rows_in
-from benchmarks.highway_messages import rows_of
 
 RESULTS = Path(__file__).parents[1] / "docs/results"
 IMPLANTS, MESSAGES = RESULTS / "obstacles_implants.csv", RESULTS / "obstacles_messages.csv"

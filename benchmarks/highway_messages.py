@@ -1,64 +1,85 @@
-r"""What messages are worth to highway drivers: the table of docs/highway.md.
+r"""What messages are worth to highway drivers: the tables of docs/highway.md.
 
-    python -m mirror_ppl.fit --domain highway --setting fog --population diverse \
-        --train-rounds 20 --explore 0 --out runs/highway_0
-    python -m mirror_ppl.assist --posterior runs/highway_0/posterior.nc --rounds 8 \
-        --communicator none all nearest mirror oracle --json runs/highway_assist.json
-    python -m benchmarks.highway_messages runs/highway_assist.json
+    python -m mirror_ppl.evaluate assistance --domain highway --setting fog --population diverse \
+        --people 10 --seeds 1 --rounds 0 20 --played 8 \
+        --models mirror bc sqil none all nearest oracle --out runs/fog
+    python -m mirror_ppl.evaluate assistance --domain highway --setting clear \
+        --population diverse --people 10 --seeds 1 --rounds 20 --played 8 \
+        --models mirror none all nearest oracle --out runs/clear
+    python -m benchmarks.highway_messages runs/fog/assistance.csv runs/clear/assistance.csv
 
-The last command writes a row for each communicator to docs/results/highway_messages.csv. Without a
-file it prints the table of the rows that are there.
+The last command writes the rows of these studies to docs/results/highway_assistance.csv. Without
+files it prints the tables of the rows that are there.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks._assist_rows import rows_of
-from benchmarks._rows import rows_in
+import numpy as np
 
-ROWS = Path(__file__).parents[1] / "docs/results/highway_messages.csv"
-NAMES = {"none": "silence", "all": "everything", "nearest": "nearest hidden car"}
+from benchmarks._rows import rows_in
+from benchmarks.tables import rows_of
+from mirror_ppl.evaluation.assistance import REFERENCES
+from mirror_ppl.evaluation.study_summary import NONE, ORACLE, interval, ways_to_oracle
+from mirror_ppl.evaluation.tables import Rows
+
+ROWS = Path(__file__).parents[1] / "docs/results/highway_assistance.csv"
+PLAYED = 8
+"""Rounds of each driver."""
+NAMES = {NONE: "silence", "all": "everything", "nearest": "nearest hidden car", ORACLE: "oracle"}
 """Names of communicators in the table, where they are words."""
 
 
-def table(rows: Sequence[dict[str, str]]) -> str:
-    """Return the table of the page."""
-    lines = [
-        "| Communicator | Net return a round | Above silence | % of the way to the oracle | "
-        "Rounds with an accident | Groups shown, sentences said a decision |",
-        "|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        name, own = row["communicator"], {k: v for k, v in row.items() if k != "communicator"}
-        number = {key: float(value) for key, value in own.items() if value}
-        label = NAMES.get(name, "oracle" if name == "oracle" else f"`{name}`")
-        accidents = round(number["mishaps"] * number["people"] * number["rounds"])
-        ways = ("way_to_oracle_mean", "way_to_oracle_low", "way_to_oracle_high")
-        way = "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * number[key] for key in ways))
-        gain = "{:.1f} [{:.1f}, {:.1f}]".format(
-            *(number[f"over_none_{part}"] for part in ("mean", "low", "high"))
+def table(rows: Rows, setting: str) -> str:
+    """Return the table of a setting, by net return."""
+    here = [row for row in rows if row["setting"] == setting]
+    ways = {(way.model, way.rounds): way.share for way in ways_to_oracle(here)}
+    lines = []
+    for (name, rounds), way in ways.items():
+        own, silent = (
+            [row for row in here if (row["model"], row["rounds"]) == key]
+            for key in ((name, rounds), (NONE, 0))
         )
-        none = name == "none"
-        lines.append(
-            f"| {label} | {number['net']:.1f} ± {number['net_se']:.1f} | {'' if none else gain} | "
-            f"{'' if none or name == 'oracle' else way} | "
-            f"{accidents} of {number['people'] * number['rounds']:.0f} | "
-            f"{number['visual']:.2f}, {number['verbal']:.2f} |"
-        )
-    return "\n".join(lines)
+        net, cost = (np.array([row[key] for row in own]) for key in ("net", "cost"))
+        above = interval(net - np.array([row["net"] for row in silent]))
+        gain = f"{above.mean:.1f} [{above.low:.1f}, {above.high:.1f}]"
+        share = ""
+        if way is not None and name not in (NONE, ORACLE):
+            share = f"{100 * way.mean:.0f} [{100 * way.low:.0f}, {100 * way.high:.0f}]"
+        played = PLAYED * len(own)
+        accidents = round(sum(row["mishaps"] for row in own) * PLAYED)
+        shown, said = (sum(row[f"items_{m}"] for row in own) / played for m in ("visual", "verbal"))
+        cells = [
+            NAMES.get(name, f"`{name}`"),
+            "" if name in REFERENCES else f"{rounds}",
+            f"{net.mean():.1f} ± {net.std(ddof=1) / len(net) ** 0.5:.1f}",
+            "" if name == NONE else gain,
+            share,
+            f"{accidents} of {played}",
+            f"{shown:.1f}, {said:.1f}",
+            f"{cost.mean():.1f}",
+        ]
+        lines.append((net.mean(), f"| {' | '.join(cells)} |"))
+    heads = (
+        "| Communicator | Rounds learned from | Net return a round | Above silence | "
+        "% of the way to the oracle | Rounds with an accident | "
+        "Groups shown, sentences said a round | Cost a round |"
+    )
+    return "\n".join([heads, "|---" * 8 + "|", *(line for _, line in sorted(lines))])
 
 
 def main() -> None:
-    """Write the rows of a run, if one is given, and print their table."""
+    """Write the rows of studies, if some are given, and print their tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("file", nargs="?", type=Path, help="what `assist --json` wrote")
-    given = parser.parse_args().file
-    print(table(rows_in(ROWS, rows_of(given) if given else ())))
+    parser.add_argument("files", nargs="*", type=Path, help="rows that `evaluate` wrote")
+    rows_in(ROWS, [row for path in parser.parse_args().files for row in rows_in(path)])
+    rows = rows_of(ROWS)
+    for setting in dict.fromkeys(row["setting"] for row in rows):
+        print(f"{setting}\n{table(rows, setting)}\n")
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ PROGRAM = "python -m mirror_ppl.train"
 DESCRIPTION = """Train the robot's self-model from nothing, or a guide that infers people at once,
 measure it, and write its weights and a card with settings and quality. A self-model is measured
 against the exact planner; it takes about ten minutes in driving, half an hour in search_rescue and
-bomb_defusal, and more than an hour in highway. A guide learns from people who are drawn from the human model's prior; it takes
-about half an hour. The same command resumes a stopped run."""
+bomb_defusal, and more than an hour in highway. A guide learns from people who are drawn from the
+human model's prior; it takes about half an hour. The same command resumes a stopped run."""
 EXAMPLES = {
     "the self-model that ships, from nothing": (
         "--domain driving --out runs/driving_self_model.safetensors"

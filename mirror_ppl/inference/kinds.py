@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.inference.engine import Inferred, Job
+from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.prior import draw_prior, sample_sites
@@ -29,7 +30,7 @@ from mirror_ppl.progress import Report
 from mirror_ppl.randomness import forked
 
 LITTLE = 0.01
-"""Posterior probability of a kind below which its Pareto k is ignored."""
+"""Posterior probability of a kind below which its Pareto k and combinations are ignored."""
 
 
 def models_by_kind(human: HumanModel) -> dict[str, HumanModel]:
@@ -92,7 +93,25 @@ def infer_kinds(
         weights.masked_fill(shares < LITTLE, -torch.inf).amax(-1),
         log_joint.logsumexp(-1),
         (shares * errors).square().sum(-1).sqrt(),
+        _combinations(job.human, models, found, shares),
         engines=found[0].engines,
+    )
+
+
+def _combinations(
+    human: HumanModel, models: dict[str, HumanModel], found: list[Inferred], shares: Tensor
+) -> tuple[Tensor, ...]:
+    """Probable combinations of each person under their probable kinds.
+
+    Empty where the models' combinations are not of the same sites as those of the whole program.
+    """
+    sites = list(perceived_sites(human))
+    alike = all(list(perceived_sites(model)) == sites for model in models.values())
+    if not (alike and all(one.combinations for one in found)):
+        return ()
+    return tuple(
+        torch.cat([found[kind].combinations[person] for kind in kinds.nonzero().flatten()]).unique()
+        for person, kinds in enumerate(shares >= LITTLE)
     )
 
 

@@ -9,7 +9,9 @@ from few_reaches import robot_of_few_reaches
 from mirror_ppl.inference import importance
 from mirror_ppl.inference.engine import Job
 from mirror_ppl.inference.kinds import models_by_kind
+from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import KIND, LATE, AnyKind, Late
 from mirror_ppl.models.loading import load_human_model
@@ -53,6 +55,19 @@ def test_kinds_are_weighed_by_evidence_and_implants_are_those_of_each(job):
         # the standard deviation .163.
         others = found.draws[LATE][kinds != 1, person]
         assert abs(float(others.mean()) - 0.8) < 4 * 0.163 / len(others) ** 0.5
+
+
+def test_what_is_probable_of_a_probable_kind_is_probable(job):
+    found = importance.infer_by_importance(job)
+    sizes = {site: len(support) for site, support in perceived_sites(job.human).items()}
+    assert len(found.combinations) == job.rounds.num_people
+    for person, probable in enumerate(found.combinations):
+        drawn = combination_number({site: found.draws[site][:, person, 0] for site in sizes}, sizes)
+        kinds = found.draws[KIND][:, person].flatten()
+        often = torch.bincount(kinds, minlength=5) / len(kinds)
+        # Systematic draws: a kind whose share is 2% has a probability above 1%.
+        assert torch.isin(drawn[often[kinds] >= 0.02], probable).all()
+        assert probable.tolist() == sorted({*probable.tolist()})
 
 
 def test_each_kind_is_its_model_with_what_was_learned_of_the_world():
