@@ -4,7 +4,7 @@
 
 Reads ``docs/results/<world>_prediction.csv`` and ``..._assistance.csv``, rows that `python -m
 mirror_ppl.evaluate` wrote, and writes the page and the picture of each (and of relevance, which is
-in the rows of assistance), and the tables in docs/results.md between the lines
+in the rows of assistance, where not all items are relevant), and the tables in docs/results.md between the lines
 ``<!-- <world> <study> -->`` and ``<!-- end -->``. The same rows give the same pages.
 """
 
@@ -32,6 +32,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 RESULTS = DOCS / "results"
 WORDS, WHOLE = ("domain", "setting", "population", "person", "model"), ("seed", "rounds")
 """Columns that are no numbers, and that are whole ones."""
+EVERYTHING = "anything"
+"""Notion of relevance of worlds in which all items are relevant, so that there is no page of it."""
 TITLES = {"search_rescue": "Search and rescue"}
 """Worlds whose title is more than their name."""
 BLOCK = re.compile(r"<!-- (\w+) (\w+) -->\n.*?<!-- end -->", re.DOTALL)
@@ -61,6 +63,8 @@ def studies() -> dict[str, Rows]:
         found[path.stem] = rows_of(path)
     for path in sorted(RESULTS.glob("*_assistance.csv")):
         rows = found[path.stem] = rows_of(path)
+        if any(name.startswith(f"{EVERYTHING}_") for name in rows[0]):
+            continue
         most = max(row["rounds"] for row in rows)
         last = [row for row in rows if row["rounds"] == most or row["model"] in REFERENCES]
         found[path.stem.replace("assistance", "relevance")] = last

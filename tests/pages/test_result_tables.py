@@ -17,7 +17,8 @@ from benchmarks import (
 from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
-from benchmarks.tables import DOCS, RESULTS, results_page, studies, study_page
+from benchmarks.tables import DOCS, RESULTS, results_page, rows_of, studies, study_page
+from mirror_ppl.evaluation.study_summary import interval
 from mirror_ppl.inference.calibration.ranks import Calibration
 
 STUDIES = studies()
@@ -64,17 +65,20 @@ def test_the_table_of_planner_settings_is_what_its_rows_say():
 
 def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
     page = (DOCS / "highway.md").read_text()
-    rows = rows_in(highway_messages.ROWS)
-    found = page.partition("<!-- messages -->\n")[2].partition("\n<!-- end -->")[0]
-    assert found == highway_messages.table(rows)
-    mirror = next(row for row in rows if row["communicator"] == "mirror")
-    silent = next(row for row in rows if row["communicator"] == "none")
+    rows = rows_of(highway_messages.ROWS)
+    for setting in ("fog", "clear"):
+        found = page.partition(f"<!-- messages in {setting} -->\n")[2].partition("\n<!-- end -->")[0]
+        assert found == highway_messages.table(rows, setting)
     words = " ".join(page.split())
-    assert f"worth {float(mirror['over_none_mean']):.1f} a round" in words
-    assert f"only {100 * float(mirror['way_to_oracle_mean']):.0f}% of the way" in words
-    rounds = int(silent["people"]) * int(silent["rounds"])
-    assert rounds == 80 and round(float(silent["mishaps"]) * rounds) == 1
-    assert "Of 80 rounds in silence one ended in an accident" in words
+    for setting, start in (("fog", "In fog"), ("clear", "in clear weather")):
+        here = [row for row in rows if row["setting"] == setting]
+        net = {
+            key: np.array([row["net"] for row in here if (row["model"], row["rounds"]) == key])
+            for key in (("mirror", 20), ("none", 0))
+        }
+        gain = interval(net["mirror", 20] - net["none", 0])
+        shown = f"{gain.mean:.1f} [{gain.low:.1f}, {gain.high:.1f}]"
+        assert f"{start} messages of `mirror` are worth {shown} a round" in words
 
 
 def test_the_table_of_what_messages_to_drivers_lose_is_what_its_rows_say():
