@@ -4,8 +4,9 @@
 
 Reads ``docs/results/<world>_prediction.csv`` and ``..._assistance.csv``, rows that `python -m
 mirror_ppl.evaluate` wrote, and writes the page and the picture of each (and of relevance, which is
-in the rows of assistance, where not all items are relevant), and the tables in docs/results.md between the lines
-``<!-- <world> <study> -->`` and ``<!-- end -->``. The same rows give the same pages.
+in the rows of assistance, where not all items are relevant), and the tables in docs/results.md
+between the lines ``<!-- <world> <study> -->`` and ``<!-- end -->``. The same rows give the same
+pages.
 """
 
 from __future__ import annotations

@@ -67,7 +67,8 @@ def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
     page = (DOCS / "highway.md").read_text()
     rows = rows_of(highway_messages.ROWS)
     for setting in ("fog", "clear"):
-        found = page.partition(f"<!-- messages in {setting} -->\n")[2].partition("\n<!-- end -->")[0]
+        after = page.partition(f"<!-- messages in {setting} -->\n")[2]
+        found = after.partition("\n<!-- end -->")[0]
         assert found == highway_messages.table(rows, setting)
     words = " ".join(page.split())
     for setting, start in (("fog", "In fog"), ("clear", "in clear weather")):
