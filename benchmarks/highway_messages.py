@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks._rows import rows_in
 from benchmarks.tables import rows_of
 from mirror_ppl.evaluation.assistance import REFERENCES
-from mirror_ppl.evaluation.study_summary import NONE, ORACLE, interval, ways_to_oracle
+from mirror_ppl.evaluation.study_summary import FIRST, NONE, ORACLE, interval, ways_to_oracle
 from mirror_ppl.evaluation.tables import Rows
 
 ROWS = Path(__file__).parents[1] / "docs/results/highway_assistance.csv"
@@ -70,6 +70,31 @@ def table(rows: Rows, setting: str) -> str:
     return "\n".join([heads, "|---" * 8 + "|", *(line for _, line in sorted(lines))])
 
 
+def advantages(rows: Rows) -> str:
+    """Return the table of what ``mirror`` with the most rounds has ahead of the others."""
+    settings = list(dict.fromkeys(row["setting"] for row in rows))
+    net: dict[tuple[str, str, int], list[float]] = {}
+    for row in rows:
+        net.setdefault((row["setting"], row["model"], row["rounds"]), []).append(row["net"])
+    most = max(rounds for _, _, rounds in net)
+    lines = []
+    for name, rounds in dict.fromkeys((name, rounds) for _, name, rounds in net):
+        if (name, rounds) in ((FIRST, most), (ORACLE, 0)):
+            continue
+        cells = []
+        for setting in settings:
+            other = net.get((setting, name, rounds))
+            if other is None:
+                cells.append("")
+                continue
+            ahead = interval(np.array(net[setting, FIRST, most]) - np.array(other))
+            cells.append(f"{ahead.mean:.1f} [{ahead.low:.1f}, {ahead.high:.1f}]")
+        learned = "" if name in REFERENCES else f", {rounds or 'no'} rounds"
+        lines.append(f"| {NAMES.get(name, f'`{name}`')}{learned} | {' | '.join(cells)} |")
+    heads = f"| `{FIRST}`, {most} rounds, ahead of | {' | '.join(settings)} |"
+    return "\n".join([heads, "|---" * (1 + len(settings)) + "|", *lines])
+
+
 def main() -> None:
     """Write the rows of studies, if some are given, and print their tables."""
     parser = argparse.ArgumentParser(
@@ -80,6 +105,7 @@ def main() -> None:
     rows = rows_of(ROWS)
     for setting in dict.fromkeys(row["setting"] for row in rows):
         print(f"{setting}\n{table(rows, setting)}\n")
+    print(advantages(rows))
 
 
 if __name__ == "__main__":

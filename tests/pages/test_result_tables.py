@@ -70,6 +70,8 @@ def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
         after = page.partition(f"<!-- messages in {setting} -->\n")[2]
         found = after.partition("\n<!-- end -->")[0]
         assert found == highway_messages.table(rows, setting)
+    found = page.partition("<!-- advantages -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == highway_messages.advantages(rows)
     words = " ".join(page.split())
     for setting, start in (("fog", "In fog"), ("clear", "in clear weather")):
         here = [row for row in rows if row["setting"] == setting]
