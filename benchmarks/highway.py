@@ -4,8 +4,8 @@
 
 Rounds of manoeuvres, as people drive; rounds of steering and acceleration, in the batched physics
 and in the Gymnasium environment on highway-env; all from the same starts. Doing nothing is to keep
-the lane at full speed, or no steering and no pedal. The robot drives by the shipped self-model, in
-clear weather or with everything said, too; the others do not depend on what can be seen.
+the lane at full speed, or no steering and no pedal. The robot drives by the shipped self-model,
+with everything shown or shown and said; the others do not depend on what can be seen.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from mirror_ppl.training.experience import drive
 
 Driver = Callable[[HighwayState], Tensor]
 """Maps states to actions."""
+Who = Literal["expert", "nothing", "random", "robot", "robot+said"]
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Options:
     """Seed of the rounds."""
     horizon: int = expert.ExpertOptions.horizon
     """Decisions that the expert looks ahead."""
-    drivers: tuple[str, ...] = ()
+    drivers: tuple[Who, ...] = ()
     """Who drives: all unless given."""
     environment: bool = True
     """Whether to play the environment on highway-env too."""
@@ -95,7 +97,9 @@ def main(options: Options) -> None:
         ),
     }
     for name, speech in (("robot", False), ("robot+said", True)):
-        manoeuvres[name] = robot(start, speech, torch.Generator().manual_seed(options.seed + 2))
+        if name in (options.drivers or (name,)):
+            views = torch.Generator().manual_seed(options.seed + 2)
+            manoeuvres[name] = robot(start, speech, views)
     simulators: dict[str, tuple[Highway, Play, dict[str, Driver]]] = {
         "manoeuvres": (Highway(), play_batched, manoeuvres),
         "direct": (DirectHighway(), play_batched, direct),

@@ -15,7 +15,9 @@ files it prints the tables of the rows that are there.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,14 +29,19 @@ from mirror_ppl.evaluation.tables import Rows
 
 ROWS = Path(__file__).parents[1] / "docs/results/highway_assistance.csv"
 PLAYED = 8
-"""Rounds of each driver."""
+"""Rounds of each driver, as in the commands above."""
 NAMES = {NONE: "silence", "all": "everything", "nearest": "nearest hidden car", ORACLE: "oracle"}
 """Names of communicators in the table, where they are words."""
 
 
+def by_driver(rows: Iterable[dict[str, Any]]) -> Rows:
+    """Return the rows in the order of drivers, so that those of two communicators pair."""
+    return sorted(rows, key=lambda row: (row["seed"], row["person"]))
+
+
 def table(rows: Rows, setting: str) -> str:
     """Return the table of a setting, by net return."""
-    here = [row for row in rows if row["setting"] == setting]
+    here = by_driver(row for row in rows if row["setting"] == setting)
     ways = {(way.model, way.rounds): way.share for way in ways_to_oracle(here)}
     lines = []
     for (name, rounds), way in ways.items():
@@ -74,7 +81,7 @@ def advantages(rows: Rows) -> str:
     """Return the table of what ``mirror`` with the most rounds has ahead of the others."""
     settings = list(dict.fromkeys(row["setting"] for row in rows))
     net: dict[tuple[str, str, int], list[float]] = {}
-    for row in rows:
+    for row in by_driver(rows):
         net.setdefault((row["setting"], row["model"], row["rounds"]), []).append(row["net"])
     most = max(rounds for _, _, rounds in net)
     lines = []

@@ -39,6 +39,7 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
             "person": person["id"],
             "rounds": person["rounds"],
             "verdict": check["verdict"],
+            "reasons": "; ".join(check["reasons"]),
             "pareto_k": f"{person['pareto_k']:.2f}",
             "assumes_clear": implants["assumes_clear"]["median"],
             "nll": f"{person['test']['nll']:.4f}",

@@ -103,10 +103,13 @@ def _combinations(
 ) -> tuple[Tensor, ...]:
     """Probable combinations of each person under their probable kinds.
 
-    Empty where the models' combinations are not of the same sites as those of the whole program.
+    Empty where the models' combinations are not of the same values as those of the whole program.
     """
-    sites = list(perceived_sites(human))
-    alike = all(list(perceived_sites(model)) == sites for model in models.values())
+    first, *others = (
+        [(site, len(support)) for site, support in perceived_sites(model).items()]
+        for model in (human, *models.values())
+    )
+    alike = all(other == first for other in others)
     if not (alike and all(one.combinations for one in found)):
         return ()
     return tuple(

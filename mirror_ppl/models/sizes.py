@@ -25,7 +25,7 @@ class Sizes:
         q_network: of ``Q(z_t, a_t)``.
         value_bins: bins of values over which the Q-network has a distribution, at least 2; at 0 it
             has values alone.
-        least_value: centre of the first of these bins; no return should be less.
+        least_value: centre of the first of these bins; no value that is learned should be less.
         most_value: centre of the last one.
         image: of the layers between a convolution and the features, and of those before an image
             decoder's deconvolution.

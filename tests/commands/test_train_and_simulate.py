@@ -37,7 +37,7 @@ def test_train_writes_weights_with_a_card(tmp_path, monkeypatch, capsys):
 def test_the_help_has_the_defaults_of_each_world(name):
     source = inspect.getsource(train.Options)
     text = " ".join(re.search(rf'    {name}: .*?"""(.*?)"""', source, re.DOTALL)[1].split())
-    shown = dict(re.findall(r"of (\w+) (\d[\d.]*\d)", text))
+    shown = dict(re.findall(r"of (\w+) (\d+(?:\.\d+)?)", text))
     worlds = ("driving", "search_rescue", "bomb_defusal", "highway")
     assert shown == {world: f"{getattr(SelfModelOptions.of(world), name):g}" for world in worlds}
 

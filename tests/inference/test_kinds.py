@@ -7,8 +7,8 @@ import torch
 from few_reaches import robot_of_few_reaches
 
 from mirror_ppl.inference import importance
-from mirror_ppl.inference.engine import Job
-from mirror_ppl.inference.kinds import models_by_kind
+from mirror_ppl.inference.engine import Inferred, Job
+from mirror_ppl.inference.kinds import _combinations, models_by_kind
 from mirror_ppl.likelihood.combinations import perceived_sites
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.view_table import combination_number
@@ -16,6 +16,7 @@ from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import KIND, LATE, AnyKind, Late
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.simulation import simulate_from_prior
+from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
@@ -68,6 +69,15 @@ def test_what_is_probable_of_a_probable_kind_is_probable(job):
         # Systematic draws: a kind whose share is 2% has a probability above 1%.
         assert torch.isin(drawn[often[kinds] >= 0.02], probable).all()
         assert probable.tolist() == sorted({*probable.tolist()})
+
+
+def test_combinations_of_other_sites_are_not_kept(job):
+    shares, found = torch.ones(1, 1), [Inferred({}, combinations=(torch.arange(3),))]
+    alike = {"late": Late(job.human.self_model)}
+    assert [one.tolist() for one in _combinations(job.human, alike, found, shares)] == [[0, 1, 2]]
+    assert _combinations(job.human, alike, [Inferred({})], shares) == ()
+    other = {"one-radius": VARIANTS["one-radius"](job.human.self_model)}
+    assert _combinations(job.human, other, found, shares) == ()
 
 
 def test_each_kind_is_its_model_with_what_was_learned_of_the_world():

@@ -34,6 +34,7 @@ def test_tables_of_the_page_of_results_are_what_their_rows_say():
     page = (DOCS / "results.md").read_text()
     assert results_page(page) == page
     assert page.count("<!-- end -->") >= 1
+    assert "driving_relevance" in STUDIES and "highway_relevance" not in STUDIES
 
 
 def test_a_number_that_is_not_in_the_rows_is_found():
@@ -104,6 +105,14 @@ def test_the_table_of_what_messages_to_drivers_lose_is_what_its_rows_say():
     )
     apart = highway_gap.share_of_best(values - choices, best).replace(" ", " points ", 1)
     assert f"the difference is {apart}" in words
+    silent = [row for row in rows if row["receive"] == "none"]
+    lost = (
+        np.array([float(row["decisions"]) * float(row[way]) for row in silent])
+        for way in ("true_choices", "true_values", "best")
+    )
+    first, second, most = lost
+    less = highway_gap.share_of_best(first - second, most).replace(" ", " points ", 1)
+    assert f"with the values of the true state it would gain {less} less" in words
     left = np.sort(best - mirror)
     share = 100 * left[-2:].sum() / left.sum()
     assert f"Two of the twenty drivers have {share:.0f}% of what is left" in words
@@ -138,7 +147,12 @@ def test_the_table_of_reaches_is_what_its_rows_say():
     assert f"{clear} of 50 are found to take the road for clear" in words
     weights = f"Importance weights of {unreliable}" if unreliable else "No importance weights"
     assert f"{weights} are unreliable" in words
-    assert f"{suspect} of 50 are `suspect`" in words
+    reasons = [row["reasons"] for row in people]
+    earn, seldom = (
+        sum(what in reason for reason in reasons) for what in ("earns more", "changes what they do")
+    )
+    assert f"{suspect} of 50 are `suspect`: {earn} earn more than predicted" in words
+    assert f"and {seldom} change their action less often" in words
     own, entropy, none, base = nats
     assert (
         f"{own}; the drivers' own entropy is {entropy}, a robot without implants has {none}"
