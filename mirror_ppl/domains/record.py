@@ -56,8 +56,8 @@ class Record:
         rounds: pictures of rounds, by method of :class:`mirror_ppl.plots.fit.FitPlots`.
     """
 
-    networks: Mapping[str, int] = field(default_factory=dict)
-    paper_networks: Mapping[str, int] = field(default_factory=dict)
+    networks: Mapping[str, Any] = field(default_factory=dict)
+    paper_networks: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     planning: Mapping[str, Any] = field(default_factory=dict)
     baselines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
