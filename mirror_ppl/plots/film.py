@@ -120,7 +120,7 @@ def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> No
     """Draw the state before a step, or the last one where the round is over by then."""
     ax.set_axis_off()
     end = len(strip.actions)
-    ax.imshow(film.domain.render(strip.states[min(step, end)]), interpolation="nearest")
+    ax.imshow(film.domain.render(strip.states[min(step, end)]))
     if step >= end:
         ax.set_title("the end" if step == end else f"over since step {end + 1}", fontsize=9)
         return
