@@ -132,8 +132,7 @@ def robot(start: HighwayState, speech: bool, generator: torch.Generator) -> Driv
     self_model, _ = load_self_model(shipped_weights("highway"))
     world, batch = self_model.domain, len(start.tick)
     views = fixed_views(world, batch, generator, speech=speech)
-    actions = drive(self_model, start, views, world.horizon, generator).unbind(1)
-    steps = iter(actions)
+    steps = iter(drive(self_model, start, views, world.horizon, generator).unbind(1))
     return lambda state: next(steps)
 
 

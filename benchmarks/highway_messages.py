@@ -24,7 +24,14 @@ import numpy as np
 from benchmarks._rows import rows_in
 from benchmarks.tables import rows_of
 from mirror_ppl.evaluation.assistance import REFERENCES
-from mirror_ppl.evaluation.study_summary import FIRST, NONE, ORACLE, interval, ways_to_oracle
+from mirror_ppl.evaluation.study_summary import (
+    FIRST,
+    NONE,
+    ORACLE,
+    interval,
+    summarize_study,
+    ways_to_oracle,
+)
 from mirror_ppl.evaluation.tables import Rows
 
 ROWS = Path(__file__).parents[1] / "docs/results/highway_assistance.csv"
@@ -78,27 +85,20 @@ def table(rows: Rows, setting: str) -> str:
 
 
 def advantages(rows: Rows) -> str:
-    """Return the table of what ``mirror`` with the most rounds has ahead of the others."""
-    settings = list(dict.fromkeys(row["setting"] for row in rows))
-    net: dict[tuple[str, str, int], list[float]] = {}
-    for row in by_driver(rows):
-        net.setdefault((row["setting"], row["model"], row["rounds"]), []).append(row["net"])
-    most = max(rounds for _, _, rounds in net)
+    """Return the table of how far ``mirror`` is ahead, with as many rounds or with the most."""
+    found = {
+        (one.model, one.rounds, one.place.setting): one.mirror.ahead
+        for one in summarize_study(rows, "net")
+        if one.mirror is not None and one.model != ORACLE
+    }
+    settings = list(dict.fromkeys(setting for _, _, setting in found))
     lines = []
-    for name, rounds in dict.fromkeys((name, rounds) for _, name, rounds in net):
-        if (name, rounds) in ((FIRST, most), (ORACLE, 0)):
-            continue
-        cells = []
-        for setting in settings:
-            other = net.get((setting, name, rounds))
-            if other is None:
-                cells.append("")
-                continue
-            ahead = interval(np.array(net[setting, FIRST, most]) - np.array(other))
-            cells.append(f"{ahead.mean:.1f} [{ahead.low:.1f}, {ahead.high:.1f}]")
+    for name, rounds in dict.fromkeys(key[:2] for key in found):
+        ahead = (found.get((name, rounds, setting)) for setting in settings)
+        cells = ["" if x is None else f"{x.mean:.1f} [{x.low:.1f}, {x.high:.1f}]" for x in ahead]
         learned = "" if name in REFERENCES else f", {rounds or 'no'} rounds"
         lines.append(f"| {NAMES.get(name, f'`{name}`')}{learned} | {' | '.join(cells)} |")
-    heads = f"| `{FIRST}`, {most} rounds, ahead of | {' | '.join(settings)} |"
+    heads = f"| `{FIRST}` ahead of | {' | '.join(settings)} |"
     return "\n".join([heads, "|---" * (1 + len(settings)) + "|", *lines])
 
 

@@ -18,7 +18,7 @@ from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
 from benchmarks.sight_scale import ROWS as SCALES
 from benchmarks.tables import DOCS, RESULTS, results_page, rows_of, studies, study_page
-from mirror_ppl.evaluation.study_summary import interval
+from mirror_ppl.evaluation.study_summary import interval, ways_to_oracle
 from mirror_ppl.inference.calibration.ranks import Calibration
 
 STUDIES = studies()
@@ -75,7 +75,7 @@ def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
     assert found == highway_messages.advantages(rows)
     words = " ".join(page.split())
     for setting, start in (("fog", "In fog"), ("clear", "in clear weather")):
-        here = [row for row in rows if row["setting"] == setting]
+        here = highway_messages.by_driver(row for row in rows if row["setting"] == setting)
         net = {
             key: np.array([row["net"] for row in here if (row["model"], row["rounds"]) == key])
             for key in (("mirror", 20), ("none", 0))
@@ -83,6 +83,10 @@ def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
         gain = interval(net["mirror", 20] - net["none", 0])
         shown = f"{gain.mean:.1f} [{gain.low:.1f}, {gain.high:.1f}]"
         assert f"{start} messages of `mirror` are worth {shown} a round" in words
+        (way,) = (
+            one.share for one in ways_to_oracle(here) if (one.model, one.rounds) == ("mirror", 20)
+        )
+        assert way is not None and f"{100 * way.mean:.0f}% of the way" in words
 
 
 def test_the_table_of_what_messages_to_drivers_lose_is_what_its_rows_say():
@@ -149,7 +153,8 @@ def test_the_table_of_reaches_is_what_its_rows_say():
     assert f"{weights} are unreliable" in words
     reasons = [row["reasons"] for row in people]
     earn, seldom = (
-        sum(what in reason for reason in reasons) for what in ("earns more", "changes what they do")
+        sum(what in reason for reason in reasons)
+        for what in ("earns more", "changes what they do less often")
     )
     assert f"{suspect} of 50 are `suspect`: {earn} earn more than predicted" in words
     assert f"and {seldom} change their action less often" in words

@@ -74,7 +74,7 @@ def test_people_in_the_model_remember_as_simulated_drivers_do(monkeypatch):
 
 @pytest.mark.parametrize(("rounds", "repeated"), [(1, False), (3, True), (3, False)])
 def test_people_know_what_they_would_know_in_a_round_alone(rounds, repeated):
-    """Of rounds that many people see: each as if it were observed once, and by them alone."""
+    """People whose rounds are observed together know what each would know alone."""
     recordings = load_demonstrations(asset_path("highway_fog_diverse.nc")).select_people([0])
     every = {name: value[0, [0] * rounds] for name, value in recordings.observation().items()}
     # The same sectors see cars in every round, each round's a little nearer than the one's before.
