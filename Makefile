@@ -48,7 +48,7 @@ check: $(STAMP) ## Style, format and types
 
 # One thread a process: the networks are small, and two workers share the cores.
 test: $(STAMP) ## The whole test suite
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 docs: $(STAMP) ## The documentation site in build/site; a broken link or reference fails
 	$(BIN)/sphinx-build --fresh-env --quiet --fail-on-warning --keep-going -c docs/_site -d build/doctrees \
