@@ -23,6 +23,7 @@ from example_views import ragged
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.nuts import NUTSOptions
 from mirror_ppl.inference.online import OnlinePosterior
 from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.attention import KEPT, VALUES
@@ -171,18 +172,22 @@ def test_predictions_condition_on_the_round_so_far(self_model, recordings):
                 log_weights = log_weights + each[:, step, done[step]]
 
 
-@pytest.mark.parametrize("guide", ["svi", "nuts"])
-def test_other_guides_agree_with_importance_sampling(self_model, guide):
+def test_other_guides_agree_with_importance_sampling(self_model):
     """On a posterior of one number: means within .15 and half of the spread of each other."""
     human = Fixed(self_model)
     truth = {NOTICES[0]: torch.tensor([[0.1]])}
     rounds = play_rounds(human, truth, 6, "fog", torch.Generator().manual_seed(1))
     found = {}
-    for name in ("importance", guide):
-        options = InferenceOptions(name, 100, SVIOptions(steps=150) if name == "svi" else None)
+    for name, settings in (
+        ("importance", None),
+        ("svi", SVIOptions(steps=100)),
+        ("nuts", NUTSOptions(warmup=40)),
+    ):
+        options = InferenceOptions(name, 80, settings)
         found[name] = infer(human, rounds, options, 0).draws[NOTICES[0]].flatten()
-    assert abs(found[guide].mean() - found["importance"].mean()) < 0.15
-    assert 0.5 < found[guide].std() / found["importance"].std() < 2
+    for guide in ("svi", "nuts"):
+        assert abs(found[guide].mean() - found["importance"].mean()) < 0.15
+        assert 0.5 < found[guide].std() / found["importance"].std() < 2
 
 
 def test_rounds_that_come_in_are_those_that_were_there(self_model, recordings):

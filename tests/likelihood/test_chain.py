@@ -145,8 +145,7 @@ class Late(BombDefusalHuman):
         return super().act(implants, belief.chunk(2, -1)[1], values)
 
 
-@pytest.mark.parametrize("kind", [BombDefusalHuman, Late])
-@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize(("told", "kind"), [(False, BombDefusalHuman), (True, Late)])
 def test_the_sum_is_that_over_all_combinations(defuser, told, kind):
     rounds, human = recorded(told=told), kind(defuser.self_model)
     draws = draw_prior(human, 1, 4, 0)

@@ -4,6 +4,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from few_reaches import robot_of_few_reaches
 
 from mirror_ppl import load_recordings
 from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalNoImplants
@@ -23,6 +24,11 @@ from mirror_ppl.people import simulate
 @pytest.fixture(scope="module")
 def self_model():
     return load_self_model(shipped_weights("driving"))[0]
+
+
+@pytest.fixture(scope="module")
+def few_reaches():
+    return robot_of_few_reaches()
 
 
 class Blind(HumanModel):
@@ -56,9 +62,9 @@ PRUNED = SVIOptions(steps=30, prune_every=10, prune_margin=2)
     ],
 )
 @pytest.mark.parametrize(("kind", "bins"), [(Blind, {0}), (Gaze, {0, 1})])
-def test_what_the_prior_says_of_sight_outweighs_rounds(kind, bins, number, options, self_model):
+def test_what_the_prior_says_of_sight_outweighs_rounds(kind, bins, number, options, few_reaches):
     rounds = load_recordings().select_people(["person-01"]).select_rounds(range(number))
-    drawn = infer(kind(self_model), rounds, options, 0).draws["sight_front_own"]
+    drawn = infer(kind(few_reaches), rounds, options, 0).draws["sight_front_own"]
     assert set(drawn.flatten().tolist()) <= bins
 
 

@@ -15,6 +15,7 @@ from benchmarks.one_program import CHANGES, exact_mean, toy
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.errors import HumanModelError, InputError
 from mirror_ppl.inference.engines import InferenceOptions, infer
+from mirror_ppl.inference.svi import SVIOptions
 from mirror_ppl.likelihood.compiled import compile
 from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models import HumanModel
@@ -45,7 +46,9 @@ def recordings():
 @pytest.mark.parametrize("guide", ["importance", "svi"])
 def test_engines_have_the_posterior_of_the_program(guide, change, recordings):
     """Importance within four standard errors; the Gaussian of svi within a fifth of the change."""
-    options = InferenceOptions(engine=guide, draws=2000 if guide == "importance" else 100)
+    options = InferenceOptions(engine=guide, draws=2000)
+    if guide == "svi":
+        options = InferenceOptions(guide, 100, SVIOptions(steps=150))
     found = infer(toy(change, self_model()), recordings, options, 0).draws["in_sight"].flatten()
     expected = exact_mean(change, recordings, self_model())
     if guide == "importance":

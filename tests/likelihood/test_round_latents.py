@@ -150,7 +150,7 @@ def test_weighted_sums_are_right_on_average(number):
     ]
     exact = torch.stack([function(*axes).sum() for function in functions])
     totals = []
-    for seed in range(3000):
+    for seed in range(1000):
         found = chosen(number, seed)
         rows = [found.values[site].double() for site in SUPPORTS]
         weights = found.log_weights.double().exp()
@@ -165,7 +165,7 @@ def test_what_is_kept_stands_for_what_is_not():
     useful = torch.softmax(torch.arange(30.0) / 4, 0)
     something = torch.arange(30.0).double()
     totals = []
-    for seed in range(2000):
+    for seed in range(1000):
         kept = found.thinned(useful, 8, seed)
         assert abs(len(kept.kept) - 8) <= 1
         totals.append((something[kept.kept] / kept.log_kept.double().exp()).sum())
