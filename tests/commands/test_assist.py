@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import h5py
 import pytest
 from paths import EXAMPLES
-from running import command, command_on_cluster
+from running import command
 
 from mirror_ppl.commands import assist, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
@@ -103,16 +103,13 @@ def test_the_table_shows_the_numbers(posterior, capsys):
     assert "2/2" in captured.err
 
 
-def test_one_seed_gives_one_result(posterior, done, tmp_path):
-    for seed in (0, 1):
-        chosen = ("--communicator", "mirror", "--json", tmp_path / f"{seed}.json", "--seed", seed)
-        assert command(assist, "--posterior", posterior, *SMALL, *chosen) == 0
-    again, other = (
-        results_of(tmp_path / f"{seed}.json")["communicators"]["mirror"] for seed in (0, 1)
-    )
+def test_another_seed_gives_another_result(posterior, done, tmp_path):
+    """One gives the same: a cluster, below, plays what is played here."""
+    chosen = ("--communicator", "mirror", "--json", tmp_path / "a.json", "--seed", 1)
+    assert command(assist, "--posterior", posterior, *SMALL, *chosen) == 0
+    other = results_of(tmp_path / "a.json")["communicators"]["mirror"]
     before = results_of(done / "a.json")["communicators"]["mirror"]
-    assert again.items() <= before.items()
-    assert other["net_by_person"] != again["net_by_person"]
+    assert other["net_by_person"] != before["net_by_person"]
 
 
 def test_alone_or_among_others_a_communicator_plays_the_same(posterior, done, tmp_path):
@@ -124,15 +121,14 @@ def test_alone_or_among_others_a_communicator_plays_the_same(posterior, done, tm
     assert alone["random"]["net_by_person"] == among["net_by_person"][:1]
 
 
-@pytest.mark.slow
-def test_a_cluster_plays_the_same(posterior, done, tmp_path):
+def test_a_cluster_plays_the_same(posterior, done, cluster, tmp_path):
     chosen = ("--communicator", "mirror", "random", "--json", tmp_path / "a.json")
-    run = command_on_cluster(tmp_path, assist, "--posterior", posterior, *SMALL, *chosen)
-    assert run.returncode == 0, run.stderr
+    there = ("--scheduler", cluster)
+    assert command(assist, "--posterior", posterior, *SMALL, *chosen, *there) == 0
     there = results_of(tmp_path / "a.json")["communicators"]
     here = results_of(done / "a.json")["communicators"]
     for name in ("mirror", "random"):
-        assert there[name]["net_by_person"] == here[name]["net_by_person"]
+        assert there[name].items() <= here[name].items()
 
 
 # --- resuming ---------------------------------------------------------------------------------

@@ -1,10 +1,11 @@
 """`python -m mirror_ppl.fit`: what it writes and says, and that a killed fit goes on."""
 
+import io
 import json
+import os
 import signal
-import subprocess
-import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
@@ -22,20 +23,32 @@ def some():
     return two_people()
 
 
+def said_by(*args):
+    """What a fit says on its two streams."""
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        assert command(fit, *args) == 0
+    return out.getvalue(), err.getvalue()
+
+
 @pytest.fixture(scope="module")
 def folder(some, tmp_path_factory):
     """A folder with recordings, and the results of a short fit of them in out/."""
     folder = tmp_path_factory.mktemp("cli")
     save_demonstrations(folder / "some.nc", some)
-    assert command(fit, *short_fit(folder, "out")) == 0
+    out, err = said_by(*short_fit(folder, "out"))
+    (folder / "said.out").write_text(out)
+    (folder / "said.err").write_text(err)
     return folder
 
 
+NOTHING_HELD_OUT = "--human-model", "no-implants", "--train-rounds", 4
+
+
 @pytest.fixture(scope="module")
-def whole(folder):
-    """A fit of many steps, of a model that is quick."""
-    assert command(fit, *short_fit(folder, "whole", *RADIUS, steps=80)) == 0
-    return folder / "whole"
+def quick(folder):
+    """A fit of a model that is quicker still, of all rounds, and what it said."""
+    out, _ = said_by(*short_fit(folder, "quick", *NOTHING_HELD_OUT))
+    return folder / "quick", out
 
 
 def summary_of(folder):
@@ -94,25 +107,31 @@ def test_posterior_opens_without_this_package_and_agrees_with_the_summary(folder
         group.close()
 
 
-def test_one_seed_gives_one_summary(folder, whole):
+def test_one_seed_gives_one_summary(folder, quick):
     torch.manual_seed(99)
-    assert command(fit, *short_fit(folder, "again", *RADIUS, steps=80)) == 0
-    assert summary_of(folder / "again") == summary_of(whole)
-    assert command(fit, *short_fit(folder, "other", *RADIUS, steps=80), "--seed", 1) == 0
+    args = NOTHING_HELD_OUT
+    assert command(fit, *short_fit(folder, "again", *args)) == 0
+    assert summary_of(folder / "again") == summary_of(quick[0])
+    assert command(fit, *short_fit(folder, "other", *args), "--seed", 1) == 0
     other = summary_of(folder / "other")
     assert other.pop("seed") == 1
-    assert other["people"] != summary_of(whole)["people"]
+    assert other["people"] != summary_of(quick[0])["people"]
 
 
-def test_fit_says_what_it_found_and_where_it_lies(folder, capsys):
-    assert command(fit, *short_fit(folder, "said"), "--train-rounds", 4) == 0
-    captured = capsys.readouterr()
+def test_fit_says_what_it_found_and_where_it_lies(folder):
+    out, err = ((folder / f"said.{stream}").read_text() for stream in ("out", "err"))
     for name in ("person-01", "person-04", "front own", "assumes clear", "consistency", *RESULTS):
-        assert name in captured.out
-    assert "Held-out actions" not in captured.out  # there are none
-    assert "fit: 4/4 negative ELBO" in captured.err  # plain lines: it is no terminal
-    assert "\x1b" not in captured.err
-    people = summary_of(folder / "said")["people"]
+        assert name in out
+    assert "Held-out actions" in out
+    assert "fit: 4/4 negative ELBO" in err  # plain lines: it is no terminal
+    assert "\x1b" not in err
+
+
+def test_nothing_is_said_of_held_out_actions_where_there_are_none(quick):
+    folder, out = quick
+    assert "consistency" in out
+    assert "Held-out actions" not in out
+    people = summary_of(folder)["people"]
     assert [(person["rounds"], person["test"]) for person in people] == [(4, None)] * 2
 
 
@@ -126,21 +145,21 @@ def test_shipped_recordings_are_those_that_are_asked_for():
             assert recordings.shape == (10, 40, 15)
 
 
-def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, whole, monkeypatch):
-    args = [str(arg) for arg in short_fit(folder, "killed", *RADIUS, steps=80)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mirror_ppl.fit", *args], stderr=subprocess.PIPE
+def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, forks, monkeypatch):
+    """A fit of some more steps, as there is a checkpoint in 25, of a model that is quick."""
+    whole, args = (
+        [str(arg) for arg in short_fit(folder, out, *RADIUS, steps=40)]
+        for out in ("whole", "killed")
     )
+    assert command(fit, *whole) == 0
+    with open(os.devnull, "w") as nowhere:
+        process = forks.start("mirror_ppl.fit", *args, stdout=nowhere, stderr=nowhere)
     checkpoint, deadline = folder / "killed" / "fit.checkpoint", time.monotonic() + 120
-    try:
-        while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert process.poll() is None, process.stderr.read().decode()
-        assert checkpoint.exists()
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-    assert process.returncode == -signal.SIGKILL
+    while not checkpoint.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.kill(process, signal.SIGKILL)
+    assert forks.status(process) == -signal.SIGKILL
+    assert checkpoint.exists()
     assert not RESULTS & set(content(folder / "killed"))
 
     done = []
@@ -152,7 +171,7 @@ def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, wh
 
     monkeypatch.setattr(fit.Stages, "report", spy)
     assert command(fit, *args) == 0
-    assert done[0] in (26, 51, 76)  # from a checkpoint, of which there is one in 25 steps
+    assert done[0] == 26
     assert set(content(folder / "killed")) >= RESULTS_OF_RADIUS
     assert not checkpoint.exists()
-    assert summary_of(folder / "killed") == summary_of(whole)
+    assert summary_of(folder / "killed") == summary_of(folder / "whole")

@@ -1,10 +1,9 @@
 """The console script `mirror-ppl`, and what `--help` says."""
 
+import functools
 import importlib
 import re
 import shlex
-import subprocess
-import sys
 import tomllib
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -24,13 +23,12 @@ from mirror_ppl.option_help import WORDS, texts_of
 
 MODULES = {name: importlib.import_module(f"mirror_ppl.commands.{name}") for name in COMMANDS}
 every_command = pytest.mark.parametrize("name", COMMANDS)
-SCRIPT = "import sys; from mirror_ppl.__main__ import script; script()"
 
 
-def called(*args):
-    """What came of the console script with these arguments, in a process of its own."""
-    words = [sys.executable, "-c", SCRIPT, *args]
-    return subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+@pytest.fixture
+def called(forks):
+    """A function that runs the console script with arguments, in a process of its own."""
+    return functools.partial(forks.run, "mirror_ppl.__main__:script")
 
 
 def words_of(text):
@@ -48,7 +46,7 @@ def test_the_console_script_is_the_packages():
     assert getattr(importlib.import_module(module), function) is script
 
 
-def test_the_console_script_lists_its_commands():
+def test_the_console_script_lists_its_commands(called):
     done = called()
     assert (done.returncode, done.stderr) == (0, "")
     for name, purpose in COMMANDS.items():
@@ -57,7 +55,7 @@ def test_the_console_script_lists_its_commands():
 
 
 @every_command
-def test_each_command_of_the_script_explains_itself(name):
+def test_each_command_of_the_script_explains_itself(called, name):
     spoken = f"mirror-ppl {name.replace('_', '-')}"
     done = called(*shlex.split(spoken)[1:], "--help")
     assert (done.returncode, done.stderr) == (0, "")
@@ -66,7 +64,7 @@ def test_each_command_of_the_script_explains_itself(name):
         assert f"    {spoken} {example}\n" in done.stdout
 
 
-def test_the_script_does_what_the_module_does(tmp_path):
+def test_the_script_does_what_the_module_does(called, tmp_path):
     path = tmp_path / "people.nc"
     done = called("simulate", "--out", str(path), "--people", "1", "--rounds", "2")
     assert done.returncode == 0
@@ -74,7 +72,7 @@ def test_the_script_does_what_the_module_does(tmp_path):
     assert path.is_file()
 
 
-def test_the_status_of_the_script_is_the_commands(tmp_path):
+def test_the_status_of_the_script_is_the_commands(called, tmp_path):
     (tmp_path / "world.py").write_text("class Mine: pass\n")
     done = called("check-domain", f"{tmp_path}/world.py:Mine")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)

@@ -2,41 +2,23 @@
 
 import json
 import os
-import subprocess
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
+from example_cells import ASKED, FOLDER, Square, die_of_one, die_once, square
 
 from mirror_ppl.errors import OptionError, WorkerError
 from mirror_ppl.jobs import DatasetFormat, JsonFormat, Runner
 from mirror_ppl.progress import Progress
 from mirror_ppl.workers import KILLED
 
-
-@dataclass(frozen=True)
-class Square:
-    number: int
-
-    @property
-    def label(self):
-        return f"square of {self.number}"
-
-
 CELLS = [Square(number) for number in (3, 1, 2)]
-ASKED = []
 
 
 def same(cell):
     return "a"
-
-
-def square(cell):
-    ASKED.append(cell.number)
-    return [{"number": cell.number, "square": cell.number**2}]
 
 
 def all_but_one(cell):
@@ -123,12 +105,6 @@ def test_a_failure_is_reported_loses_nothing_and_is_tried_again(tmp_path):
     assert ASKED == [3, 2, 1]
 
 
-def die_of_one(cell):
-    if cell.number == 1:
-        os._exit(3)
-    return square(cell)
-
-
 def test_work_that_kills_its_process_is_reported_and_the_rest_is_done(tmp_path):
     outcomes = Runner(tmp_path, same, 2, keep_going=True).run(CELLS, die_of_one)
     assert squares(outcomes) == [9, 4]
@@ -152,20 +128,11 @@ def test_work_that_needs_all_cells_names_the_one_that_kills_its_process(tmp_path
 LIMIT = 20
 
 
-def die_once(cell):
-    """Kills its process the first time, as a system without memory does."""
-    mark = Path(os.environ["MIRROR_PPL_TEST_JOBS"]) / f"died-{cell.number}"
-    if cell.number == 1 and not mark.exists():
-        mark.touch()
-        os._exit(3)
-    return square(cell) + [{"square": os.getpid()}]
-
-
 def test_who_is_killed_once_is_tried_again_and_the_rest_is_done_beside_each_other(
     tmp_path, monkeypatch
 ):
     """Only cells that were handed out when the process was killed are done one at a time."""
-    monkeypatch.setenv("MIRROR_PPL_TEST_JOBS", str(tmp_path))
+    monkeypatch.setenv(FOLDER, str(tmp_path))
     cells = [Square(number) for number in range(1, LIMIT + 1)]
     outcomes = Runner(None, same, 2).run(cells, die_once)
     found = squares(outcomes)
@@ -233,31 +200,7 @@ def test_a_missing_cluster_is_reported(tmp_path):
     assert get_scheduler() is None  # or whatever is written next asks that cluster for its lock
 
 
-CLUSTER = """
-import sys
-from pathlib import Path
-from distributed import LocalCluster
-sys.path.insert(0, "{tests}")
-from mirror_ppl.jobs import Runner
-from test_jobs import CELLS, same, square, squares
-
-if __name__ == "__main__":
-    options = dict(n_workers=1, threads_per_worker=1, dashboard_address=None)
-    with LocalCluster(**options) as cluster:
-        runner = Runner(Path("{out}"), same, scheduler=cluster.scheduler_address)
-        found = runner.run(CELLS, square)
-    print(squares(found))
-"""
-
-
-@pytest.mark.slow
-def test_a_cluster_does_the_same(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    script = tmp_path / "script.py"
-    script.write_text(CLUSTER.format(tests=Path(__file__).parent, out=out))
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120
-    )
-    assert done.stdout.strip() == "[9, 1, 4]", done.stderr
-    assert len(list(out.iterdir())) == 3
+def test_a_cluster_does_the_same(cluster, tmp_path):
+    assert squares(Runner(tmp_path, same, scheduler=cluster).run(CELLS, square)) == [9, 1, 4]
+    assert ASKED == []  # another process did it
+    assert len(list(tmp_path.iterdir())) == 3

@@ -81,7 +81,7 @@ def test_signals_end_work_at_once_and_leave_nothing(forks, tmp_path, number, sta
         time.sleep(0.1)
     os.kill(process, number)
     began = time.monotonic()
-    assert forks.status() == status
+    assert forks.status(process) == status
     assert time.monotonic() - began < 10  # seconds; three where nothing else runs
     assert said.read_text().splitlines()[-1] == line
     assert not out.exists()

@@ -2,42 +2,30 @@
 
 import os
 import signal
-import subprocess
-import sys
-import textwrap
 import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import pytest
+from example_cells import MARK, ends, pair
 from running import command
 
 from mirror_ppl.commands import calibrate
-from mirror_ppl.errors import HumanModelError, MirrorError
+from mirror_ppl.errors import HumanModelError
 from mirror_ppl.user_code import remember_file
 from mirror_ppl.workers import run_tasks
-
-MARK = "MIRROR_PPL_TEST_WORKERS"
-
-
-def square(number):
-    return number, number**2
-
-
-def ends(number):
-    raise SystemExit(number)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_come_as_tasks_end(jobs):
-    found = dict(run_tasks([partial(square, number) for number in range(5)], jobs))
+    found = dict(run_tasks([partial(pair, number) for number in range(5)], jobs))
     assert found == {number: number**2 for number in range(5)}
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_task_cannot_end_the_program(jobs):
-    with pytest.raises(HumanModelError, match=r"sys.exit\(3\) \(test_workers.py, line"):
+    with pytest.raises(HumanModelError, match=r"sys.exit\(3\) \(example_cells.py, line"):
         list(run_tasks([partial(ends, 3)], jobs))
 
 
@@ -68,42 +56,19 @@ def marked(value):
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/environ"), reason="there is no /proc here")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_workers_end_soon_after_the_process_that_started_them(tmp_path, number):
-    code = """
-        import signal, sys, time
-        from dataclasses import dataclass
-        from functools import partial
-        from mirror_ppl.console import run
-        from mirror_ppl.workers import run_tasks
-
-        @dataclass(frozen=True)
-        class Options:
-            pass
-
-        def main(options):
-            for _ in run_tasks([partial(time.sleep, 0.1), *[partial(time.sleep, 60)] * 2], 2):
-                print("at work", flush=True)
-
-        # Whoever runs these tests in the background may have had it ignored.
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        sys.exit(run(Options, main, prog="x", description="x", args=[]))
-        """
-    environment = os.environ | {MARK: str(tmp_path)}
-    with subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=environment,
-        text=True,
-    ) as process:
-        assert process.stdout.readline() == "at work\n"
-        assert len(marked(tmp_path)) >= 3
-        process.send_signal(number)
-        assert process.wait(10) == {9: -9, 15: 143, 2: 130}[number]
-        deadline = time.monotonic() + 10
-        while marked(tmp_path) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        assert marked(tmp_path) == []
+def test_workers_end_soon_after_the_process_that_started_them(forks, tmp_path, number):
+    read, write = os.pipe()
+    with open(read) as told:
+        with open(write, "w") as out, open(os.devnull, "w") as nowhere:
+            process = forks.start("example_cells:at_work", tmp_path, stdout=out, stderr=nowhere)
+        assert told.readline() == "at work\n"
+        assert len(marked(tmp_path)) >= 2
+        os.kill(process, number)
+        assert forks.status(process) == {9: -9, 15: 143, 2: 130}[number]
+    deadline = time.monotonic() + 10
+    while marked(tmp_path) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert marked(tmp_path) == []
 
 
 MODEL = """
@@ -130,12 +95,3 @@ def test_calibration_names_the_line_of_a_faulty_model(tmp_path, capsys, jobs):
     assert command(calibrate, *model, *small) == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert line == "error: RuntimeError: later (fails.py, line 12)"
-
-
-def test_a_worker_that_is_killed_is_one_line():
-    with pytest.raises(MirrorError, match="its process was killed"):
-        list(run_tasks([partial(square, 1), _kill_oneself], 2))
-
-
-def _kill_oneself():
-    os.kill(os.getpid(), signal.SIGKILL)
