@@ -72,8 +72,9 @@ def test_rules_are_learned_from_rewards_and_planned_with():
 def test_a_fit_learns_rules_in_a_model_of_its_own():
     human = BombDefusalHuman(load_self_model(shipped_weights("bomb_defusal"), "bomb_defusal")[0])
     before = human.rule_logits.clone()
-    recorded = simulate("bomb_defusal", "labelled", people=1, rounds=2, seed=1)
-    fit = mirror_ppl.infer(recorded, human=human, draws=4, train_rounds=2, explore=0)
+    recorded = simulate("bomb_defusal", "labelled", people=1, rounds=1, seed=1)
+    few = {"settings": {"proposals": 64, "enough": 4.0}, "draws": 4, "explore": 0}
+    fit = mirror_ppl.infer(recorded, human=human, engine="importance", train_rounds=1, **few)
     assert torch.equal(human.rule_logits, before)
     assert isinstance(fit.human, BombDefusalHuman)
     assert not torch.equal(fit.human.rule_logits, before)

@@ -84,7 +84,7 @@ def test_a_person_s_probabilities_come_out_of_their_rounds():
     human.fit_world(recorded)
     builder = ViewTableBuilder(human, Screening())
     builder.add(rounds_of(recorded, 0))
-    found = sample_importance(human, builder.table(), ImportanceOptions(proposals=256))
+    found = sample_importance(human, builder.table(), ImportanceOptions(256, 50.0))
     draws = found.sample(200, builder.grid)
     mean = torch.stack([draws[f"notices_terminal {k}"].mean() for k in range(1, 7)]).mean()
     # About 30 finds, and a prior worth one: a standard error of a fifth.

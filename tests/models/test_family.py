@@ -1,5 +1,7 @@
 """The family of human models: each by itself, and all of them as one program."""
 
+from dataclasses import replace
+
 import pyro
 import pyro.distributions as dist
 import pytest
@@ -14,11 +16,9 @@ from mirror_ppl.communication import (
     RoundSoFar,
     SimulatorWorld,
 )
-from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.data import asset_path, concatenate, load_demonstrations
 from mirror_ppl.domains.bomb_defusal.human_variants import BombDefusalAnyKind
 from mirror_ppl.errors import HumanModelError, InputError
-from mirror_ppl.inference.adaptive_importance import ImportanceOptions
-from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.tables import rounds_of
 from mirror_ppl.likelihood.view_table import combination_number
@@ -257,36 +257,46 @@ def of_kind(human, seed, rounds=6, **known):
     return play_rounds(human, implants, rounds, "fog", torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize(
-    ("kind", "model", "rounds", "known"),
-    [
-        ("mirror", HumanModel, 6, {"consistency": 4.0}),
-        ("preferring", Preferring, 6, {"consistency": 4.0, SHARES_GOAL: -0.8}),
-        ("noticing", Noticing, 12, {"consistency": 4.0, NOTICES: 0.5}),
-        ("forgetting", Forgetting, 6, {"consistency": 4.0, FORGETS: 0.7}),
-    ],
-)
-def test_kinds_are_distinguished(few_reaches, kind, model, rounds, known):
-    recordings = of_kind(model(few_reaches), 100, rounds, **known).select_people([0])
-    options = InferenceOptions("importance", 100, ImportanceOptions(proposals=256, enough=100))
-    found = infer(AnyKind(few_reaches), recordings, options, 1)
-    own = (found.draws[KIND][:, :, 0] == list(KINDS).index(kind)).float().mean(0)
-    assert (own > 0.5).all(), own
-    assert (found.pareto_k < 0.7).all()
+FEW = {"settings": {"proposals": 128, "enough": 25.0}, "draws": 100, "explore": 0}
+"""Settings with which kinds that differ much are told apart."""
+PEOPLE = {
+    "mirror": (HumanModel, 4, {}),
+    "late": (Late, 5, {LATE: 0.95}),
+    "noticing": (Noticing, 8, {NOTICES: 0.5}),
+    "forgetting": (Forgetting, 4, {FORGETS: 0.7}),
+    "preferring": (Preferring, 4, {SHARES_GOAL: -0.8}),
+}
+"""Of each kind: the model, rounds and what is known of somebody who is clearly of it."""
 
 
-def test_a_fit_reports_the_probability_of_each_model(few_reaches):
-    recordings = of_kind(Late(few_reaches), 100, 8, **{LATE: 0.95, "consistency": 4.0})
-    few = {"settings": {"proposals": 256, "enough": 100}, "draws": 100, "explore": 0}
-    one = recordings.select_people([0])
-    fit = mirror_ppl.infer(one, human=AnyKind(few_reaches), engine="importance", **few, seed=1)
-    for number, person in enumerate(fit.summary["people"]):
+def test_a_fit_tells_kinds_apart_and_reports_how_probable_each_is(few_reaches):
+    """One fit of five people, of whom each is of another kind."""
+    people = [
+        replace(
+            of_kind(model(few_reaches), 100, rounds, consistency=4.0, **known).select_people([0]),
+            people=(kind,),
+        )
+        for kind, (model, rounds, known) in PEOPLE.items()
+    ]
+    assert tuple(PEOPLE) == KINDS
+    fit = mirror_ppl.infer(
+        concatenate(people),
+        human=AnyKind(few_reaches),
+        engine="importance",
+        train_rounds=8,
+        **FEW,
+        seed=1,
+    )
+    drawn = torch.from_numpy(fit.data.posterior[KIND].values[0])  # [S, P]
+    for number, (kind, person) in enumerate(zip(KINDS, fit.summary["people"], strict=True)):
+        assert (drawn[:, number] == number).float().mean() > 0.5, kind
+        assert person["pareto_k"] < 0.7
         models = person["check"]["models"]
         assert list(models) == list(KINDS) and sum(models.values()) == pytest.approx(1)
-        assert person["implants"][KIND]["most_probable"] == "late"
-        assert person["implants"][KIND]["probability"] == pytest.approx(models["late"])
-        assert fit.check["p(late)"].iloc[number] == models["late"] > 0.9
-        assert person["pareto_k"] < 0.7
+        assert person["implants"][KIND]["most_probable"] == kind
+        assert person["implants"][KIND]["probability"] == pytest.approx(models[kind])
+        assert fit.check[f"p({kind})"].iloc[number] == models[kind]
+    assert fit.check["p(late)"].iloc[KINDS.index("late")] > 0.9
 
 
 @pytest.mark.parametrize("known", [{SHARES_GOAL: -0.8}, {SHARES_GOAL: 1.0}])
@@ -313,12 +323,12 @@ def test_what_is_stratified_by_has_to_be_discrete(driving):
         ViewTableBuilder(Wrong(driving), Screening())
 
 
-@pytest.mark.parametrize("world", WORLDS)
-@pytest.mark.parametrize("name", ["all"])
-def test_without_rounds_what_is_known_is_the_prior(world, name):
-    human = load_human_model(name, self_model(world))
-    rounds = simulate_from_prior(human, 1, 2, seed=1)
-    fit = mirror_ppl.infer(rounds, human=human, train_rounds=0, draws=200, explore=0)
+@pytest.mark.parametrize("world", ["driving", "bomb_defusal"])
+def test_without_rounds_what_is_known_is_the_prior(world, few_reaches):
+    """Of both models of all kinds."""
+    human = load_human_model("all", few_reaches if world == "driving" else self_model(world))
+    rounds = simulate_from_prior(human, 1, 1, seed=1)
+    fit = mirror_ppl.infer(rounds, human=human, engine="importance", train_rounds=0, **FEW)
     assert fit.summary["people"][0]["rounds"] == 0
     assert abs(fit.summary["people"][0]["log_evidence"]) < 0.05  # an average of weights
     assert fit.summary["people"][0]["check"]["verdict"] == "unchecked"
@@ -334,8 +344,8 @@ def test_evidence_is_of_actions_alone(few_reaches):
             pyro.sample("asked", dist.Normal(implants["consistency"], 0.5), obs=torch.tensor(3.0))
             return implants
 
-    rounds = of_kind(HumanModel(few_reaches), 100)
-    fit = mirror_ppl.infer(rounds, human=Asked(few_reaches), engine="importance", explore=0)
+    rounds = of_kind(HumanModel(few_reaches), 100, 1).select_people([0])
+    fit = mirror_ppl.infer(rounds, human=Asked(few_reaches), engine="importance", **FEW)
     assert fit.summary["people"][0]["log_evidence"] is None
 
 

@@ -56,9 +56,9 @@ def test_a_planner_s_values_are_learned():
     options = SelfModelOptions(
         phases=1,
         rounds=64,
-        steps=150,
+        steps=60,
         batch=16,
-        learning_rate=3e-3,
+        learning_rate=5e-3,
         window=3,
         distil=True,
         assumed=0.0,
@@ -161,7 +161,7 @@ def test_bins_of_values_are_learned_by_cross_entropy():
         # Squared errors of the means are what is reported.
         torch.testing.assert_close(found.bellman, (network(belief) - goal).square().mean())
     optimizer = torch.optim.Adam(robot.parameters(), 3e-3)
-    for _ in range(300):
+    for _ in range(60):
         optimizer.zero_grad()
         loss().total.backward()
         optimizer.step()
