@@ -102,7 +102,7 @@ def test_a_resumed_run_knows_the_engine_of_each_person(
 
 
 def test_a_fit_reports_the_engine_of_each_person():
-    people = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0, 1])
+    people = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0])
     one = people.select_people(["person-01"])
     fit = mirror_ppl.infer(one, draws=5, explore=0)
     assert fit.summary["people"][0]["engine"] in ("amortized", "importance")

@@ -55,9 +55,9 @@ def test_the_elbo_teaches_the_network_where_people_are(toy, groups):
     before = surprise(network, groups)
     training = ELBOTraining(network, itertools.cycle(groups), 3e-3)
     losses, distances = [], []
-    for step in range(150):
+    for step in range(80):
         losses.append(training.step())
-        if step >= 100:
+        if step >= 50:
             distances.append(surprise(network, groups))
     assert sum(losses[-20:]) / 20 < sum(losses[:5]) / 5
     # It is not told the truth, but gets nearer to it; of 100 people, at steps that are noisy.

@@ -108,9 +108,10 @@ def test_a_checkpoint_is_a_file(one, tmp_path):
 
 def test_numbers_of_numpy_make_the_same_fit(two):
     person = HumanModel(robot_of_few_reaches())
-    options = InferenceOptions("importance", draws=3)
+    few = ImportanceOptions(64, 4.0)
+    options = InferenceOptions("importance", draws=3, settings=few)
     own = fit_people(person, two, options, seed=1, train_rounds=2)
-    options = InferenceOptions("importance", draws=np.int64(3))
+    options = InferenceOptions("importance", draws=np.int64(3), settings=few)
     other = fit_people(person, two, options, seed=np.int64(1), train_rounds=np.int64(2))
     assert json.dumps(own.summary) == json.dumps(other.summary)
 

@@ -24,17 +24,21 @@ from mirror_ppl.models.weights import load_self_model, shipped_weights
 def job():
     human = AnyKind(robot_of_few_reaches())
     rounds = simulate_from_prior(human, 1, 2, "fog", 100)
-    return Job(human, rounds, 200, importance.ImportanceOptions(), 1, Screening())
+    return Job(human, rounds, 200, importance.ImportanceOptions(128, 25.0), 1, Screening())
 
 
-def test_kinds_are_weighed_by_evidence_and_implants_are_those_of_each(job):
+@pytest.fixture(scope="module")
+def found(job):
+    return importance.infer_by_importance(job)
+
+
+def test_kinds_are_weighed_by_evidence_and_implants_are_those_of_each(job, found):
     """Systematic draws: of 200 as many as the probability says, to within one."""
     models = models_by_kind(job.human)
     alone = {
         name: importance.infer_by_importance(replace(job, human=model))
         for name, model in models.items()
     }
-    found = importance.infer_by_importance(job)
     evidence = torch.stack([one.log_evidence for one in alone.values()], -1).double()  # pyright: ignore
     prior = torch.tensor([0.6, 0.1, 0.1, 0.1, 0.1], dtype=torch.double)
     joint = evidence + prior.log()
@@ -58,8 +62,7 @@ def test_kinds_are_weighed_by_evidence_and_implants_are_those_of_each(job):
         assert abs(float(others.mean()) - 0.8) < 4 * 0.163 / len(others) ** 0.5
 
 
-def test_what_is_probable_of_a_probable_kind_is_probable(job):
-    found = importance.infer_by_importance(job)
+def test_what_is_probable_of_a_probable_kind_is_probable(job, found):
     sizes = {site: len(support) for site, support in perceived_sites(job.human).items()}
     assert len(found.combinations) == job.rounds.num_people
     for person, probable in enumerate(found.combinations):

@@ -21,7 +21,7 @@ from mirror_ppl.models.toy import ToyHuman
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 TOY = ("--human-model", "toy.py:Toy")
-QUICK = ("--demos", "some.nc", *TOY, "--explore", 0)
+QUICK = ("--demos", "few.nc", *TOY, "--explore", 0)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,10 @@ def toy():
 
 @pytest.fixture(scope="module")
 def folder(toy, tmp_path_factory):
-    """Recordings of eight people of one kind, one of whom has no rounds, and their fit."""
+    """Recordings of eight people of one kind, one of whom has no rounds, and their fit.
+
+    Four of them, of whom three have rounds, are in a file of their own.
+    """
     folder = tmp_path_factory.mktemp("population")
     implants = {
         "reach": torch.full((8, 1), 3),
@@ -47,6 +50,7 @@ def folder(toy, tmp_path_factory):
         "driving", "fog", recordings.people, variables, recordings.provenance
     )
     save_demonstrations(folder / "some.nc", ragged)
+    save_demonstrations(folder / "few.nc", ragged.select_people([0, 1, 2, 7]))
     (folder / "toy.py").write_text("from mirror_ppl.models.toy import ToyHuman as Toy\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -117,13 +121,13 @@ def test_a_population_is_a_prior_of_others(inside, capsys):
     )
     assert before.attrs["pooling"] == "known population"
     assert float((before["reach"] == 3).mean()) > 2 / 7
-    right = (after["reach"] == 3).mean(("chain", "draw"))[:6]
+    right = (after["reach"] == 3).mean(("chain", "draw"))[:3]
     assert float(right.mean()) > float((before["reach"] == 3).mean())
     capsys.readouterr()
     # By itself, nobody without rounds is known better than by the prior.
     assert command(fit, *QUICK, "--train-rounds", 0, "--out", "own") == 0
     own = az.from_netcdf("own/posterior.nc")["posterior"]["reach"]
-    assert abs(float((own == 3).mean()) - 1 / 7) < 0.06  # 1,600 draws: s.d. 0.01
+    assert abs(float((own == 3).mean()) - 1 / 7) < 0.06  # 800 draws: s.d. 0.012
     assert "Held-out actions" in capsys.readouterr().out
 
 

@@ -114,7 +114,7 @@ def test_weights_are_right_whatever_is_proposed(human, table, monkeypatch):
     """Means with the residual proposed and without agree within what chance explains."""
     torch.manual_seed(0)
     plain = Sampler(human, table)
-    plain.draw(6000)
+    plain.draw(3000)
     proposed = Sampler(human, table)
     proposed.draw(300)
     proposed.learn_residual(proposed.weighted())

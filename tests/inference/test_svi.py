@@ -9,7 +9,6 @@ import torch
 from example_combinations import fixed_policy, some_policy
 from example_views import Sure
 
-from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import CheckpointError
 from mirror_ppl.inference.engines import InferenceOptions, infer
 from mirror_ppl.inference.results.fitting import fit_people
@@ -20,7 +19,6 @@ from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores
 from mirror_ppl.likelihood.view_table import NO_VIEW
-from mirror_ppl.models import HumanModel
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.progress import silent
 
@@ -179,13 +177,12 @@ def test_impossible_options_are_refused(name, value, message):
 
 
 def test_people_are_fitted_in_batches_that_do_not_depend_on_each_other(
-    self_model, tmp_path, monkeypatch
+    few, recordings, tmp_path, monkeypatch
 ):
     from mirror_ppl.inference import batches
 
-    human = HumanModel(self_model)
-    recordings = load_demonstrations(asset_path("driving_fog_paper.nc")).select_rounds([0])
-    recordings = recordings.select_people([0, 1, 2])
+    human = few
+    recordings = recordings.select_rounds([0]).select_people([0, 1, 2])
     options = InferenceOptions("svi", 6, SVIOptions(steps=4, checkpoint_every=2))
     monkeypatch.setattr(batches, "PEOPLE_AT_ONCE", 2)
     found = infer(human, recordings, options, 3)
