@@ -53,7 +53,7 @@ def test_solves_a_task_that_it_must(rule, generator):
 
 
 def test_similar_people_share_weights(generator):
-    data = group(avoid, generator, 8, 14)
+    data = group(avoid, generator, 4, 14)
     train, validation, test = parts(data, (0, 1), (1, 6), (6, 14))
     together = fit_pooled_logistic(train, validation)
     nll = mean_nll(together.log_probabilities(test), test.actions).mean()

@@ -110,7 +110,7 @@ def test_an_item_is_relevant_where_another_value_would_change_what_is_best():
 
 
 def test_in_two_rooms_the_key_matters_only_where_the_door_is_in_the_way():
-    world = load_world(UNLOCKING)
+    world = type("Fewer", (type(load_world(UNLOCKING)),), {"layouts": 40})()
     tables, column = world.tables, world.tables.observation["ego"][:, 1]
     key, goal = world.relevance(tables.observation)["decisive"]["visual"].unbind(-1)
     beyond = world.distance(tables.observation)[0][:, 1] == 1
@@ -119,7 +119,7 @@ def test_in_two_rooms_the_key_matters_only_where_the_door_is_in_the_way():
     # With the goal at hand a key is at most in the way.
     assert key[left & ~beyond].float().mean() < 0.1
     assert not key[taken & left].any(), "the key is in their hands"
-    # Of most states there is one with the key elsewhere; 60 layouts do not have them all.
+    # Of most states there is one with the key elsewhere; 40 layouts do not have them all.
     assert key[left & beyond & ~taken].float().mean() > 0.3
     assert goal[left].float().mean() > 0.5
 

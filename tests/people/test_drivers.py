@@ -267,7 +267,7 @@ def test_probabilities_follow_values_and_consistency(generator):
 
 def test_the_search_finds_nearly_all_of_the_exact_values(seed):
     drivers = simulated_drivers("clear", "paper", 10, 0)
-    recording = record(drivers, draw_starts(10, 30, seed, "a test of planning"))
+    recording = record(drivers, draw_starts(10, 15, seed, "a test of planning"))
     memory, lanes = recording.memory, recording.observation["ego"][:, :, :-1, 0].long()
     reward = drivers.reward
     rewards = lane_rewards(

@@ -156,7 +156,7 @@ def test_the_same_call_gives_the_same_recordings(fog):
 def test_messages_are_recorded_and_as_frequent_as_asked_for(domain, monkeypatch):
     """Messages are 10% of the items that can be communicated; people and starts stay the same."""
     monkeypatch.setattr(Highway, "horizon", 8)
-    number = 4 if domain == "highway" else 20  # of many steps
+    number = 2 if domain == "highway" else 20  # of many steps
     quiet = simulate(domain, people=2, rounds=number, seed=0)
     spoken_to = simulate(domain, people=2, rounds=number, seed=0, told=0.1)
     assert not any(mask.any() for mask in quiet.told.values())
