@@ -10,12 +10,14 @@ import pytest
 from paths import EXAMPLES
 from running import command
 
+from mirror_ppl import infer
 from mirror_ppl.commands import assist, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.evaluation import assistance_cells
 from mirror_ppl.evaluation.assistance import COMMUNICATORS
+from mirror_ppl.inference.results.export import netcdf_content
 
 SMALL = ("--rounds", "2", "--draws", "4", "--horizon", "2", "--jobs", "1")
 
@@ -30,6 +32,14 @@ def posterior(tmp_path_factory):
     small = ("--demos", folder / "some.nc", "--explore", "0", "--draws", "6")
     assert command(fit, *small, "--out", folder / "out") == 0
     return folder / "out" / "posterior.nc"
+
+
+def posterior_of(recordings, folder, **options):
+    """The file of a posterior, without the pictures of a fit."""
+    fitted = infer(recordings, explore=0, **options)
+    path = folder / "posterior.nc"
+    path.write_bytes(bytes(netcdf_content(fitted.data)))
+    return path
 
 
 def content(folder):
@@ -317,13 +327,12 @@ def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     quickly("mirror", "mirror-self-model")
     example = EXAMPLES / "late_reactions.py"
     late = ("--human-model", f"{example}:LatePerson")
-    demos = ("--demos", posterior.parents[1] / "some.nc")
-    small = ("--train-rounds", "0", "--explore", "0", "--draws", "6", "--out", tmp_path)
-    assert command(fit, *demos, *small, *late) == 0
-    capsys.readouterr()
+    some = load_demonstrations(posterior.parents[1] / "some.nc")
+    one = some.select_people([0]).select_rounds([0])
+    path = posterior_of(one, tmp_path, human=late[1], train_rounds=0, draws=6)
     own = (
         "--posterior",
-        tmp_path / "posterior.nc",
+        path,
         *late,
         *SMALL,
         "--people",
@@ -360,11 +369,8 @@ def test_nobody_plans_in_a_world_that_the_robot_was_taught_wrong_unless_asked_to
     quickly("mirror", "mirror-self-model")
     everybody = load_demonstrations(asset_path("bomb_defusal_unlabelled_paper.nc"))
     one = everybody.select_people([0]).select_rounds([0])
-    save_demonstrations(tmp_path / "one.nc", one)
-    small = ("--train-rounds", "0", "--explore", "0", "--draws", "4", "--out", tmp_path)
-    assert command(fit, "--demos", tmp_path / "one.nc", *small) == 0
-    capsys.readouterr()
-    bomb = ("--posterior", tmp_path / "posterior.nc", "--rounds", "1", "--draws", "4")
+    path = posterior_of(one, tmp_path, train_rounds=0, draws=4)
+    bomb = ("--posterior", path, "--rounds", "1", "--draws", "4")
     bomb += ("--horizon", "1", "--patience", "1", "--jobs", "1", "--json", tmp_path / "a.json")
     assert command(assist, *bomb) == 0
     told = "mirror-self-model is left out: the robot was taught wrong in bomb_defusal"

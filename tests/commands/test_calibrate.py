@@ -1,5 +1,8 @@
 """`python -m mirror_ppl.calibrate`, on toys whose posterior is quick."""
 
+import io
+from contextlib import redirect_stderr, redirect_stdout
+
 import pytest
 from PIL import Image
 from running import command
@@ -30,27 +33,32 @@ def names(folder):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A calibration of 20 people, in one go."""
+def done(tmp_path_factory):
+    """A folder with a calibration of 20 people, in one go, and what the command said."""
     folder = tmp_path_factory.mktemp("whole")
-    assert command(calibrate, *quick(folder)) == 0
-    return Calibration.load(folder / "out" / "calibration.nc").data
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
+        assert command(calibrate, *quick(folder)) == 0
+    return folder / "out", out.getvalue(), err.getvalue()
 
 
-def test_it_prints_and_writes_what_it_found(tmp_path, capsys):
-    assert command(calibrate, *quick(tmp_path, people=10)) == 0
-    out, err = capsys.readouterr()
-    assert "10 people drawn from the prior" in out
+@pytest.fixture(scope="module")
+def whole(done):
+    return Calibration.load(done[0] / "calibration.nc").data
+
+
+def test_it_prints_and_writes_what_it_found(done):
+    folder, out, err = done
+    assert "20 people drawn from the prior" in out
     words = "reach", "in sight", "otherwise", "not rejected for any of 3", "calibration.nc"
-    for word in (*words, "Of 10 people, only gross faults would show"):
+    for word in (*words, "Of 20 people, only gross faults would show"):
         assert word in out
-    assert "2/2 people " in err
-    assert names(tmp_path / "out") == RESULTS
-    calibration = Calibration.load(tmp_path / "out" / "calibration.nc")
-    assert calibration.people == 10 and calibration.draws == 19
+    assert "4/4 people " in err
+    assert names(folder) == RESULTS
+    calibration = Calibration.load(folder / "calibration.nc")
+    assert calibration.people == 20 and calibration.draws == 19
     assert calibration.data.attrs["human_model"] == "Toy"
     assert calibration.data.attrs["engine"] == "importance"
-    with Image.open(tmp_path / "out" / "ranks.png") as image:
+    with Image.open(folder / "ranks.png") as image:
         assert len(image.convert("L").getcolors()) > 10
 
 

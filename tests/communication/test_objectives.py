@@ -114,7 +114,7 @@ def reference(someone, past, world, candidates, horizon, discount=1.0):
     [
         (0, 4, 3, 1.0, HumanModel, SimulatorWorld),
         (3, 3, 2, 0.8, HumanModel, SimulatorWorld),
-        (6, 4, 4, 0.9, HumanModel, SimulatorWorld),
+        (6, 3, 3, 0.9, HumanModel, SimulatorWorld),
         (2, 3, 2, 0.9, HumanModel, SelfModelWorld),
         (2, 3, 3, 1.0, Averaging, SimulatorWorld),
     ],

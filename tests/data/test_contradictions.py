@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from example_recordings import loaded
 from running import command
 
 from mirror_ppl.commands import fit
-from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
+from mirror_ppl.data import asset_path, save_demonstrations
 from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError, MirrorError
@@ -30,7 +31,7 @@ SHIPPED = [
 
 def recorded(name):
     """Two people's first five rounds."""
-    every = load_demonstrations(asset_path(f"{name}.nc"))
+    every = loaded(asset_path(f"{name}.nc"))
     return every.select_people([0, 3]).select_rounds(range(5))
 
 

@@ -65,7 +65,7 @@ def test_a_file_without_optional_parts(path):
     lengths=st.lists(st.lists(st.integers(1, 6), max_size=4), min_size=1, max_size=4),
     seed=st.integers(0, 2**16),
 )
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_rounds_and_people_of_any_number_survive_a_file(tmp_path_factory, lengths, seed):
     made = Demonstrations(**fields(lengths, seed=seed))
     path = tmp_path_factory.mktemp("any") / "recordings.nc"

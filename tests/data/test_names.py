@@ -16,11 +16,8 @@ from mirror_ppl.plots.picture import Picture, displayable, label_of
 STRANGE = (
     r"$\foo$",
     "$x^$",
-    "[/]",
-    ":smile: [red]",
-    "\N{HEBREW LETTER ALEF}",
-    "\U0001f600",
-    "\u5c71\u7530",
+    "[/] :smile: [red]",
+    "\N{HEBREW LETTER ALEF}\U0001f600\u5c71\u7530",
     "n" * 100,
 )
 REFUSED = ("two\nlines", "tab\t", "n" * 101, "", " ", "ana ", "\ud800")
@@ -71,8 +68,8 @@ def test_other_ids_are_refused_at_load(some, tmp_path, capsys, name):
 
 def test_ids_that_are_no_text_are_refused(some, tmp_path):
     for what, ids in {
-        "the dtype float64": np.arange(8.0),
-        "times": np.arange(8).astype("datetime64[ns]"),
+        "the dtype float64": np.arange(5.0),
+        "times": np.arange(5).astype("datetime64[ns]"),
     }.items():
         dataset = to_dataset(some).assign_coords(person=("person", ids))
         dataset.to_netcdf(tmp_path / "some.nc", engine="scipy")

@@ -191,11 +191,11 @@ def test_its_messages_attain_its_value(horizon):
 
 def test_no_other_way_to_speak_is_better(horizon, generator):
     horizon(6)
-    start = DOMAIN.initial(6, generator)
+    start = DOMAIN.initial(3, generator)
     for person in (driver(), driver(NOTHING, 1.0)):
         value = Oracle(person, start).value
         for say in (silence, everything):
-            others = [value_of(person, one(start, r), say, 6) for r in range(6)]
+            others = [value_of(person, one(start, r), say, 6) for r in range(3)]
             gain = value - torch.tensor(others)
             assert (gain > -1e-4).all()
             assert gain.max() > 0.05
