@@ -287,7 +287,7 @@ def test_a_fit_tells_kinds_apart_and_reports_how_probable_each_is(few_reaches):
         **FEW,
         seed=1,
     )
-    drawn = torch.from_numpy(fit.data.posterior[KIND].values[0])  # [S, P]
+    drawn = torch.from_numpy(fit.data["posterior"][KIND].values[0])  # [S, P]
     for number, (kind, person) in enumerate(zip(KINDS, fit.summary["people"], strict=True)):
         assert (drawn[:, number] == number).float().mean() > 0.5, kind
         assert person["pareto_k"] < 0.7
