@@ -5,6 +5,7 @@ those of any process; only what is about an interpreter's start needs one of its
 """
 
 import gc
+import io
 import json
 import os
 import runpy
@@ -38,8 +39,9 @@ class Forks:
             number = other.fileno()
             words = [sys.executable, __file__, str(number)]
             # Streams that take pipes and files alike, as they do not believe that they can seek.
-            pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-            self.process = subprocess.Popen(words, pass_fds=[number], **pipes)
+            self.process = subprocess.Popen(
+                words, pass_fds=[number], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            )
 
     def start(self, module, *args, stdout, stderr, encoding=None):
         """Start ``python -m module``, or its function after a colon, and return its number."""
@@ -97,6 +99,7 @@ def main():
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if encoding is not None:
         for stream in (sys.stdout, sys.stderr):
+            assert isinstance(stream, io.TextIOWrapper)
             stream.reconfigure(encoding=encoding)
     module, _, function = module.partition(":")
     sys.argv = [module, *args]
@@ -115,9 +118,11 @@ def dask():
     parent, address = os.getppid(), sys.argv[1:]
 
     async def be():
-        kind = Worker if address else Scheduler
-        options = {"nthreads": 1} if address else {"host": "127.0.0.1", "port": 0}
-        async with kind(*address, dashboard_address=":0", **options) as own:
+        if address:
+            being = Worker(address[0], nthreads=1, dashboard_address=":0")
+        else:
+            being = Scheduler(host="127.0.0.1", port=0, dashboard_address=":0")
+        async with being as own:
             print(own.address, flush=True)
             while os.getppid() == parent:
                 await asyncio.sleep(0.5)

@@ -31,7 +31,7 @@ QUICK = ["mirror", "no-implants", "base-rate", "logistic", "bc", "bc-pooled", "s
 def few_steps(monkeypatch):
     """SQIL takes few steps: what it reads does not depend on their number."""
     baselines = Driving.record.baselines
-    fewer = baselines | {"sqil": {**baselines.get("sqil", {}), "epochs": 30}}
+    fewer = {**baselines, "sqil": {**baselines.get("sqil", {}), "epochs": 30}}
     monkeypatch.setattr(Driving, "record", replace(Driving.record, baselines=fewer))
 
 
