@@ -64,7 +64,10 @@ def run_tasks(
             own = {"backend": "loky", "initializer": _end_with, "initargs": (os.getpid(),)}
         worlds = added_worlds()
         context = _Context(_files_of_users(), worlds, _environments() if worlds else {})
-        calls = (delayed(partial(_in_worker, context, task))() for task in tasks)
+        each = (partial(_in_worker, context, task) for task in tasks)
+        if not here:  # Dask pickles classes of users by name, which its workers do not know
+            each = (partial(_called, pickled(call)) for call in each)
+        calls = (delayed(call)() for call in each)
         results = Parallel(n_jobs=jobs, return_as="generator_unordered", **own)(calls)
         try:
             yield from cast(Iterator[Result], results)
@@ -186,6 +189,11 @@ def _in_worker(context: _Context, task: Callable[[], Result]) -> Result:
 
     torch.set_num_threads(1)
     return _guarded(task)
+
+
+def _called(task: bytes) -> Any:
+    """Call a task that was pickled."""
+    return pickle.loads(task)()
 
 
 def _guarded(task: Callable[[], Result]) -> Result:
