@@ -71,6 +71,7 @@ def guarded(call: Callable[[], int]) -> int:
         try:
             status = call()
             sys.stdout.flush()
+            _leave_streams()  # what stderr cannot take does not make good work fail
             return status
         except (KeyboardInterrupt, Exception) as error:
             ending = _ending(error)

@@ -39,9 +39,10 @@ class Forks:
             number = other.fileno()
             words = [sys.executable, __file__, str(number)]
             # Streams that take pipes and files alike, as they do not believe that they can seek.
-            self.process = subprocess.Popen(
-                words, pass_fds=[number], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-            )
+            pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+            # With buffers that are written at the end, as users have them.
+            own = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+            self.process = subprocess.Popen(words, pass_fds=[number], env=own, **pipes)
 
     def start(self, module, *args, stdout, stderr, encoding=None):
         """Start ``python -m module``, or its function after a colon, and return its number."""
