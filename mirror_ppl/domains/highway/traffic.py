@@ -70,6 +70,8 @@ HEADING_GAIN, LATERAL_GAIN = 5.0, 1 / 0.6
 """Gains of lane keeping, per second."""
 WHEEL_LIMIT = math.pi / 3
 """Radians of the front wheels of other vehicles."""
+SLIP_LIMIT = math.atan(math.tan(WHEEL_LIMIT) / 2)
+"""Radians between their heading and their course at that limit."""
 SMALL = 1e-2
 """Speeds, distances: nothing is divided by less."""
 
@@ -176,7 +178,8 @@ def steer_to(flow: Flow, y: Tensor) -> Tensor:
     course = course.clamp(-math.pi / 4, math.pi / 4)
     turning = HEADING_GAIN * wrapped(course - flow.heading)
     slip = torch.asin((LENGTH / 2 / speed * turning).clamp(-1, 1))
-    return torch.atan(2 * torch.tan(slip)).clamp(-WHEEL_LIMIT, WHEEL_LIMIT)
+    # Before the tangent, which has the wrong sign at a right angle that is rounded up.
+    return torch.atan(2 * torch.tan(slip.clamp(-SLIP_LIMIT, SLIP_LIMIT)))
 
 
 def idm(speed: Tensor, intended: Tensor, headway: Tensor, gap: Tensor, closing: Tensor) -> Tensor:
