@@ -47,7 +47,7 @@ def test_solves_a_task_that_it_must(rule, generator):
     train, validation, test = (
         data.select_rounds(slice(*ends)) for ends in ((0, 40), (40, 50), (50, 80))
     )
-    networks = fit_soft_q(train, validation, SoftQOptions(patience=1000), seed=0)
+    networks = fit_soft_q(train, validation, SoftQOptions(epochs=60, patience=1000), seed=0)
     rate = (train.actions == SWITCH).float().mean()
     knowing_nothing = float(torch.special.entr(torch.stack([rate, 1 - rate])).sum())
     assert held_out_nll(networks, test).item() < 0.6 * knowing_nothing

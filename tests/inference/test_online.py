@@ -7,6 +7,7 @@ import pyro.distributions as dist
 import pytest
 import torch
 from example_person import Averaging
+from few_reaches import robot_of_few_reaches
 
 from mirror_ppl.communication import Person
 from mirror_ppl.data import asset_path, load_demonstrations
@@ -36,13 +37,21 @@ def rounds():
     return recordings.select_people([0]).select_rounds(range(4))
 
 
+@pytest.fixture(scope="module")
+def few_reaches():
+    return HumanModel(robot_of_few_reaches())
+
+
 @pytest.fixture(params=["amortized", "importance"])
-def asked(request, human, network, rounds):
-    """Two posteriors: of so many rounds one by one, and of all at once."""
+def asked(request, human, few_reaches, network, rounds):
+    """Two posteriors: of so many rounds one by one, and of all at once.
+
+    With the network, of the model that it is for; without, of one with fewer reaches.
+    """
 
     def of(number):
-        given = network if request.param == "amortized" else None
-        little, whole = OnlinePosterior(human, given), OnlinePosterior(human, given)
+        given = (human, network) if request.param == "amortized" else (few_reaches,)
+        little, whole = OnlinePosterior(*given), OnlinePosterior(*given)
         for one in range(number):
             little.add(rounds.select_rounds([one]))
         whole.add(rounds.select_rounds(range(number)))
