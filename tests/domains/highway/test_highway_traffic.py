@@ -9,7 +9,16 @@ from highway_states import state_of
 
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import scenarios, traffic
-from mirror_ppl.domains.highway.road import LANE_WIDTH, LENGTH, LIMIT, ROUND_TICKS, TICK, TICKS
+from mirror_ppl.domains.highway.road import (
+    LANE_WIDTH,
+    LANES,
+    LENGTH,
+    LIMIT,
+    ROUND_TICKS,
+    TICK,
+    TICKS,
+    centre_of,
+)
 from mirror_ppl.domains.highway.state import NEVER
 from mirror_ppl.domains.highway.world import DirectHighway
 
@@ -297,3 +306,29 @@ def test_calm_traffic_does_nothing_unusual(generator):
     state = rounds("calm traffic", 40, generator)
     assert (state.cue_at == NEVER).all() and (state.headway == scenarios.HEADWAY).all()
     assert (state.cruise[:, 0] == torch.tensor(LIMIT)).all()
+
+
+def test_other_cars_stay_on_the_road(coasting):
+    """In the numbers of few digits in which rounds are played, unlike those of parity."""
+    y, heading = coasting.y[..., 1:], coasting.heading[..., 1:]
+    assert y.dtype == torch.float32
+    assert (coasting.target_lane[-1] != coasting.target_lane[0]).any()
+    edges = centre_of(torch.tensor([0, LANES - 1]))
+    assert edges[0] - LANE_WIDTH / 2 < y.min() and y.max() < edges[1] + LANE_WIDTH / 2
+    assert heading.abs().max() < math.pi / 4
+
+
+@pytest.mark.parametrize("speed", [0.5, 2.0, 5.0, 8.0, 15.0])
+def test_cars_steer_alike_in_few_and_in_many_digits(speed):
+    """Slow ones turn the wheels to their limit, to the side of the lane that they move to."""
+    across = torch.tensor([-8.0, -4.0, -1.0, 1.0, 4.0, 8.0])
+    cars = [(20.0 * place, 4.0, 0.0, speed) for place in range(1, 1 + len(across))]
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        state = state_of(cars=cars, dtype=dtype)
+        goal = state.y.clone()
+        goal[1 : 1 + len(across)] += across.to(dtype)
+        found.append(traffic.steer_to(traffic.Flow.of(state), goal)[1 : 1 + len(across)])
+    torch.testing.assert_close(found[0].double(), found[1], atol=1e-5, rtol=0)
+    assert (found[0].sign() == across.sign()).all()
+    assert found[0].abs().max() == pytest.approx(traffic.WHEEL_LIMIT) or speed > 10
