@@ -269,7 +269,7 @@ PEOPLE = {
 """Of each kind: the model, rounds and what is known of somebody who is clearly of it."""
 
 
-def test_a_fit_tells_kinds_apart_and_reports_how_probable_each_is(few_reaches):
+def test_a_fit_distinguishes_kinds_and_reports_how_probable_each_is(few_reaches):
     """One fit of five people, of whom each is of another kind."""
     people = [
         replace(
