@@ -54,7 +54,7 @@ def pair(number):
 
 
 MARK = "MIRROR_PPL_TEST_WORKERS"
-"""Variable of the environment that tells workers of a test from others."""
+"""Variable of the environment by which workers of a test are found."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class NoOptions:
 
 
 def at_work():
-    """Be a command that tells that its workers work, which takes them a minute."""
+    """Be a command that says that its workers work, which takes them a minute."""
     from mirror_ppl.console import run
     from mirror_ppl.workers import run_tasks
 

@@ -155,7 +155,7 @@ WRONG = {
 
 @pytest.mark.parametrize("guide", ["importance", "amortized"])
 def test_importance_is_calibrated_and_wrong_posteriors_are_noticed(toy, network, guide):
-    """Of the same people, who are inferred once: as found, too narrow, and shifted."""
+    """The people are inferred once; posteriors are as found, too narrow, and shifted."""
     kept = {}
 
     def infer_once(recordings, seed, change=lambda value: value):

@@ -19,7 +19,7 @@ PRIORS = HyperPriors({"sees": torch.tensor([0.3, 0.7])}, 1.0, 0.5, 0.5)
 SEES = torch.tensor([[0, 1], [1, 1], [0, 0]])
 PLACE = torch.tensor([[0.7, 2.3], [2.0, 3.2], [1.5, 1.8]])
 LOG_PRIOR = torch.tensor([[-1.0, -2.0], [0.3, -1.5], [0.0, 1.0]])
-DRAWS = 1000
+DRAWS = 2000
 
 
 def people(sees=SEES, place=PLACE, log_prior=LOG_PRIOR):
@@ -69,11 +69,11 @@ def test_draws_have_the_exact_posterior(grids):
     assert probabilities["sees"].shape == (DRAWS, 2) and means.shape == spreads.shape == (DRAWS, 1)
     torch.testing.assert_close(probabilities["sees"].sum(-1), torch.ones(DRAWS))
     for place, value in enumerate((means[:, 0], spreads[:, 0].log(), probabilities["sees"][:, 0])):
-        # Of 1,000 draws that depend on each other at least 250 count; grids are finer than that.
+        # Of 2,000 draws that depend on each other at least 500 count; grids are finer than that.
         centre = expected[2 * place]
         width = (expected[2 * place + 1] - centre**2).sqrt()
-        assert abs(value.double().mean() - centre) < 4.5 * width / 250**0.5
-        assert 0.8 < value.double().std() / width < 1.2  # 4.5 standard errors of a normal
+        assert abs(value.double().mean() - centre) < 4.5 * width / 500**0.5
+        assert 0.85 < value.double().std() / width < 1.15  # 4.5 standard errors of a normal
 
 
 def test_spreads_are_weighed_with_the_mean_integrated_out():
@@ -125,11 +125,11 @@ def test_sites_are_known_by_their_names():
     priors = HyperPriors({"a": torch.full((2,), 0.5), "b": torch.full((3,), 1 / 3)}, 1.0, 0.5, 0.5)
     turned = dict(reversed(known.items()))
     one, same = (
-        sample_population(PeoplesDraws(own, place, LOG_PRIOR), priors, 100, 0)
+        sample_population(PeoplesDraws(own, place, LOG_PRIOR), priors, 300, 0)
         for own in (known, turned)
     )
     assert all(torch.equal(one[0][name], same[0][name]) for name in known)
-    assert one[0]["b"].shape == (100, 3) and one[0]["b"].mean(0)[2] > 0.6
+    assert one[0]["b"].shape == (300, 3) and one[0]["b"].mean(0)[2] > 0.6
     assert one[0]["a"].mean(0)[0] == pytest.approx(0.5, abs=0.2)
     assert one[1][:, 1].mean() > one[1][:, 0].mean() + 0.5
 

@@ -47,7 +47,7 @@ def self_model(world):
 
 
 few_reaches = cache(robot_of_few_reaches)
-"""Of driving: what is summed over has a thirtieth of the parts."""
+"""The robot of driving, with sums of a thirtieth of the parts."""
 
 
 def short_rounds(world, steps):

@@ -258,7 +258,7 @@ def of_kind(human, seed, rounds=6, **known):
 
 
 FEW = {"settings": {"proposals": 128, "enough": 25.0}, "draws": 100, "explore": 0}
-"""Settings with which kinds that differ much are told apart."""
+"""Settings with which kinds that differ much are distinguished."""
 PEOPLE = {
     "mirror": (HumanModel, 4, {}),
     "late": (Late, 5, {LATE: 0.95}),
@@ -266,7 +266,7 @@ PEOPLE = {
     "forgetting": (Forgetting, 4, {FORGETS: 0.7}),
     "preferring": (Preferring, 4, {SHARES_GOAL: -0.8}),
 }
-"""Of each kind: the model, rounds and what is known of somebody who is clearly of it."""
+"""Model, number of rounds and known implants of somebody who is clearly of each kind."""
 
 
 def test_a_fit_distinguishes_kinds_and_reports_how_probable_each_is(few_reaches):
@@ -325,7 +325,7 @@ def test_what_is_stratified_by_has_to_be_discrete(driving):
 
 @pytest.mark.parametrize("world", ["driving", "bomb_defusal"])
 def test_without_rounds_what_is_known_is_the_prior(world, few_reaches):
-    """Of both models of all kinds."""
+    """With both models of all kinds."""
     human = load_human_model("all", few_reaches if world == "driving" else self_model(world))
     rounds = simulate_from_prior(human, 1, 1, seed=1)
     fit = mirror_ppl.infer(rounds, human=human, engine="importance", train_rounds=0, **FEW)

@@ -118,12 +118,12 @@ def test_variants_are_special_cases(self_model, rounds):
 def test_a_variant_is_fitted_and_advises(tmp_path, monkeypatch, guide):
     """``no-implants``, ``per-item`` and ``one-radius`` are fitted; the last two also advise.
 
-    What advises is a posterior file, which does not hang on the guide.
+    What advises is a posterior file, which does not depend on the guide.
     """
     monkeypatch.chdir(tmp_path)
     assert command(simulate, "--people", 1, "--rounds", 2, "--out", "people.nc") == 0
     advises = ("per-item", "one-radius") if guide == "importance" else ()
-    for name in {"no-implants", "one-radius", *advises}:
+    for name in dict.fromkeys(("no-implants", "one-radius", *advises)):
         given = "--human-model", name, "--demos", "people.nc"
         status = command(
             fit, *given, "--guide", guide, "--train-rounds", 1, "--draws", 8, "--steps", 2,

@@ -13,8 +13,7 @@ from mirror_ppl.people import act, draw_starts, populations_of, simulated_people
 RECORDINGS = [(s, p) for s in Highway.settings for p in ("diverse", "paper")]
 
 
-def test_it_is_a_sound_world_of_the_package(monkeypatch):
-    monkeypatch.setattr(Highway, "horizon", 12)  # of random actions; an accident may come first
+def test_it_is_a_sound_world_of_the_package():
     world = get_domain("highway")
     assert isinstance(world, Highway) and DOMAINS["highway"] is world
     assert faults_of(world) == [] and populations_of("highway") == ("diverse", "paper")
