@@ -66,7 +66,9 @@ def run_tasks(
         context = _Context(_files_of_users(), worlds, _environments() if worlds else {})
         each = (partial(_in_worker, context, task) for task in tasks)
         if not here:  # Dask pickles classes of users by name, which its workers do not know
-            each = (partial(_called, pickled(call)) for call in each)
+            import cloudpickle
+
+            each = (partial(_called, cloudpickle.dumps(call)) for call in each)
         calls = (delayed(call)() for call in each)
         results = Parallel(n_jobs=jobs, return_as="generator_unordered", **own)(calls)
         try:
