@@ -1,4 +1,4 @@
-"""How much of a fit's time its matrix products take, which no better program could save.
+"""How much of a fit's time the matrix products that it makes would take alone.
 
     python -m benchmarks.floor
 
