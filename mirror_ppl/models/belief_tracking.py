@@ -10,7 +10,7 @@ n stands for people or histories that are tracked, m for distinct beliefs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -27,6 +27,7 @@ from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, overrides
 from mirror_ppl.models.networks import Gaussian
 from mirror_ppl.models.view import View
+from mirror_ppl.row_appending import RowBuffer
 from mirror_ppl.row_hashing import as_whole_numbers, distinct_rows, row_numbers
 
 CHUNK = 4096
@@ -63,11 +64,13 @@ class Memory:
             cannot tell observations apart.
         causes: belief before, action and key of the evidence, ``[k, 3]``.
         effects: the belief that follows from each, ``[k]``.
+        beliefs: memory of the beliefs of all steps, to which those of a step are appended.
     """
 
     observed: Tensor
     causes: Tensor
     effects: Tensor
+    beliefs: RowBuffer = field(default_factory=RowBuffer)
 
     @classmethod
     def of_rounds(cls, human: HumanModel, observation: Observation) -> Memory:
@@ -275,7 +278,9 @@ class BeliefState:
             if still is not None and before_scale is not None:
                 # A belief that does not change keeps its scale.
                 scale = torch.where(still[some, None], before_scale, scale)
-        mean, stayed = torch.cat([mean, means]), None
+        mean, stayed = means, None
+        if self.memory is not None:
+            mean = self.memory.beliefs.appended(self.mean, means)
         place = torch.arange(begin, len(mean), device=mean.device)
         if still is not None and len(some):
             stayed = torch.where(new, -1, before)

@@ -17,6 +17,7 @@ from mirror_ppl.models import HumanModel
 from mirror_ppl.models.belief_tracking import NOT_SHOWN, BeliefState, Memory, Transition
 from mirror_ppl.models.human import at_step, messages_at
 from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.row_appending import RowBuffer
 from mirror_ppl.row_hashing import row_numbers
 
 PEOPLE, STEPS = 60, 8
@@ -176,6 +177,19 @@ def test_a_belief_is_inferred_once(case, monkeypatch):
     first, index = states[-1].distinct()
     assert torch.equal(first.key()[index], states[-1].key())
     assert len(first.key().unique(dim=0)) == len(first.belief)
+
+
+def test_rows_that_were_returned_never_change():
+    buffer, parts = RowBuffer(), [torch.full((3, 2), float(part)) for part in range(6)]
+    found, expected = [parts[0]], [parts[0]]
+    # From the newest rows, from earlier ones, and from rows made elsewhere.
+    for part, origin in zip(parts[1:], [0, 1, 1, 3, 2], strict=True):
+        found.append(buffer.appended(found[origin], part))
+        expected.append(torch.cat([expected[origin], part]))
+    found.append(buffer.appended(found[-1][1:], parts[0]))
+    expected.append(torch.cat([expected[-1][1:], parts[0]]))
+    for rows, own in zip(found, expected, strict=True):
+        assert torch.equal(rows, own)
 
 
 def test_before_the_first_step_there_is_one_belief(case):
