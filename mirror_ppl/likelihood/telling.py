@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SAMPLE = 64
-"""Combinations that determine the order of rounds."""
-MANY = 4 * SAMPLE
+SAMPLE = 16
+"""Combinations that determine the order of rounds. More take more time than they save."""
+MANY = 16 * SAMPLE
 """Least number of combinations for which ordering the rounds pays."""
 
 
