@@ -13,7 +13,9 @@ class Screening:
 
     Attributes:
         margin: nats by which a combination's log-likelihood may fall behind the best one's, each
-            under its best policy.
+            under its best policy, after many rounds.
+        early: nats by which the margin is larger after the first round; divided by the number of
+            rounds from then on. What one round says of a person, others can contradict.
         policies: number of policies, which are draws of the implants from the prior.
         seed: seed of those draws.
         resolution: grid width for merging moments of a round: they are merged if their recorded
@@ -23,6 +25,7 @@ class Screening:
     """
 
     margin: float = 15.0
+    early: float = 25.0
     policies: int = 16
     seed: int = 0
     resolution: float = 0.03
@@ -31,9 +34,14 @@ class Screening:
     def __post_init__(self) -> None:
         for name, least in (
             ("margin", 0),
+            ("early", 0),
             ("policies", 1),
             ("resolution", 0),
             ("merge_policies", 1),
         ):
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
+
+    def margin_after(self, rounds: float) -> float:
+        """Return the margin after some rounds, which may be parts of rounds."""
+        return self.margin + self.early / max(rounds, 1.0)

@@ -7,6 +7,7 @@ and exact marginalization stays cheap.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -49,6 +50,9 @@ SCREENED_ROWS, MOST_ROWS = 4096, 32768
 the number at which they take as long as the calls' overhead: later rounds have fewer left."""
 CHAINED_ROUNDS = 32
 """Rounds that are processed at once where attention is summed out exactly."""
+BEGINNING, LONG = 12, 3
+"""Steps of a round's beginning, and how many times as long rounds are whose beginnings are looked at
+first. In shorter rounds views of these take as long as views of the whole."""
 FEW_ROUNDS = 2
 """Number of rounds up to which they are processed in the given order."""
 GROWTH = 3
@@ -113,6 +117,7 @@ class ViewTableBuilder:
             number = len(next(iter(self.policies.values())))
         self.score = torch.zeros(number, prod(self.sizes), device=device)
         self._likelihoods = PolicyLikelihoods(human, self.policies, number)
+        self._share, self._evidence = 1.0, 0.0  # of each round; rounds that the score is of
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
@@ -128,6 +133,8 @@ class ViewTableBuilder:
     @torch.no_grad()
     def add(self, rounds: Rounds) -> None:
         """Add rounds: the fewer combinations are left, the more rounds at once."""
+        if self._begins_with_beginnings(rounds):
+            self._drop_by_beginnings(rounds)
         order, before = self._order(rounds), len(self._rounds)
         if order is None:
             self._go_through(rounds)
@@ -141,11 +148,27 @@ class ViewTableBuilder:
         first = 0
         while first < len(rounds):
             some = rounds.at(first, first + self._at_once())
+            self._evidence += len(some) * self._share
             if self.human.chained:
                 self._add_chained(some)
             else:
                 self._add_together(some)
             first += len(some)
+
+    def _begins_with_beginnings(self, rounds: Rounds) -> bool:
+        """True if rounds are so long that a look at their beginnings saves time."""
+        long = rounds.actions.shape[1] >= LONG * BEGINNING
+        many = self.screening is not None and len(self.alive) >= MANY
+        return long and many and not self.human.has_round_latents
+
+    def _drop_by_beginnings(self, rounds: Rounds) -> None:
+        """Drop combinations by the first steps of all rounds, where views have hardly branched."""
+        first = copy.copy(self)
+        first.score, first._rounds, first._seen, first._recorded = self.score.clone(), [], [], []
+        first._share = BEGINNING / rounds.actions.shape[1]
+        order = first._order(beginnings := rounds.first_steps(BEGINNING))
+        first._go_through(beginnings if order is None else beginnings.chosen(order))
+        self.alive = first.alive
 
     def _order(self, rounds: Rounds) -> list[int] | None:
         """Order in which rounds are processed: the most informative about combinations first.
@@ -165,7 +188,7 @@ class ViewTableBuilder:
         policies = self._likelihoods.merging(self.screening)
         found = self._likelihoods.of_views(views, policies)[:, which].unflatten(-1, (number, -1))
         prior = (self.score + self.log_prior)[: len(found), some]
-        return telling_first(found, prior, self.screening.margin)
+        return telling_first(found, prior, self.screening.margin_after(1))
 
     def _at_once(self) -> int:
         """Number of rounds that are processed before combinations are dropped."""
@@ -282,7 +305,8 @@ class ViewTableBuilder:
         self.score[:, alive] = score
         # With the prior, whose factors and observed sites may rule combinations out.
         joint = score + self.log_prior[:, alive]
-        self.alive = alive[within(self.human, joint, screening.margin)]
+        margin = screening.margin_after(self._evidence)
+        self.alive = alive[within(self.human, joint, margin)]
 
     def table(self) -> ViewTable:
         """Build the table of the views that are left; needs at least one round."""

@@ -221,9 +221,11 @@ def test_infinite_margin_without_merging_changes_nothing(self_model, recordings)
         )
 
 
-@pytest.mark.parametrize("margin", [0.7, 2.0, 15.0])
-def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, recordings, margin):
-    human, screening = Few(self_model), Screening(margin=margin, resolution=0.0)
+@pytest.mark.parametrize(("margin", "early"), [(0.7, 0.0), (2.0, 1.5), (15.0, 25.0)])
+def test_screening_drops_whoever_falls_behind_and_never_the_best(
+    self_model, recordings, margin, early
+):
+    human, screening = Few(self_model), Screening(margin, early, resolution=0.0)
     rounds = recordings.select_rounds(range(4))
     whole = build_view_table(human, rounds)
     with pyro.plate("policy", screening.policies, dim=-3), pyro.plate("person", 1, dim=-2):
@@ -242,8 +244,9 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(self_model, rec
         best = (score + prior).amax(0).masked_fill(~expected, -math.inf)
         distance = best.amax(-1, keepdim=True) - best
         # Rounding may decide either way at the very margin; nobody is there here.
-        assert (distance - margin).abs().min() > 1e-3
-        expected &= distance <= margin
+        allowed = screening.margin_after(number + 1)
+        assert (distance - allowed).abs().min() > 1e-3
+        expected &= distance <= allowed
         # The best one so far stays.
         assert expected.gather(-1, best.argmax(-1, keepdim=True)).all()
     screened = build_view_table(human, rounds, screening=screening)
