@@ -12,6 +12,7 @@ from example_views import DRIVING, Few, Sure, log_likelihoods_by_hand, policies,
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
+from mirror_ppl.likelihood import view_table_builder
 from mirror_ppl.likelihood.combinations import MAX_COMBINATIONS, log_priors
 from mirror_ppl.likelihood.enumeration import combination_values
 from mirror_ppl.likelihood.screening import Screening
@@ -257,6 +258,61 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(
     # With the margin that is used, the best of all rounds is never among the dropped.
     best = (score + prior).amax(0).argmax(-1, keepdim=True)
     assert margin < 15 or expected.gather(-1, best).all()
+
+
+@pytest.mark.parametrize("early", [0.0, 4.0])
+def test_beginnings_of_long_rounds_drop_combinations_before(
+    self_model, recordings, monkeypatch, early
+):
+    human, rounds = Few(self_model), rounds_of(recordings.select_rounds(range(6)), 0)
+    screening = Screening(1.0, early, resolution=0.0)
+    plain = ViewTableBuilder(human, screening)
+    plain.add(rounds.first_steps(5))
+    monkeypatch.setattr(view_table_builder, "MANY", 2)
+    monkeypatch.setattr(view_table_builder, "BEGINNING", 5)
+    margins, margin_after = [], Screening.margin_after
+
+    def noted(self, number):
+        margins.append(number)
+        return margin_after(self, number)
+
+    monkeypatch.setattr(Screening, "margin_after", noted)
+    monkeypatch.setattr(ViewTableBuilder, "_order", lambda self, rounds: None)
+    found = ViewTableBuilder(human, screening)
+    found.add(rounds)
+    # Rounds 0; 1 to 3; 4 and 5: a third of each, then the whole.
+    assert margins == pytest.approx([1 / 3, 4 / 3, 2, 1, 4, 6])
+    begun = [part for part, _ in found._seen][0]
+    assert len(begun) < 14
+    if not early:  # with it, the margin differs between a third of a round and a round
+        assert torch.equal(begun, plain.alive)
+    after = ViewTableBuilder(human, screening, candidates=begun)
+    monkeypatch.setattr(view_table_builder, "MANY", 15)
+    after.add(rounds)
+    assert torch.equal(found.alive, after.alive) and torch.equal(found.score, after.score)
+    assert_tables_equal(found.table(), after.table())
+    monkeypatch.setattr(view_table_builder, "LONG", 4)
+    monkeypatch.setattr(view_table_builder, "MANY", 2)
+    short = ViewTableBuilder(human, screening)
+    short.add(rounds)
+    assert len(short._seen[0][0]) == 14
+
+
+def test_what_one_round_contradicts_is_kept_until_others_agree(self_model, recordings):
+    """A round that leaves one combination 20 nats behind drops it only without other rounds."""
+    human = Few(self_model)
+    for early, kept in ((0.0, False), (25.0, True)):
+        builder = ViewTableBuilder(human, Screening(15.0, early))
+        builder.add(rounds_of(recordings.select_rounds([0]), 0))
+        builder.alive, builder._evidence = torch.arange(14), 1.0
+        builder.score.zero_()
+        found = torch.zeros_like(builder.score)
+        found[:, 3] = -20.0
+        builder._screen(found, builder.screening)
+        assert (3 in builder.alive.tolist()) == kept
+        builder._evidence = 20.0
+        builder._screen(torch.zeros_like(builder.score)[:, builder.alive], builder.screening)
+        assert 3 not in builder.alive.tolist()
 
 
 def test_a_memory_that_is_not_used_leaves_the_likelihoods_as_they_are(self_model, recordings):
