@@ -51,7 +51,7 @@ the number at which they take as long as the calls' overhead: later rounds have 
 CHAINED_ROUNDS = 32
 """Rounds that are processed at once where attention is summed out exactly."""
 BEGINNING, LONG = 12, 3
-"""Steps of a round's beginning, and how many times as long rounds are whose beginnings are looked at
+"""Steps of a round's beginning, and how many times as long rounds must be for it to be looked at
 first. In shorter rounds views of these take as long as views of the whole."""
 FEW_ROUNDS = 2
 """Number of rounds up to which they are processed in the given order."""
