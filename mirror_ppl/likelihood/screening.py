@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from mirror_ppl.errors import InputError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Screening:
     """Settings of screening, which drops combinations of discrete implants during compilation.
 
     Attributes:
         margin: nats by which a combination's log-likelihood may fall behind the best one's, each
             under its best policy, after many rounds.
-        early: nats by which the margin is larger after the first round; divided by the number of
-            rounds from then on. What one round says of a person, others can contradict.
+        early: nats by which the margin is larger after the first round. After n rounds it is
+            ``margin + early / n``, since later rounds can contradict early ones.
         policies: number of policies, which are draws of the implants from the prior.
         seed: seed of those draws.
         resolution: grid width for merging moments of a round: they are merged if their recorded
@@ -43,5 +43,5 @@ class Screening:
                 raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
 
     def margin_after(self, rounds: float) -> float:
-        """Return the margin after some rounds, which may be parts of rounds."""
+        """Return the margin after some rounds; with none, that of the first."""
         return self.margin + self.early / max(rounds, 1.0)

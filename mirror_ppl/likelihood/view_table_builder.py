@@ -117,7 +117,7 @@ class ViewTableBuilder:
             number = len(next(iter(self.policies.values())))
         self.score = torch.zeros(number, prod(self.sizes), device=device)
         self._likelihoods = PolicyLikelihoods(human, self.policies, number)
-        self._share, self._evidence = 1.0, 0.0  # of each round; rounds that the score is of
+        self._share, self._evidence = 1.0, 0.0  # what a round counts; rounds counted so far
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
@@ -157,15 +157,19 @@ class ViewTableBuilder:
 
     def _begins_with_beginnings(self, rounds: Rounds) -> bool:
         """True if rounds are so long that a look at their beginnings saves time."""
-        long = rounds.actions.shape[1] >= LONG * BEGINNING
+        long = int(rounds.real.sum(-1).max()) >= LONG * BEGINNING
         many = self.screening is not None and len(self.alive) >= MANY
         return long and many and not self.human.has_round_latents
 
     def _drop_by_beginnings(self, rounds: Rounds) -> None:
-        """Drop combinations by the first steps of all rounds, where views have hardly branched."""
+        """Drop combinations by the first steps of all rounds, where views have hardly branched.
+
+        With the margin of a first round throughout, since the rest of each round, of which nothing
+        is known yet, can contradict all beginnings.
+        """
         first = copy.copy(self)
         first.score, first._rounds, first._seen, first._recorded = self.score.clone(), [], [], []
-        first._share = BEGINNING / rounds.actions.shape[1]
+        first._share = 0.0
         order = first._order(beginnings := rounds.first_steps(BEGINNING))
         first._go_through(beginnings if order is None else beginnings.chosen(order))
         self.alive = first.alive

@@ -40,7 +40,7 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.distributions import NormalizedCategorical
 from mirror_ppl.models.handlers import AtStep, MaskObserved
-from mirror_ppl.models.networks import Gaussian, log_softmax_of_few
+from mirror_ppl.models.networks import Gaussian, log_of_sum, log_softmax_of_few
 from mirror_ppl.models.perception import perceived_by
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
@@ -307,8 +307,8 @@ class HumanModel(nn.Module):
         logits = logits + implant_priors.residual(implants, belief)
         lapse = implants["lapse"][..., None]
         aware = torch.log1p(-lapse) + log_softmax_of_few(logits)
-        lapsed = torch.log(lapse / logits.shape[-1]).expand_as(aware)
-        return implant_priors.executed(self.domain, implants, torch.logaddexp(aware, lapsed))
+        lapsed = torch.log(lapse / logits.shape[-1])
+        return implant_priors.executed(self.domain, implants, log_of_sum(aware, lapsed))
 
     def choose(
         self, implants: Implants, belief: Tensor, values: Tensor, action: Tensor | None = None

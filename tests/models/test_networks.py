@@ -11,6 +11,7 @@ from torch import nn
 
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.networks import (
+    LOW,
     MIN_SCALE,
     BinnedQNetwork,
     Decoder,
@@ -18,6 +19,7 @@ from mirror_ppl.models.networks import (
     QNetwork,
     Reward,
     Transition,
+    log_of_sum,
     log_softmax_of_few,
 )
 from mirror_ppl.models.self_model import SelfModel
@@ -278,3 +280,17 @@ def test_log_softmax_of_few_is_that_of_torch(shape, generator):
     # Of expanded inputs, too.
     wide = logits.detach().expand(2, *shape)
     torch.testing.assert_close(log_softmax_of_few(wide), wide.log_softmax(-1))
+
+
+@pytest.mark.parametrize("least", [-5.0, LOW + 0.1, LOW - 0.1, -200.0, -torch.inf])
+def test_log_of_sum_is_that_of_torch(least, generator):
+    first = -80 * torch.rand(50, 4, generator=generator)
+    first[0] = torch.tensor([0.0, -500.0, -90.0, -100.0])
+    first.requires_grad_()
+    second = torch.linspace(-1, -3, 50)[:, None].clone()
+    second[:2] = least
+    second.requires_grad_()
+    found, expected = log_of_sum(first, second), torch.logaddexp(first, second.expand_as(first))
+    torch.testing.assert_close(found, expected)
+    own, others = (torch.autograd.grad(value.sum(), [first, second]) for value in (found, expected))
+    torch.testing.assert_close(own, others)
