@@ -283,7 +283,7 @@ def _contents(
         from mirror_ppl.evaluation.film import film
         from mirror_ppl.plots.film import plot_film
 
-        shown = film(pairing, played)
+        shown = film(pairing, played, options.communicator)
         kind = options.film.suffix[1:].lower()
         contents[options.film] = plot_film(shown, posterior.people).content(kind)
     return contents

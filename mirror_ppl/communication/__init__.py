@@ -5,8 +5,9 @@ Three layers: the person (`person`, posterior draws of a human model tracked thr
 `Communicator` combines them.
 """
 
-from mirror_ppl.communication.communicator import Communicator, Decision, Gain
+from mirror_ppl.communication.communicator import Communicator
 from mirror_ppl.communication.companion import Companion
+from mirror_ppl.communication.decision import Decision, Gain
 from mirror_ppl.communication.messages import Channels, Message, every_message
 from mirror_ppl.communication.objectives import Divergence, ExpectedUtility, Objective, Valued
 from mirror_ppl.communication.person import Person, PlanningContext

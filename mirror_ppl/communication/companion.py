@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mirror_ppl.checks import require_kind
-from mirror_ppl.communication.communicator import Communicator, Decision
+from mirror_ppl.communication.communicator import Communicator
+from mirror_ppl.communication.decision import Decision
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import require_known

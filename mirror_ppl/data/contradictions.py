@@ -1,7 +1,7 @@
 """Checks that recordings are possible in their domain's world.
 
-Each observation has to be possible, and the action recorded at step t has to lead from the
-observation at time t to the one at time t + 1.
+Rounds are at most as long as the world's, each observation has to be possible, and the action
+recorded at step t has to lead from the observation at time t to the one at time t + 1.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ def check_world(demonstrations: Demonstrations, allowed: float = 0.0) -> Contrad
         The number of steps that do.
 
     Raises:
-        DemonstrationsError: an observation is impossible, or too many steps contradict each other;
-            the message says where the first is, what was expected and what was found.
+        DemonstrationsError: a round is too long, an observation is impossible, or too many steps
+            contradict each other; the message says where the first is, what was expected and what
+            was found.
     """
     wrong = []
     for person in range(demonstrations.num_people):  # one by one, to bound memory
@@ -95,7 +96,7 @@ def _observation(demonstrations: Demonstrations, person: int) -> Observation:
 
 
 def check_observations(demonstrations: Demonstrations) -> None:
-    """Check that each observation is possible in the domain's world.
+    """Check that each observation is possible in the domain's world, and no round too long.
 
     Raises:
         DemonstrationsError: one is not; the message names it and the rule that it breaks.
@@ -108,9 +109,16 @@ def _check_observations(
     demonstrations: Demonstrations, person: int, observation: Observation
 ) -> None:
     lengths = demonstrations.lengths[person][:, None]
+    domain = get_domain(demonstrations.domain)
+    number, most = int(lengths.argmax()), int(lengths.max())
+    if most > domain.horizon:
+        raise DemonstrationsError(
+            f"person {demonstrations.people[person]!r}, round {number}: {most} steps, expected at "
+            f"most {domain.horizon}, as long as rounds of {domain.name} are"
+        )
     times = torch.arange(demonstrations.ego.shape[2], device=lengths.device)
     real = (times <= lengths) & (lengths > 0)
-    for rule, broken in get_domain(demonstrations.domain).faults(observation).items():
+    for rule, broken in domain.faults(observation).items():
         where = (broken & real).nonzero()
         if len(where):
             number, time = where[0].tolist()

@@ -203,6 +203,7 @@ class Domain(Protocol):
     scenarios: tuple[str, ...]
     reward_terms: tuple[str, ...]
     mishap: tuple[str, str]
+    picture_legend: str
     counterparts: tuple[int | None, ...]
     directions: tuple[str, ...]
     direction_groups: tuple[tuple[int, ...], ...]
@@ -373,6 +374,10 @@ class Domain(Protocol):
 
     def render(self, state: Any) -> Any:
         """Draw a picture of one state, ``uint8 [height, width, 3]``."""
+        ...
+
+    def render_seen(self, state: Any, visible: Visibility) -> Any:
+        """Draw one state where somebody perceives some items ``[K]``."""
         ...
 
 

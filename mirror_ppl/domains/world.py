@@ -58,6 +58,7 @@ class World(ABC):
         record: this world's settings of training, planning and networks, its people and pictures;
             see :class:`~mirror_ppl.domains.record.Record`.
         mishap: reward term of a harmful event, and the plural of its name.
+        picture_legend: a sentence about pictures of states, which stands below films.
         partly_observed: True if full observations do not determine states; `state_behind` is then
             an estimate, as in ``random`` worlds.
         random: True if states hold a seed of what will happen by chance, which `transition` uses
@@ -79,6 +80,7 @@ class World(ABC):
     lasting: tuple[str, ...] = ()
     record: Record = Record()
     mishap: tuple[str, str]
+    picture_legend: str = ""
     partly_observed: bool = False
     random: bool = False
 
@@ -352,6 +354,11 @@ class World(ABC):
         share = (items / torch.tensor(visual.scales)).abs().clamp(0, 1)
         grey = (255 * (1 - share)).to(torch.uint8).numpy()
         return np.kron(grey, np.ones((PIXELS, PIXELS), np.uint8))[..., None].repeat(3, -1)
+
+    def render_seen(self, state: Any, visible: Visibility) -> np.ndarray:
+        """Draw a state where somebody perceives some items ``[K]``; by default :meth:`render`."""
+        del visible
+        return self.render(state)
 
     def _all(self, observation: Observation, which: Callable[[Modality], bool]) -> Visibility:
         """Return masks ``[..., K]``, constant in each modality."""

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from mirror_ppl.communication import rules
-from mirror_ppl.communication.communicator import Communicator, Decision
+from mirror_ppl.communication.communicator import Communicator
+from mirror_ppl.communication.decision import Decision
 from mirror_ppl.communication.hearing import HearingPerson
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.person import Person

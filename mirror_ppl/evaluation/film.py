@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
-from mirror_ppl.domains.base import Domain, map_state
+from mirror_ppl.communication.messages import Channels
+from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state
 from mirror_ppl.errors import OptionError
 from mirror_ppl.evaluation.assistance_cells import Pairing
 from mirror_ppl.evaluation.played import Played
@@ -31,24 +32,38 @@ def compared(communicators: Sequence[str]) -> tuple[str, str]:
     return chosen[0], chosen[1]
 
 
-def film(pairing: Pairing, played: Mapping[str, Sequence[Played]]) -> Film:
+def film(
+    pairing: Pairing,
+    played: Mapping[str, Sequence[Played]],
+    communicators: Sequence[str] | None = None,
+) -> Film:
     """Play back the round in which the second communicator gained most over the first.
 
     Args:
         pairing: that was played, with ``keep_log``.
-        played: results of the P people by communicator, at least two; see :func:`compared`.
+        played: results of the P people by communicator, at least two.
+        communicators: their names in the order that :func:`compared` reads; as in ``played``
+            unless given.
     """
-    pair = compared(list(played))
+    pair = compared([name for name in communicators or played if name in played])
     first, second = ([one.net for one in played[name]] for name in pair)
     gain = np.stack(second) - np.stack(first)
     person, number = (int(index) for index in np.unravel_index(gain.argmax(), gain.shape))
     (listener,) = pairing.listeners([person], inferred=False)
     begin = listener.start.round(number).state
-    a, b = (strip(pairing.domain, begin, name, played[name][person], number) for name in pair)
+    sees = listener.driver.sees
+    a, b = (strip(pairing.domain, begin, name, played[name][person], number, sees) for name in pair)
     return Film(pairing.domain, person, number, (a, b))
 
 
-def strip(domain: Domain, state: Any, name: str, played: Played, number: int) -> Strip:
+def strip(
+    domain: Domain,
+    state: Any,
+    name: str,
+    played: Played,
+    number: int,
+    sees: Callable[[Observation], Visibility],
+) -> Strip:
     """Play back one round by its logged actions.
 
     Args:
@@ -57,17 +72,27 @@ def strip(domain: Domain, state: Any, name: str, played: Played, number: int) ->
         name: of the communicator.
         played: a person's rounds, with their log.
         number: of the round.
+        sees: what the person sees of an observation without messages.
     """
     log = [entry for entry in played.log if entry["round"] == number]
     states = [state]
     for entry in log:
         action = torch.tensor([[domain.actions.index(entry["action"])]])
         states.append(domain.transition(states[-1], action))
+    channels = Channels(domain)
+    messages = [*(entry["message"] for entry in log), {}]
+    told = [channels.split(channels.flags(message)) for message in messages]
+    seen = [
+        {name: mask[0, 0] | said[name] for name, mask in sees(domain.observe(one)).items()}
+        for one, said in zip(states, told, strict=True)
+    ]
     return Strip(
         name,
         [map_state(lambda part: part[0, 0], one) for one in states],
+        seen,
         [_words(entry["message"]) for entry in log],
         [entry["action"] for entry in log],
+        [float(entry.get("gain", 0.0)) for entry in log],
         float(played.net[number]),
         played.mishaps[number],
     )

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from torch import Tensor
 
-from mirror_ppl.communication.communicator import Decision, gain_over_silence
+from mirror_ppl.communication.decision import Decision, gain_over_silence
 from mirror_ppl.communication.messages import Channels, Message
 from mirror_ppl.communication.search import Found
 from mirror_ppl.domains.base import require_known

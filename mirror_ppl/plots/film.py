@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from mirror_ppl.domains.base import Domain
+from mirror_ppl.domains.base import Domain, Visibility
 from mirror_ppl.errors import InputError
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLUE, GREY
@@ -28,16 +28,20 @@ class Strip:
     Attributes:
         communicator: its name.
         states: one before each decision and one after the last, without batch, T + 1.
+        seen: masks ``[K]`` of the items that the person saw or was shown or told of in each state.
         messages: what was communicated at each decision, in words, T.
         actions: of the person, by name, T.
+        gains: what each decision was expected to gain over silence, T; 0 if not known.
         net: rewards less costs of the round.
         mishaps: number of steps with the world's mishap.
     """
 
     communicator: str
     states: list[Any]
+    seen: list[Visibility]
     messages: list[list[str]]
     actions: list[str]
+    gains: list[float]
     net: float
     mishaps: int
 
@@ -63,8 +67,9 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
     """Draw the same round with two communicators, step by step.
 
     Communicators stand below each other, or side by side where pictures of the world are wide.
-    Steps at which messages or actions differ come first, then others. Below each frame stand what
-    was communicated (blue) and what the person did then.
+    Of the steps at which messages or actions differ, the first one is drawn and those at which
+    messages were expected to gain most, then others. Below each frame stand what was communicated
+    (blue) and what the person did then.
 
     Args:
         film: from :func:`mirror_ppl.evaluation.film.film`.
@@ -83,7 +88,7 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
     tall = each * height / width + (0.62 if side_by_side else 1.1)
     shape = (len(steps), 2) if side_by_side else (2, len(steps))
     figure = Picture(figsize=(each * shape[1] + 0.3, tall * shape[0] + 0.9), layout="constrained")
-    title = f"Round {film.round + 1} of {label_of(people[film.person])}"
+    title = f"Round {film.round} of {label_of(people[film.person])}, counted from 0"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     parts = figure.subfigures(*((1, 2) if side_by_side else (2, 1)), squeeze=False).flat
     for part, strip in zip(parts, film.strips, strict=True):
@@ -91,11 +96,13 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
         one = (len(steps), 1) if side_by_side else (1, len(steps))
         for ax, step in zip(part.subplots(*one, squeeze=False).flat, steps, strict=True):
             _frame(ax, film, strip, step, 60 if side_by_side else 34)
+    if film.domain.picture_legend:
+        figure.supxlabel(film.domain.picture_legend, fontsize=9, color=GREY)
     return figure
 
 
 def _steps(film: Film, frames: int) -> list[int]:
-    """Choose steps: the last, the first ones that differ, and others at equal distances."""
+    """Choose steps: the last, the first that differs, those of the largest gains, and others."""
     one, other = film.strips
     last = max(len(one.actions), len(other.actions))
     differ = [
@@ -104,7 +111,13 @@ def _steps(film: Film, frames: int) -> list[int]:
         if one.messages[step : step + 1] != other.messages[step : step + 1]
         or one.actions[step : step + 1] != other.actions[step : step + 1]
     ]
-    chosen = {last, *differ[: frames - 1]}
+    gains = [
+        max(strip.gains[step : step + 1], default=0.0)
+        for strip in film.strips
+        for step in range(last)
+    ]
+    ranked = sorted(differ[1:], key=lambda step: -max(gains[step], gains[last + step]))
+    chosen = {last, *differ[:1], *ranked[: frames - 2]}
     for step in np.linspace(max(min(differ, default=0) - 1, 0), last, frames):
         if len(chosen) < frames:
             chosen.add(round(step))
@@ -120,11 +133,12 @@ def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> No
     """Draw the state before a step, or the last one where the round is over by then."""
     ax.set_axis_off()
     end = len(strip.actions)
-    ax.imshow(film.domain.render(strip.states[min(step, end)]))
+    shown = min(step, end)
+    ax.imshow(film.domain.render_seen(strip.states[shown], strip.seen[shown]))
     if step >= end:
-        ax.set_title("the end" if step == end else f"over since step {end + 1}", fontsize=9)
+        ax.set_title("the end" if step == end else f"over since step {end}", fontsize=9)
         return
-    ax.set_title(f"step {step + 1}", fontsize=9)
+    ax.set_title(f"step {step}", fontsize=9)
     lines = [(f"then: {strip.actions[step]}", GREY)]
     if strip.messages[step]:
         lines.insert(0, (", ".join(strip.messages[step]), BLUE))

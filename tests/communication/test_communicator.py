@@ -28,7 +28,8 @@ from mirror_ppl.communication import (
     SimulatorWorld,
     Valued,
 )
-from mirror_ppl.communication.communicator import TIE, choose, gain_over_silence
+from mirror_ppl.communication.communicator import choose
+from mirror_ppl.communication.decision import TIE, gain_over_silence
 from mirror_ppl.domains.driving import Driving
 
 WORLD = SimulatorWorld(DOMAIN)

@@ -1,11 +1,13 @@
 """Decisions: the message in all forms, the table of alternatives, what mattered, and why."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from example_person import CHANNELS, DOMAIN, begun, flags, plan
 
 from mirror_ppl.communication import Decision, Gain, Valued
-from mirror_ppl.communication.communicator import gain_over_silence
+from mirror_ppl.communication.decision import gain_over_silence
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.search import Found
 from mirror_ppl.domains.bomb_defusal import BombDefusal, BombState
@@ -23,7 +25,8 @@ def decision(chosen, candidates, utility, actions=None):
     found = Found(torch.stack(candidates), values)
     flags_ = found.candidates[chosen, 0]
     gain = gain_over_silence(values, chosen)
-    return Decision(CHANNELS.message(flags_), flags_, gain, DOMAIN, now, found, chosen, DOMAIN)
+    message = CHANNELS.message(flags_)
+    return Decision(message, flags_, gain, DOMAIN, now, found, chosen, DOMAIN, standard_errors=2.0)
 
 
 def four(chosen=3, actions=None):
@@ -202,6 +205,17 @@ def test_why_silence():
     )
 
 
+def test_why_silence_says_which_rule_asks_for_it():
+    """A gain of 1 with a standard error of .5."""
+    part = 0.5**0.5
+    gains = [[0.0, 0], [1 + part / 2**0.5, 1 - part / 2**0.5]]
+    one = replace(decision(0, [plan(None), plan(SAID)], gains), standard_errors=2.5)
+    text = "silence: no message is reliably worth its cost (the best gains +1.00 [+0.18, +1.82]"
+    assert one.why() == f"{text}, fewer than 2.5 standard errors)"
+    one = replace(one, standard_errors=1.5)
+    assert one.why() == text.replace("message", "item of a message") + ")"
+
+
 @pytest.mark.parametrize(
     ("wait", "steps"), [([None, SAID, None], "1 step"), ([None, None, SAID], "2 steps")]
 )
@@ -250,7 +264,7 @@ def test_why_names_what_the_plan_sends_later_since_the_gain_is_of_both():
 
 
 def test_why_where_no_action_changes_much():
-    assert turned([[0.9, 0.1]], [[0.87, 0.13]]).why() == (
+    assert turned([[0.9, 0.1]], [[0.895, 0.105]]).why() == (
         f"{AHEAD}: slightly changes what they do in the steps ahead (gain +1.00)"
     )
 

@@ -10,7 +10,7 @@ from running import command
 
 from mirror_ppl.commands import fit
 from mirror_ppl.data import asset_path, save_demonstrations
-from mirror_ppl.data.contradictions import check_world
+from mirror_ppl.data.contradictions import check_observations, check_world
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import DemonstrationsError, MirrorError
 from mirror_ppl.inference.online import OnlinePosterior
@@ -156,6 +156,27 @@ def noisy():
     actions = rounds.actions.clone()
     actions[:, 0, 0] = 1 - actions[:, 0, 0]
     return with_actions(rounds, actions)
+
+
+@pytest.mark.parametrize("check", [check_world, check_observations])
+def test_rounds_longer_than_those_of_the_world_are_refused(check):
+    rounds = recorded("driving_fog_paper").select_rounds(range(2))
+    last = {name: value[:, :, -1:] for name, value in rounds.observations.items()}
+    long = replace(
+        rounds,
+        ego=torch.cat([rounds.ego, rounds.ego[:, :, -1:]], 2),
+        observations={
+            name: torch.cat([value, last[name]], 2) for name, value in rounds.observations.items()
+        },
+        actions=torch.cat([rounds.actions, rounds.actions[:, :, -1:]], 2),
+        lengths=rounds.lengths + 1,
+        told={},
+        rewards=None,
+        action_entropy=None,
+    )
+    text = "round 0: 16 steps, expected at most 15, as long as rounds of driving are"
+    with pytest.raises(DemonstrationsError, match=f"person '{rounds.people[0]}', {text}"):
+        check(long)
 
 
 def test_a_share_of_contradictions_may_be_allowed():

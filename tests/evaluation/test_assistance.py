@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mirror_ppl.communication import rules
-from mirror_ppl.communication.communicator import Decision, Gain
+from mirror_ppl.communication.decision import Decision, Gain
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.objectives import Valued
 from mirror_ppl.communication.search import Found

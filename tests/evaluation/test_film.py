@@ -6,14 +6,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mirror_ppl.domains.base import total_reward
+from mirror_ppl.domains.base import map_state, total_reward
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.domains.driving.people import TaskDrivers
+from mirror_ppl.domains.highway.pictures import UNSEEN
 from mirror_ppl.errors import OptionError
 from mirror_ppl.evaluation.assistance import Listener, PlannerOptions, listeners, play, speaker
 from mirror_ppl.evaluation.film import compared, film, strip
 from mirror_ppl.people import draw_starts, simulated_people
-from mirror_ppl.plots.film import plot_film
+from mirror_ppl.plots.film import Film, plot_film
 
 DOMAIN = Driving()
 
@@ -54,7 +55,9 @@ def rewards_along(domain, one):
 def test_a_round_played_back_has_the_rewards_that_it_had(listener, played, name):
     own = played[name][0]
     for number in range(3):
-        one = strip(DOMAIN, listener.start.round(number).state, name, own, number)
+        one = strip(
+            DOMAIN, listener.start.round(number).state, name, own, number, listener.driver.sees
+        )
         assert len(one.states) == len(one.actions) + 1 == len(one.messages) + 1
         assert sum(rewards_along(DOMAIN, one)) == pytest.approx(own.task[number])
         assert one.net == pytest.approx(own.task[number] - own.cost[number])
@@ -72,6 +75,8 @@ def test_the_film_is_of_the_round_with_the_largest_gain(listener, played):
 def test_silence_comes_first_and_one_communicator_is_too_few():
     assert compared(("mirror", "none", "oracle")) == ("none", "mirror")
     assert compared(("mirror", "oracle")) == ("mirror", "oracle")
+    first = ("oracle", "none", "mirror")
+    assert compared(first) == ("none", "oracle")
     with pytest.raises(OptionError, match="--film compares two communicators, not mirror alone"):
         compared(("mirror",))
 
@@ -91,10 +96,47 @@ def test_steps_that_differ_are_drawn_first(listener, played):
         silent, messages=[["said: rear-left"] if step in (7, 9) else [] for step in range(20)]
     )
     figure = plot_film(replace(shown, strips=(silent, spoken)), ["ann"], frames=4)
-    assert titles(figure) == 2 * ["step 7", "step 8", "step 10", "the end"]
+    assert titles(figure) == 2 * ["step 6", "step 7", "step 9", "the end"]
     assert "said: rear-left" in texts(figure)
     figure = plot_film(replace(shown, strips=(silent, spoken)), ["ann"], frames=2)
-    assert titles(figure) == 2 * ["step 8", "the end"]
+    assert titles(figure) == 2 * ["step 7", "the end"]
+
+
+def test_steps_of_the_largest_gains_are_drawn(listener, played):
+    shown = film(pairing(listener), played)
+    silent, spoken = shown.strips
+    steps = len(silent.actions)
+    spoken = replace(
+        silent, messages=[["said: rear-left"]] * steps, gains=[float(step) for step in range(steps)]
+    )
+    for strips in ((silent, spoken), (spoken, silent)):
+        figure = plot_film(replace(shown, strips=strips), ["ann"], frames=4)
+        own = [f"step {number}" for number in (0, steps - 2, steps - 1)]
+        assert titles(figure) == 2 * [*own, "the end"]
+
+
+def test_a_film_of_the_highway_shows_what_the_driver_sees():
+    people = simulated_people("highway", "fog", "paper", 1, 0)
+    (driver,) = listeners(people, 1, "fog", 1, 0)
+    world = driver.domain
+    state = driver.start.round(0).state
+    log = [{"round": 0, "message": {"visual": ["rear"]}, "action": world.actions[7], "gain": 0.5}]
+    own = SimpleNamespace(log=log, net=[1.0], mishaps=[0])
+    one = strip(world, state, "mirror", own, 0, driver.driver.sees)
+    alone = people.sees(world.observe(state))["visual"][0, 0]
+    rear = one.seen[0]["visual"] & ~alone
+    assert rear[18] and not alone[18] and not rear[:10].any() and one.gains == [0.5]
+    silent = replace(one, seen=[people_sees(people, world, part) for part in one.states])
+    figure = plot_film(Film(world, 0, 0, (silent, one)), ["ann"], frames=2)
+    first, second = (part.axes[0].images[0].get_array() for part in figure.subfigs)
+    grey = [(image[..., :3] == UNSEEN).all(-1).sum() for image in (first, second)]
+    assert grey[0] > grey[1] > 0
+    assert any("dark grey ones are not seen" in text.get_text() for text in figure.texts)
+
+
+def people_sees(people, world, state):
+    batch = map_state(lambda part: part[None, None], state)
+    return {name: mask[0, 0] for name, mask in people.sees(world.observe(batch)).items()}
 
 
 def test_a_round_that_ended_early_stands_still(listener, played):
@@ -109,10 +151,10 @@ def test_a_round_that_ended_early_stands_still(listener, played):
     figure = plot_film(replace(shown, strips=(short, silent)), ["ann"], frames=3)
     assert titles(figure) == [
         "the end",
-        "over since step 6",
-        "over since step 6",
+        "over since step 5",
+        "over since step 5",
+        "step 5",
         "step 6",
-        "step 7",
         "the end",
     ]
 
@@ -120,7 +162,7 @@ def test_a_round_that_ended_early_stands_still(listener, played):
 def test_equal_rounds_are_drawn_too(listener, played):
     shown = film(pairing(listener), {"none": played["none"], "nearest": played["none"]})
     figure = plot_film(shown, ["ann"], frames=3)
-    assert titles(figure) == 2 * ["step 1", "step 9", "the end"]
+    assert titles(figure) == 2 * ["step 0", "step 8", "the end"]
 
 
 def test_pictures_that_are_not_wide_stand_below_each_other():

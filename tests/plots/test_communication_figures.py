@@ -9,7 +9,7 @@ from example_person import DOMAIN, begun, flags, observed, person, plan, scene
 from matplotlib.container import BarContainer
 
 from mirror_ppl.communication import Channels, Message, RoundSoFar, every_message
-from mirror_ppl.communication.communicator import Decision, gain_over_silence
+from mirror_ppl.communication.decision import Decision, gain_over_silence
 from mirror_ppl.communication.objectives import Valued
 from mirror_ppl.communication.search import Found
 from mirror_ppl.domains.driving import CARS

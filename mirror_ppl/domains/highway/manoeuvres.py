@@ -30,6 +30,7 @@ SPEED_NAMES = ("stop", "slow", "medium", "fast")
 LANE_NAMES = ("left", "middle", "right")
 MANOEUVRES = tuple(f"{lane} lane {speed}" for lane in LANE_NAMES for speed in SPEED_NAMES)
 """Lane and speed of each manoeuvre in words; the lane changes slowest."""
+SPEED_WORDS = ("stop", "go slowly", "go at medium speed", "go fast")
 REFLECTED = tuple(
     (LANES - 1 - lane) * len(SPEEDS) + speed
     for lane in range(LANES)
@@ -43,6 +44,12 @@ STEEPEST = 0.15
 """Radians to the road at which it changes lanes at most."""
 SLOWEST = 1.0
 """m/s below which steering is as at this speed."""
+
+
+def deed(action: int) -> str:
+    """Return words for a manoeuvre that follow "they would"."""
+    lane, speed = divmod(action, len(SPEEDS))
+    return f"{SPEED_WORDS[speed]} in the {LANE_NAMES[lane]} lane"
 
 
 def lanes_and_speeds(like: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,14 +12,10 @@ from gymnasium import spaces
 from torch import Tensor
 
 from mirror_ppl.domains.environment import RENDER_MODES, DomainEnv
-from mirror_ppl.domains.highway.lidar import RANGE
-from mirror_ppl.domains.highway.road import LANES, TICK, TICKS
-from mirror_ppl.domains.highway.speech import NOTHING
+from mirror_ppl.domains.highway.limits import LIMITS
+from mirror_ppl.domains.highway.road import TICK, TICKS
 from mirror_ppl.domains.highway.state import HighwayState
 from mirror_ppl.domains.highway.world import DirectHighway
-
-FASTEST = 60.0
-"""m/s that no relative velocity exceeds."""
 
 
 class RoundEnv(DomainEnv):
@@ -42,14 +38,7 @@ class RoundEnv(DomainEnv):
         "render_fps": round(1 / (TICK * TICKS)),
     }
     domain: ClassVar[Any] = DirectHighway()
-    limits: ClassVar[Mapping[str, tuple[list[float], list[float]]]] = {
-        "ego": (
-            [0.0, -10.0, -np.pi, -1.0, -1.0, -1.0, 0.0],
-            [LANES - 1.0, 10.0, np.pi, 20.0, 1.0, 1.0, 1.0],
-        ),
-        "visual": ([0.0, -FASTEST, -FASTEST], [RANGE, FASTEST, FASTEST]),
-        "verbal": ([0.0], [float(NOTHING)]),
-    }
+    limits: ClassVar[Mapping[str, tuple[list[float], list[float]]]] = LIMITS
 
     @abstractmethod
     def begin(self, scenario: int, seed: int) -> None:

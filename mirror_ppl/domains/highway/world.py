@@ -61,8 +61,9 @@ from mirror_ppl.domains.base import Modality, Observation, Visibility, require_k
 from mirror_ppl.domains.highway import estimate, expert, reward, scenarios, traffic
 from mirror_ppl.domains.highway.estimate import state_with
 from mirror_ppl.domains.highway.knowledge import Memory, imagined, nothing, out_of_sight, remember
-from mirror_ppl.domains.highway.lidar import RANGE, SECTORS, scan
-from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, REFLECTED, controls
+from mirror_ppl.domains.highway.lidar import RANGE, SECTOR, SECTORS, scan
+from mirror_ppl.domains.highway.limits import outside, require_action
+from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES, REFLECTED, controls, deed
 from mirror_ppl.domains.highway.messages import GROUPS, SEEN, SPOKEN, group_of
 from mirror_ppl.domains.highway.record import RECORD
 from mirror_ppl.domains.highway.road import (
@@ -113,6 +114,10 @@ class Highway(World):
     scenarios: tuple[str, ...] = scenarios.NAMES
     reward_terms: tuple[str, ...] = reward.TERMS
     mishap: tuple[str, str] = ("accident", "accidents")
+    picture_legend = (
+        "Below the road the lidar, ahead is up: green sectors are free, red ones end at a near "
+        "car, dark grey ones are not seen"
+    )
     directions: tuple[str, ...] = ("ahead", "ahead_aside", "behind_aside", "behind")
     direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
     reach_bins: tuple[float, ...] = KNOTS
@@ -154,14 +159,17 @@ class Highway(World):
         Args:
             state: ``[...]``.
             action: manoeuvres ``[...]``, or steering and acceleration ``[..., 2]``.
+
+        Raises:
+            InputError: there is no such manoeuvre, or controls are of another shape or not finite.
         """
-        return traffic.transition(state, action, self.ticks)
+        return traffic.transition(state, require_action(action), self.ticks)
 
     def rewards(
         self, state: HighwayState, action: Tensor, following: HighwayState
     ) -> dict[str, Tensor]:
-        """Return reward terms ``[...]`` by name, in units of reward."""
-        return reward.rewards(state, controls(state, action), following)
+        """Return reward terms ``[...]`` by name, in units of reward; actions as in `transition`."""
+        return reward.rewards(state, controls(state, require_action(action)), following)
 
     def over(self, state: HighwayState) -> Tensor:
         """Return where ``[...]`` a collision or the end of the shoulder has ended the round."""
@@ -207,6 +215,11 @@ class Highway(World):
         sides = torch.tensor(SIDES, device=shown.device)
         lane = observation["ego"][..., :1].round() + sides
         return {"visual": shown, "verbal": (lane >= 0) & (lane < LANES)}
+
+    def faults(self, observation: Observation) -> dict[str, Tensor]:
+        """Return which observations ``[...]`` break each rule of recordings, by rule."""
+        names = {"ego": self.ego_features} | {m.name: m.features for m in self.modalities}
+        return super().faults(observation) | outside(observation, names)
 
     def distance(self, observation: Observation) -> tuple[Tensor, Tensor]:
         """Return the direction of sight and the distance in metres of each sector ``[..., 36]``."""
@@ -308,20 +321,33 @@ class Highway(World):
         """Describe a sector, a group of sectors or a direction of one observation."""
         if modality == "verbal":
             place = DIRECTIONS.index(item)
-            return SPOKEN.utterances[place][round(float(observation["verbal"][place, 0]))]
+            sentence = SPOKEN.utterances[place][round(float(observation["verbal"][place, 0]))]
+            return f'"{sentence.rstrip(".")}"'
         places = GROUPS[DIRECTIONS.index(item)] if item in DIRECTIONS else (SEEN.items.index(item),)
         sectors = observation["visual"][list(places)]
         distance, along, _ = sectors[sectors[:, 0].argmin()].tolist()
         if distance >= RANGE:
             return f"{item}: no car within {RANGE:g} m"
-        return f"{item}: car at {distance:.0f} m, {along:+.0f} m/s"
+        ahead = math.cos(places[int(sectors[:, 0].argmin())] * SECTOR) >= 0
+        closing = round(-along if ahead else along)
+        motion = "as fast as you"
+        if closing:
+            motion = f"{'coming closer' if closing > 0 else 'drawing away'} at {abs(closing)} m/s"
+        return f"{item}: car at {distance:.0f} m, {motion}"
+
+    def deed(self, observation: Observation, item: str | None, action: int) -> str:
+        """Describe a manoeuvre, such as "go fast in the left lane"."""
+        return deed(action)
 
     def render(self, state: HighwayState, setting: str = "clear") -> np.ndarray:
         """Draw the road and the lidar of one state, ``uint8 [height, width, 3]``."""
+        return self.render_seen(state, self.visibility(setting, self.observe(state)))
+
+    def render_seen(self, state: HighwayState, visible: Visibility) -> np.ndarray:
+        """Draw the same where somebody sees some sectors ``[36]``; others are grey."""
         from mirror_ppl.domains.highway.pictures import picture
 
-        observation = self.observe(state)
-        return picture(state, observation, self.visibility(setting, observation)["visual"])
+        return picture(state, self.observe(state), visible["visual"])
 
 
 class DirectHighway(Highway):

@@ -1,17 +1,19 @@
 """The domain: observations, what is seen and can be said, pictures, names."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
 from highway_states import state_of
 
 from mirror_ppl.domains.base import map_state
-from mirror_ppl.domains.highway import DirectHighway
+from mirror_ppl.domains.highway import DirectHighway, Highway
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
 from mirror_ppl.domains.highway.pictures import ACROSS, BEHIND, CAR, EGO, SCALE, UNSEEN
 from mirror_ppl.domains.highway.road import OTHERS
 from mirror_ppl.domains.highway.speech import DIRECTIONS
-from mirror_ppl.errors import UnknownNameError
+from mirror_ppl.errors import InputError, UnknownNameError
 
 WORLD = DirectHighway()
 
@@ -55,10 +57,71 @@ def test_sentences_are_only_heard():
     for setting in WORLD.settings:
         assert not WORLD.visibility(setting, WORLD.observe(state))["verbal"].any()
     now = WORLD.observe(state)
-    assert WORLD.describe(now, "verbal", "front") == "Car ahead, approaching fast."
-    assert WORLD.describe(now, "verbal", "rear") == "Nothing behind."
-    assert WORLD.describe(now, "visual", "front") == "front: car at 18 m, -5 m/s"
+    assert WORLD.describe(now, "verbal", "front") == '"Car ahead, approaching fast"'
+    assert WORLD.describe(now, "verbal", "rear") == '"Nothing behind"'
+    assert WORLD.describe(now, "visual", "front") == "front: car at 18 m, coming closer at 5 m/s"
     assert WORLD.describe(now, "visual", "180 degrees") == "180 degrees: no car within 60 m"
+
+
+def test_what_cars_do_is_said_from_the_driver_on():
+    found = []
+    for item, car in (
+        ("front", (20.0, 4.0, 0.0, 13.0)),
+        ("rear", (-20.0, 4.0, 0.0, 13.0)),
+        ("front-right", (9.0, 8.0, 0.0, 10.0)),
+    ):
+        now = WORLD.observe(state_of((0.0, 4.0, 0.0, 10.0), [car]))
+        found.append(WORLD.describe(now, "visual", item))
+    assert found == [
+        "front: car at 18 m, drawing away at 3 m/s",
+        "rear: car at 18 m, coming closer at 3 m/s",
+        "front-right: car at 7 m, as fast as you",
+    ]
+    deeds = [Highway().deed(now, None, action) for action in (0, 5, 6, 11)]
+    assert deeds == [
+        "stop in the left lane",
+        "go slowly in the middle lane",
+        "go at medium speed in the middle lane",
+        "go fast in the right lane",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("modality", "place", "value", "rule"),
+    [
+        ("ego", 3, 999.0, "speed of ego has to be from -1 to 20"),
+        ("ego", 1, -40.0, "lane_offset of ego has to be from -10 to 10"),
+        ("ego", 2, 100.0, "heading of ego has to be from -3.142 to 3.142"),
+        ("ego", 4, 7.0, "steering of ego has to be from -1 to 1"),
+        ("visual", 0, 70.0, "distance of visual has to be from 0 to 60"),
+        ("visual", 1, 500.0, "velocity_along of visual has to be from -60 to 60"),
+        ("verbal", 0, 0.5, "utterance of verbal has to be one of [0, 1, 2, 3, 4, 5]"),
+    ],
+)
+def test_what_cannot_be_observed_is_named(generator, modality, place, value, rule):
+    now = WORLD.observe(WORLD.initial(4, generator))
+    assert not any(broken.any() for broken in WORLD.faults(now).values())
+    now[modality] = now[modality].clone()
+    now[modality][2, ..., place] = value
+    broken = {name: where.tolist() for name, where in WORLD.faults(now).items() if where.any()}
+    assert broken == {rule: [False, False, True, False]}
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (torch.tensor([0.1]), "finite numbers [..., 2], not [0.1"),
+        (torch.tensor([torch.nan, 0.0]), "finite numbers [..., 2], not [nan, 0.0]"),
+        (torch.zeros(3, 5), "not numbers [3, 5]"),
+        (torch.tensor(12), "count from 0 to 11, not 12"),
+        (torch.tensor([-1, 2]), "count from 0 to 11, not [-1, 2]"),
+    ],
+)
+def test_actions_of_another_kind_are_refused(generator, action, message):
+    state = WORLD.initial(2, generator)
+    for function in (WORLD.transition, lambda s, a: WORLD.rewards(s, a, s)):
+        with pytest.raises(InputError, match=re.escape(message)):
+            function(state, action)
 
 
 def test_lanes_that_do_not_exist_are_not_spoken_of():
