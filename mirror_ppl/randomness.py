@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from contextlib import AbstractContextManager
 
 import torch
+
+NUMBERED = re.compile(r"person-(\d{1,9})")
 
 
 def derived_generator(
@@ -19,6 +22,18 @@ def derived_generator(
     digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
     # Torch's seeds are signed.
     return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
+
+
+def person_number(person: str) -> int:
+    """Return a number for the seeds of a person's draws, by their id.
+
+    So results do not depend on who else is inferred, nor on the order. Ids that the package gives,
+    such as ``person-01``, are counted from 0; others are hashed.
+    """
+    if found := NUMBERED.fullmatch(person):
+        return max(0, int(found[1]) - 1)
+    digest = hashlib.blake2b(person.encode(), digest_size=4).digest()
+    return int.from_bytes(digest)
 
 
 def seed_everything(seed: int) -> None:

@@ -25,6 +25,8 @@ LITTLE = 0.01
 """Changes of a probability below this are not reported as explanations."""
 ADVICE_DISCOUNT = 0.95
 """Discount per step in advice."""
+SHOWN = 0.005
+"""Gains below this are printed as 0.00."""
 TIE = 1e-6
 """Gains up to this, in units of reward, count as none."""
 
@@ -239,7 +241,7 @@ class Decision:
         gain = gain_over_silence(
             self.found.valued, int(self.found.valued.utility.mean(-1).argmax())
         )
-        if gain.mean > TIE:
+        if gain.mean >= SHOWN:
             needed = self.standard_errors * gain.standard_error
             if gain.mean - needed > TIE:
                 return f"no item of a message is reliably worth its cost (the best gains {gain})"

@@ -44,7 +44,8 @@ class Recorder(gym.Wrapper):
         super().__init__(env)
         if not isinstance(world, EnvironmentWorld):
             raise InputError(
-                "the world has to be one of a Gymnasium environment (GymnasiumWorld, SteppedWorld)"
+                "the world has to be made from a Gymnasium environment (GymnasiumWorld, "
+                "SteppedWorld); of others, save rounds by save_demonstrations"
             )
         if not any(world is known for known in known_domains()):
             raise InputError(

@@ -89,7 +89,9 @@ def _show_checks(people: Sequence[dict[str, Any]], model: str) -> None:
         print("Model check: none without training rounds")
         return
     doubted = [person for person in checked if person["check"]["verdict"] != OK]
-    hint = "; --human-model all weighs other models of them" if doubted and model == MIRROR else ""
+    hint = ""
+    if doubted and model == MIRROR:
+        hint = "; --human-model all weighs other models of them, in some sixteen times the time"
     print(f"Model check: {len(checked) - len(doubted)} of {len(checked)} people ok{hint}")
     for person in doubted[:MOST_DOUBTED]:
         check = person["check"]
@@ -219,7 +221,7 @@ def _show_entropy(people: list[dict[str, Any]], sites: Iterable[str]) -> None:
         but = ", not counting how soon they notice things" if noticing else ""
         print(f"Posterior entropy of the perceptual implants: none{but}")
         return
-    line = f"Posterior entropy of the perceptual implants: {entropy:.2f} nats on average "
+    line = f"Joint posterior entropy of the perceptual implants: {entropy:.2f} nats on average "
     line += f"({shared:.2f} shared with the policy implants)"
     if best and expected[best] >= NEGLIGIBLE:
         line += f'. Most informative next scenario: "{best}" '

@@ -17,6 +17,7 @@ from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import RESIDUAL
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.randomness import person_number
 
 if TYPE_CHECKING:
     from mirror_ppl.inference.amortized_guide import AmortizedGuide
@@ -90,7 +91,6 @@ class Job:
             identity of this run (a checkpoint of another run is refused).
         refine: gradient steps on each person's rounds that refine the network's proposal.
         workers: processes for engines that infer each person separately.
-        first: number of the first of these people among all; a person's seed depends on it.
     """
 
     human: HumanModel
@@ -104,13 +104,16 @@ class Job:
     checkpoint: tuple[Path, str] | None = None
     refine: int = 0
     workers: Workers = Workers()
-    first: int = 0
+
+    def seed_of(self, person: int) -> int:
+        """Return the seed of one of the people, by their place; it depends on their id alone."""
+        return (self.seed + 1) * 1_000_003 + person_number(self.rounds.people[person])
 
     def of(self, people: range) -> Job:
         """The job for some of the people."""
         if len(people) == self.rounds.num_people:
             return self
-        return replace(self, rounds=self.rounds.select_people(people), first=people.start)
+        return replace(self, rounds=self.rounds.select_people(people))
 
     def part(self, people: People) -> Job:
         """The job for some of the people, to be sent to another process."""

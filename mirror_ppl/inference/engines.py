@@ -284,7 +284,7 @@ def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:
     }
 
 
-FORMAT = 5
+FORMAT = 6
 """Version of stored runs; raised whenever they change, so that older runs are not resumed."""
 
 

@@ -48,7 +48,7 @@ def infer_by_importance(
                 builder = next(builders)
             human = builder.human
             # Independent of other people, and of how many draws they took.
-            seed_everything((job.seed + 1) * 1_000_003 + job.first + person)
+            seed_everything(job.seed_of(person))
             first = coarse(job.settings) if looks_twice(human) else job.settings
             engine, own = first_pass(builder, first)
             if looks_twice(human):

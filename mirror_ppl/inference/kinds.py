@@ -78,7 +78,7 @@ def infer_kinds(
     shares = log_joint.softmax(-1)
     drawn = []
     for person in range(people):
-        seed = (job.seed + 1) * 1_000_003 + job.first + person
+        seed = job.seed_of(person)
         own = draw_prior(job.human, 1, job.draws, seed % 2**32)
         own[KIND] = _kinds(shares[person], job.draws, seed).view(-1, 1, 1).to(own[KIND])
         for kind, one in enumerate(found):

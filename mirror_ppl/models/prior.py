@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from typing import Any
 
@@ -17,7 +17,7 @@ from mirror_ppl.checks import as_tensor, require_kind, seed_number, whole_number
 from mirror_ppl.errors import HumanModelError, InputError, shown
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
-from mirror_ppl.randomness import forked, seed_everything
+from mirror_ppl.randomness import forked, person_number, seed_everything
 
 Draws = dict[str, Tensor]
 """Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
@@ -84,19 +84,19 @@ def draw_prior(human: HumanModel, people: int, number: int, seed: int) -> Draws:
         return values_of(sample_sites(human, people, number))
 
 
-def draw_prior_of_each(human: HumanModel, people: range, number: int, seed: int) -> Draws:
+def draw_prior_of_each(human: HumanModel, people: Sequence[str], number: int, seed: int) -> Draws:
     """Draw ``[S, P, 1, ...]`` like `draw_prior`, with a seed per person.
 
     Args:
         human: the model of people.
-        people: numbers of the P people.
+        people: ids of the P people.
         number: number of draws S per person.
         seed: of everything random.
     """
     each = []
     with forked():
         for person in people:
-            seed_everything(seed * 1_000_003 + person)
+            seed_everything(seed * 1_000_003 + person_number(person))
             each.append(values_of(sample_sites(human, 1, number)))
     return {name: torch.cat([own[name] for own in each], 1) for name in each[0]}
 

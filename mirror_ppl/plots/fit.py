@@ -98,7 +98,9 @@ class FitPlots:
         if self.data["model_check"].sizes["check"]:
             pictures[CHECK] = self.check(), "whether the model explains each person"
         if self._has_identifiability():
-            shows = "posterior entropy of what they see, and the most informative scenarios"
+            shows = "posterior entropy of what they see"
+            if self.data["identifiability"].sizes.get("scenario"):
+                shows += ", and the most informative scenarios"
             pictures[IDENTIFIABILITY] = plot_identifiability(self.data), shows
         return pictures
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mirror_ppl.inference.results.checks import REPLICATES
+from mirror_ppl.inference.results.checks import REPLICATES, SHARE
 from mirror_ppl.inference.results.criticism import FINE, LEVEL
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE
@@ -95,13 +95,44 @@ def _p_values(ax, group: xr.Dataset) -> None:
                 fontsize=8,
                 bbox=frame if tail < limit[row] else None,
             )
-    names = [textwrap.fill(str(name), WRAP) for name in group["check"].values]
-    ax.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=9)
+    names = [str(name) for name in group["check"].values]
+    shares = [place for place, name in enumerate(names) if name.startswith(SHARE)]
+    several = len(shares) > 1
+    _name_columns(ax, [name.removeprefix(SHARE) if several else name for name in names])
     title = (
         "Two-sided p-values; \N{UPWARDS ARROW} more, \N{DOWNWARDS ARROW} less than predicted;\n"
         "frames: such people are suspect"
     )
-    ax.set_title(title, fontsize=11)
+    ax.set_title(title, fontsize=11, pad=22 if several else None)
+    if several:
+        _name_group(ax, shares[0], shares[-1], "share of each action")
+
+
+def _name_columns(ax, names: list[str]) -> None:
+    """Write names below columns, upright if they are too long to be read at an angle."""
+    wrapped = [textwrap.fill(name, WRAP) for name in names]
+    if max(name.count("\n") for name in wrapped):
+        ax.set_xticks(range(len(names)), names, rotation=90, fontsize=9)
+    else:
+        ax.set_xticks(range(len(names)), wrapped, rotation=40, ha="right", fontsize=9)
+
+
+def _name_group(ax, first: int, last: int, name: str) -> None:
+    """Draw a line above some columns, with a name over it."""
+    above = ax.get_xaxis_transform()  # x of the data, y of the panel
+    ax.plot(
+        [first - 0.42, last + 0.42], [1.02, 1.02], color=BLACK, lw=1, transform=above, clip_on=False
+    )
+    ax.annotate(
+        name,
+        ((first + last) / 2, 1.02),
+        (0, 3),
+        xycoords=above,
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize=9,
+    )
 
 
 def _likelihoods(ax, group: xr.Dataset) -> None:

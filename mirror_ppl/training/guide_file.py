@@ -118,8 +118,8 @@ def network_for(engine: str, path: Path | None, human: HumanModel) -> AmortizedG
             name = model_name(type(human).__name__)
             raise AssetError(
                 f"no guide ships for {name} in {human.domain.name}: train one with "
-                "python -m mirror_ppl.train --what guide and name it with --guide-file, or use "
-                "--guide importance"
+                f"python -m mirror_ppl.train --what guide --domain {human.domain.name} and name it "
+                "with --guide-file, or use --guide importance"
             ) from error
     return load_guide(path, human)[0]
 

@@ -67,14 +67,12 @@ class Part:
     """Some people, with their posterior draws.
 
     Attributes:
-        first: number of the first of them among all.
         train: training rounds.
         test: held-out rounds, if there are any.
         draws: posterior draws ``[S, P, 1, ...]``.
         combinations: see :func:`describe`.
     """
 
-    first: int
     train: Demonstrations
     test: Demonstrations | None
     draws: Mapping[str, Tensor]
@@ -106,7 +104,6 @@ def describe(
     def given(people: People) -> Part:
         some = slice(people.first, people.last)
         return Part(
-            people.first,
             train.part(people.range),
             None if test is None else test.part(people.range),
             {name: value[:, some].clone() for name, value in draws.items()},
@@ -127,12 +124,12 @@ def describe(
 
 
 def _describe(how: Description, part: Part) -> dict[str, Any]:
-    human, people = how.human, range(part.first, part.first + part.train.num_people)
+    human = how.human
     with clocked() as seconds:
         with stage("predict"):
-            prior = draw_prior_of_each(human, people, PRIOR_DRAWS, how.seed)
+            prior = draw_prior_of_each(human, part.train.people, PRIOR_DRAWS, how.seed)
             rounds = part.train, part.test
-            found = predict_people(human, rounds, (part.draws, prior), how.seed, first=part.first)
+            found = predict_people(human, rounds, (part.draws, prior), how.seed)
         with stage("identify"):
             unidentified = identify(
                 human,
@@ -142,7 +139,6 @@ def _describe(how: Description, part: Part) -> dict[str, Any]:
                 how.population,
                 part.combinations,
                 rounds=how.explore,
-                first=part.first,
             )
     if not how.every_draw:
         prior = {name: value for name, value in prior.items() if value.dim() == 3}  # noqa: PLR2004

@@ -42,6 +42,7 @@ from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.randomness import person_number
 
 NEGLIGIBLE = 0.005
 """Nats below which entropies and information gains count as 0; printed as 0.00."""
@@ -125,7 +126,6 @@ def identify(
     population: Population | None = None,
     combinations: Sequence[Tensor] = (),
     rounds: int = 8,
-    first: int = 0,
 ) -> Identifiability | None:
     """Compute the identifiability of people's perceptual implants after a fit.
 
@@ -138,7 +138,6 @@ def identify(
         combinations: probable combinations of each person's discrete implants, if inference found
             them. They are found anew otherwise, which takes most of the time.
         rounds: simulated rounds in each scenario; 0 for none.
-        first: number of the first of these people among all.
 
     Returns:
         The identifiability; ``None`` for models without discrete perceptual implants, in which
@@ -181,7 +180,7 @@ def identify(
         if rounds:
             # Each person has their own worlds, so that averages over people use many.
             generator = torch.Generator(weights.device).manual_seed(
-                seed * 1_000_003 + first + person
+                seed * 1_000_003 + person_number(train.people[person])
             )
             some, pairs = _represented(weights, generator)
             told = _information(

@@ -25,6 +25,7 @@ from mirror_ppl.inference.results.posterior_predictive import (
 from mirror_ppl.inference.results.summary import score
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.progress import Report, silent
+from mirror_ppl.randomness import person_number
 
 PREDICTIVE_STREAM, CRITICISM_STREAM = 2**31, 2**32
 """Offsets of seeds, so that predictive draws share none with inference and simulated rounds."""
@@ -78,12 +79,11 @@ def predict_people(
     draws: tuple[Mapping[str, Tensor], Mapping[str, Tensor]],
     seed: int,
     report: Report = silent,
-    first: int = 0,
 ) -> Predictions:
     """Predict the actions of P people, each given the earlier ones of its round.
 
     Each person has their own generator, so that predictive draws do not depend on which other
-    people were recorded.
+    people were recorded, nor on their order.
 
     Args:
         human: the model of people.
@@ -91,17 +91,17 @@ def predict_people(
         draws: implants from the posterior ``[S, P, 1, ...]`` and the prior ``[S', P, 1, ...]``.
         seed: seed of predictive draws.
         report: called with the number of people done.
-        first: number of the first of these people among all.
     """
     (train, test), parts = rounds, []
     people = train.num_people
+    numbers = [seed * 1_000_003 + person_number(person) for person in train.people]
     for some in groups(people):
         report("predict", some.start, people, "people")
         posterior, prior = (of_people(own, some) for own in draws)
         own = train.part(some)
         generators = [
-            torch.Generator().manual_seed(PREDICTIVE_STREAM + seed * 1_000_003 + first + person)
-            for person in some
+            torch.Generator().manual_seed(PREDICTIVE_STREAM + number)
+            for number in numbers[some.start : some.stop]
         ]
         learned = predict_rounds(human, own, posterior).cpu()
         part = Predictions(
@@ -119,7 +119,7 @@ def predict_people(
                 human,
                 (train.part(one), None if test is None else test.part(one)),
                 (learned[:, place : place + 1], None if found is None else found[:, [place]]),
-                CRITICISM_STREAM + seed * 1_000_003 + first + person,
+                CRITICISM_STREAM + numbers[person],
             )
             for place, (person, one) in enumerate((one, range(one, one + 1)) for one in some)
         ]
