@@ -119,7 +119,10 @@ def test_the_table_of_what_messages_to_drivers_lose_is_what_its_rows_say():
     assert f"with the values of the true state it would gain {less} less" in words
     left = np.sort(best - mirror)
     share = 100 * left[-2:].sum() / left.sum()
-    assert f"Two of the twenty drivers have {share:.0f}% of what is left" in words
+    assert (
+        f"Two of the twenty drivers account for {share:.0f}% of the gain that `mirror` misses"
+        in words
+    )
 
 
 def test_the_example_of_a_random_world_is_what_its_rows_say():

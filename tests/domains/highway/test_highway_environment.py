@@ -17,6 +17,8 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from paths import DOCS
 
+from mirror_ppl.data import load_demonstrations
+from mirror_ppl.data.contradictions import check_world
 from mirror_ppl.domains.highway import DirectHighway, HighwayState
 from mirror_ppl.domains.highway.environment import HighwayEnv
 from mirror_ppl.domains.highway.lidar import RANGE
@@ -252,13 +254,17 @@ def test_pictures():
 # --- documentation ------------------------------------------------------------------------------
 
 
-def test_the_examples_of_the_page_run():
+def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / "highway.md").read_text(), re.M | re.S)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     scope = {}
     for block in blocks:
         exec(compile(block, "highway.md", "exec"), scope)
     assert scope["seen"].shape == (3, 36) and scope["info"]["scenario"] in DirectHighway.scenarios
+    ada = load_demonstrations("ada.nc")
+    check_world(ada)
+    assert ada.people == ("ada",) and ada.shape[:2] == (1, 2)
 
 
 def test_the_page_has_every_scenario_and_term():
