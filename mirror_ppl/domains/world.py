@@ -24,6 +24,8 @@ from mirror_ppl.domains.memory import LastSeen
 from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import DomainError
 
+EVERYTHING = "anything"
+"""Definition of relevance of worlds without one: all items are relevant."""
 PIXELS = 24
 """Width and height of a number in the default picture."""
 
@@ -319,7 +321,7 @@ class World(ABC):
 
     def relevance(self, observation: Observation) -> dict[str, Visibility]:
         """Return relevant items ``[..., K]``: all."""
-        return {"anything": self._all(observation, lambda m: True)}
+        return {EVERYTHING: self._all(observation, lambda m: True)}
 
     def decisive(self, observation: Observation) -> Visibility:
         """Return items ``[..., K]`` that suffice for the choice made with full knowledge: all."""

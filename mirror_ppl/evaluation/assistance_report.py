@@ -10,6 +10,7 @@ from rich.table import Table
 
 from mirror_ppl.console import console_for_tables
 from mirror_ppl.domains import get_domain
+from mirror_ppl.domains.world import EVERYTHING
 
 FAR_BELOW = -10
 """Shares of the way from silence to the oracle below which no number is printed."""
@@ -46,18 +47,23 @@ def print_assistance(
 
     first = next(iter(summary.values()))
     domain = get_domain(attributes["domain"])
-    notions = [name.split("_")[-1] for name in first["relevant"]]
-    about = [f"about {name.replace('_', ' ')}" for name in first["relevant"]]
+    own = [name for name in first["relevant"] if name != EVERYTHING]
+    notions = [name.split("_")[-1] for name in own]
+    about = [f"about {name.replace('_', ' ')}" for name in own]
+    shares = f"{', '.join(notions)}: share of items {', '.join(about)}; " if own else ""
+    who = f"{people} {'people' if people > 1 else 'person'}"
     worth = table(
-        f"{attributes['domain']}, {attributes['setting']}: {people} people, {rounds} rounds each",
-        "rewards a round; ±: standard error; [90% interval], paired; -: needs none, and an oracle "
-        "ahead of it in every bootstrap sample",
+        f"{attributes['domain']}, {attributes['setting']}: {who}, {rounds} "
+        f"round{'s' * (rounds > 1)} each",
+        "rewards a round; ±: standard error; [90% interval], paired; -: not known without the "
+        "communicators none and oracle, nor unless oracle is ahead of none in every bootstrap "
+        "sample",
         ["task", "cost", "net", "above none", "way to oracle"],
     )
     said = table(
         "What is communicated",
         f"{domain.mishap[1]} a round; {', '.join(first['items'])}: items a step; "
-        f"{', '.join(notions)}: share of items {', '.join(about)}; ms a decision",
+        f"{shares}ms a decision",
         [domain.mishap[1], *first["items"], *notions, "ms"],
     )
     for name, entry in summary.items():
@@ -75,8 +81,10 @@ def print_assistance(
             f"{entry['mishaps']:.2f}",
             *(f"{value:.2f}" for value in entry["items"].values()),
             *(
-                "-" if share["all"] is None else f"{100 * share['all']:.0f}%"
-                for share in entry["relevant"].values()
+                "-"
+                if entry["relevant"][one]["all"] is None
+                else f"{100 * entry['relevant'][one]['all']:.0f}%"
+                for one in own
             ),
             f"{entry['milliseconds']:.1f}",
         )
