@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 
 import torch
 
-NUMBERED = re.compile(r"person-(\d{1,9})")
+NUMBERED = re.compile(r"person-(0[1-9]|[1-9][0-9]{1,8})")
 
 
 def derived_generator(
@@ -27,11 +27,12 @@ def derived_generator(
 def person_number(person: str) -> int:
     """Return a number for the seeds of a person's draws, by their id.
 
-    So results do not depend on who else is inferred, nor on the order. Ids that the package gives,
-    such as ``person-01``, are counted from 0; others are hashed.
+    So results do not depend on who else is inferred, nor on the order, unless people are sampled
+    together, as by `svi` and `nuts`. Ids that the package gives, such as ``person-01``, are counted
+    from 0; others are hashed.
     """
     if found := NUMBERED.fullmatch(person):
-        return max(0, int(found[1]) - 1)
+        return int(found[1]) - 1
     digest = hashlib.blake2b(person.encode(), digest_size=4).digest()
     return int.from_bytes(digest)
 

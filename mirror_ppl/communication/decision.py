@@ -238,12 +238,12 @@ class Decision:
         for step, message in enumerate(self.plan):
             if message:
                 return f"{self._about(message)}: can wait {step} step{'s' * (step > 1)}"
-        gain = gain_over_silence(
-            self.found.valued, int(self.found.valued.utility.mean(-1).argmax())
-        )
+        valued = self.found.valued
+        gain = gain_over_silence(valued, int(valued.utility.mean(-1).argmax()))
         if gain.mean >= SHOWN:
-            needed = self.standard_errors * gain.standard_error
-            if gain.mean - needed > TIE:
+            gains = valued.utility - valued.utility[:1]
+            least = gains.mean(-1) - self.standard_errors * standard_error(valued, gains)
+            if bool((least > TIE).any()):
                 return f"no item of a message is reliably worth its cost (the best gains {gain})"
             why = ""
             if gain.interval[0] > 0:

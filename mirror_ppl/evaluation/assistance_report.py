@@ -55,9 +55,8 @@ def print_assistance(
     worth = table(
         f"{attributes['domain']}, {attributes['setting']}: {who}, {rounds} "
         f"round{'s' * (rounds > 1)} each",
-        "rewards a round; ±: standard error; [90% interval], paired; -: not known without the "
-        "communicators none and oracle, nor unless oracle is ahead of none in every bootstrap "
-        "sample",
+        "rewards a round; ±: standard error; [90% interval], paired; -: needs the communicators "
+        "none and oracle, and oracle ahead of none in every bootstrap sample",
         ["task", "cost", "net", "above none", "way to oracle"],
     )
     said = table(

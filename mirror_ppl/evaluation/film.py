@@ -92,10 +92,15 @@ def strip(
         seen,
         [_words(entry["message"]) for entry in log],
         [entry["action"] for entry in log],
-        [float(entry.get("gain", 0.0)) for entry in log],
+        [_gain(entry) for entry in log],
         float(played.net[number]),
         played.mishaps[number],
     )
+
+
+def _gain(entry: Mapping[str, Any]) -> float:
+    """Expected gain of what is communicated now; plans that wait gain later."""
+    return float(entry.get("gain", 0.0)) if any(entry["message"].values()) else 0.0
 
 
 def _words(message: Mapping[str, Sequence[str]]) -> list[str]:

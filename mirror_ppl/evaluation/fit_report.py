@@ -91,7 +91,7 @@ def _show_checks(people: Sequence[dict[str, Any]], model: str) -> None:
     doubted = [person for person in checked if person["check"]["verdict"] != OK]
     hint = ""
     if doubted and model == MIRROR:
-        hint = "; --human-model all weighs other models of them, in some sixteen times the time"
+        hint = "; --human-model all weighs other models of them, which takes about 16 times as long"
     print(f"Model check: {len(checked) - len(doubted)} of {len(checked)} people ok{hint}")
     for person in doubted[:MOST_DOUBTED]:
         check = person["check"]

@@ -48,7 +48,7 @@ def in_batches(job: Job, infer_batch: Callable[[Compiled, Job], Inferred]) -> In
             own.human,
             own.rounds,
             screening=own.screening,
-            likely=_likely(own),
+            likely=_likely(replace(own, seed=job.seed)),
             report=lambda done, begin=begin: job.report("views", begin + done, people, "people"),
         )
         if isinstance(compiled, Sequential) and compiled.joint and len(batches) > 1:

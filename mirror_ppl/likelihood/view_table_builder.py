@@ -169,7 +169,7 @@ class ViewTableBuilder:
         """
         first = copy.copy(self)
         first.score, first._rounds, first._seen, first._recorded = self.score.clone(), [], [], []
-        first._share = 0.0
+        first._share = first._evidence = 0.0
         order = first._order(beginnings := rounds.first_steps(BEGINNING))
         first._go_through(beginnings if order is None else beginnings.chosen(order))
         self.alive = first.alive

@@ -17,6 +17,8 @@ from mirror_ppl.plots.reading import BLUE, GREY
 
 FRAMES = 6
 """Default number of frames."""
+LINE = 0.14
+"""Inches of a line of text below a frame."""
 WIDE = 3.0
 """Ratio of width to height from which communicators stand side by side."""
 
@@ -31,7 +33,7 @@ class Strip:
         seen: masks ``[K]`` of the items that the person saw or was shown or told of in each state.
         messages: what was communicated at each decision, in words, T.
         actions: of the person, by name, T.
-        gains: what each decision was expected to gain over silence, T; 0 if not known.
+        gains: what each message was expected to gain, T; 0 for silence, or if not known.
         net: rewards less costs of the round.
         mishaps: number of steps with the world's mishap.
     """
@@ -85,17 +87,21 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
     height, width = np.asarray(film.domain.render(film.strips[0].states[0])).shape[:2]
     side_by_side = width > WIDE * height
     each = 5.0 if side_by_side else 2.6
+    characters = 60 if side_by_side else 34
+    lines = [len(_below(one, step, characters)) for one in film.strips for step in steps]
     tall = each * height / width + (0.62 if side_by_side else 1.1)
+    tall += LINE * max(0, max(lines) - 3)
     shape = (len(steps), 2) if side_by_side else (2, len(steps))
     figure = Picture(figsize=(each * shape[1] + 0.3, tall * shape[0] + 0.9), layout="constrained")
-    title = f"Round {film.round} of {label_of(people[film.person])}, counted from 0"
+    title = f"{label_of(people[film.person])}, round {film.round}"
+    title += " (the first round)" if film.round == 0 else " (the first is round 0)"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     parts = figure.subfigures(*((1, 2) if side_by_side else (2, 1)), squeeze=False).flat
     for part, strip in zip(parts, film.strips, strict=True):
         part.suptitle(_result(strip, film), x=0.01, ha="left", fontsize=11)
         one = (len(steps), 1) if side_by_side else (1, len(steps))
         for ax, step in zip(part.subplots(*one, squeeze=False).flat, steps, strict=True):
-            _frame(ax, film, strip, step, 60 if side_by_side else 34)
+            _frame(ax, film, strip, step, characters)
     if film.domain.picture_legend:
         figure.supxlabel(film.domain.picture_legend, fontsize=9, color=GREY)
     return figure
@@ -139,16 +145,11 @@ def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> No
         ax.set_title("the end" if step == end else f"over since step {end}", fontsize=9)
         return
     ax.set_title(f"step {step}", fontsize=9)
-    lines = [(f"then: {strip.actions[step]}", GREY)]
-    if strip.messages[step]:
-        lines.insert(0, (", ".join(strip.messages[step]), BLUE))
-    below = 3
-    for text, colour in lines:
-        wrapped = textwrap.wrap(text.replace("_", " "), characters)
+    for number, (text, colour) in enumerate(_below(strip, step, characters)):
         ax.annotate(
-            "\n".join(wrapped),
+            text,
             (0.5, 0),
-            (0, -below),
+            (0, -3 - 10 * number),
             xycoords="axes fraction",
             textcoords="offset points",
             ha="center",
@@ -157,4 +158,15 @@ def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> No
             color=colour,
             annotation_clip=False,
         )
-        below += 10 * len(wrapped)
+
+
+def _below(strip: Strip, step: int, characters: int) -> list[tuple[str, str]]:
+    """Lines below a frame, with their colours."""
+    if step >= len(strip.actions):
+        return []
+    message, action = ", ".join(strip.messages[step]), f"then: {strip.actions[step]}"
+    return [
+        (line, colour)
+        for text, colour in ((message, BLUE), (action, GREY))
+        for line in textwrap.wrap(text.replace("_", " "), characters)
+    ]

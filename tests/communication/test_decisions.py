@@ -214,6 +214,9 @@ def test_why_silence_says_which_rule_asks_for_it():
     assert one.why() == f"{text}, fewer than 2.5 standard errors)"
     one = replace(one, standard_errors=1.5)
     assert one.why() == text.replace("message", "item of a message") + ")"
+    # The one with the largest mean is uncertain, another one is not.
+    both = decision(0, [plan(None), plan(SAID), plan(SHOWN)], [*gains, [0.9, 0.8]])
+    assert replace(both, standard_errors=2.5).why().startswith("silence: no item of a message")
 
 
 @pytest.mark.parametrize(

@@ -126,12 +126,14 @@ def test_a_film_of_the_highway_shows_what_the_driver_sees():
     alone = people.sees(world.observe(state))["visual"][0, 0]
     rear = one.seen[0]["visual"] & ~alone
     assert rear[18] and not alone[18] and not rear[:10].any() and one.gains == [0.5]
+    log[0] |= {"message": {"visual": [], "verbal": []}}
+    assert strip(world, state, "mirror", own, 0, driver.driver.sees).gains == [0.0]
     silent = replace(one, seen=[people_sees(people, world, part) for part in one.states])
     figure = plot_film(Film(world, 0, 0, (silent, one)), ["ann"], frames=2)
     first, second = (part.axes[0].images[0].get_array() for part in figure.subfigs)
     grey = [(image[..., :3] == UNSEEN).all(-1).sum() for image in (first, second)]
     assert grey[0] > grey[1] > 0
-    assert any("dark grey ones are not seen" in text.get_text() for text in figure.texts)
+    assert any("dark grey: not seen" in text.get_text() for text in figure.texts)
 
 
 def people_sees(people, world, state):

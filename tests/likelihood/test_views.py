@@ -294,6 +294,14 @@ def test_beginnings_of_long_rounds_drop_combinations_before(
     assert_tables_equal(found.table(), after.table())
     monkeypatch.setattr(view_table_builder, "LONG", 4)
     monkeypatch.setattr(view_table_builder, "MANY", 2)
+    monkeypatch.setattr(view_table_builder, "LONG", 3)
+    margins.clear()
+    one_by_one = ViewTableBuilder(human, screening, candidates=torch.arange(14))
+    for number in range(3):
+        one_by_one.alive = torch.arange(14)
+        one_by_one.add(rounds.at(number, number + 1))
+    assert margins == [0, 1, 0, 2, 0, 3]
+    monkeypatch.setattr(view_table_builder, "LONG", 4)
     for steps in (0, 20):  # padding, as beside people with longer rounds, changes nothing
         short = ViewTableBuilder(human, screening)
         short.add(padded(rounds, steps))

@@ -223,7 +223,7 @@ def test_approximations_have_the_tolerances_of_the_page():
     assert f"plus {Screening().early:.0f} divided by the number of rounds" in text
     assert f"a round of at least {LONG * BEGINNING} steps and {MANY} or more" in text
     wide = Screening().margin + Screening().early
-    assert f"the first {BEGINNING} steps of all rounds before, at {wide:.0f} nats" in text
+    assert f"the first {BEGINNING} steps of all rounds are screened at {wide:.0f} nats" in text
     assert f"best of {Screening().policies} prior policies" in text
     assert f"under each of {Screening().merge_policies} of those policies" in text
     assert f"a grid of {Screening().resolution} nats" in text

@@ -34,7 +34,7 @@ class HighwayEnv(RoundEnv):
     | key           | shape   | type    | feature                    | unit  | range      |
     |---------------|---------|---------|----------------------------|-------|------------|
     | `ego`         | (7,)    | float32 | lane                       | index | 0 to 2     |
-    |               |         |         | lane offset, to the right  | m     | -10 to 10  |
+    |               |         |         | lane offset, to the right  | m     | -15 to 15  |
     |               |         |         | heading, clockwise         | rad   | -pi to pi  |
     |               |         |         | speed                      | m/s   | -1 to 20   |
     |               |         |         | last steering              | share | -1 to 1    |

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from mirror_ppl.domains.base import Observation
@@ -12,21 +13,25 @@ from mirror_ppl.domains.highway.lidar import RANGE
 from mirror_ppl.domains.highway.manoeuvres import MANOEUVRES
 from mirror_ppl.domains.highway.road import LANES
 from mirror_ppl.domains.highway.speech import NOTHING
-from mirror_ppl.errors import InputError
+from mirror_ppl.errors import InputError, shown
 
 FASTEST = 60.0
-"""m/s that relative velocities never reach."""
+"""Bound of relative velocities, m/s."""
 LIMITS: Mapping[str, tuple[list[float], list[float]]] = {
     "ego": (
-        [0.0, -10.0, -math.pi, -1.0, -1.0, -1.0, 0.0],
-        [LANES - 1.0, 10.0, math.pi, 20.0, 1.0, 1.0, 1.0],
+        [0.0, -15.0, -math.pi, -1.0, -1.0, -1.0, 0.0],
+        [LANES - 1.0, 15.0, math.pi, 20.0, 1.0, 1.0, 1.0],
     ),
     "visual": ([0.0, -FASTEST, -FASTEST], [RANGE, FASTEST, FASTEST]),
     "verbal": ([0.0], [float(NOTHING)]),
 }
 """Least and largest value of each feature."""
+AN_ACTION = (
+    "an action of the highway is a tensor of manoeuvres (whole numbers), or of steering and "
+    "acceleration: finite numbers [..., 2]"
+)
 ROUNDING = 1e-3
-"""By which values may lie outside."""
+"""Tolerance of the limits."""
 
 
 def outside(observation: Observation, names: Mapping[str, tuple[str, ...]]) -> dict[str, Tensor]:
@@ -52,17 +57,17 @@ def require_action(action: Tensor) -> Tensor:
     Raises:
         InputError: there is no such manoeuvre, or the controls are of another shape or not finite.
     """
+    if not isinstance(action, Tensor) or action.is_complex() or action.dtype is torch.bool:
+        raise InputError(f"{AN_ACTION}, not {shown(action)}")
     if action.is_floating_point():
         if action.shape[-1:] != (2,) or not bool(action.isfinite().all()):
-            raise InputError(
-                "an action of the highway is a manoeuvre (a whole number), or steering and "
-                f"acceleration: finite numbers [..., 2], not {_shown(action)}"
-            )
-    elif action.numel() and not bool(((action >= 0) & (action < len(MANOEUVRES))).all()):
+            raise InputError(f"{AN_ACTION}, not {_shown(action)}")
+        return action
+    if action.numel() and not bool(((action >= 0) & (action < len(MANOEUVRES))).all()):
         raise InputError(
             f"manoeuvres of the highway count from 0 to {len(MANOEUVRES) - 1}, not {_shown(action)}"
         )
-    return action
+    return action.long()
 
 
 def _shown(action: Tensor) -> str:

@@ -115,8 +115,8 @@ class Highway(World):
     reward_terms: tuple[str, ...] = reward.TERMS
     mishap: tuple[str, str] = ("accident", "accidents")
     picture_legend = (
-        "Below the road the lidar, ahead is up: green sectors are free, red ones end at a near "
-        "car, dark grey ones are not seen"
+        "Below the road: the lidar, ahead is up. Green: free; red: ends at a near car; pale: "
+        "behind a car; dark grey: not seen"
     )
     directions: tuple[str, ...] = ("ahead", "ahead_aside", "behind_aside", "behind")
     direction_groups: tuple[tuple[int, ...], ...] = ((0, 1), (2, 3))
@@ -325,14 +325,18 @@ class Highway(World):
             return f'"{sentence.rstrip(".")}"'
         places = GROUPS[DIRECTIONS.index(item)] if item in DIRECTIONS else (SEEN.items.index(item),)
         sectors = observation["visual"][list(places)]
-        distance, along, _ = sectors[sectors[:, 0].argmin()].tolist()
+        nearest = int(sectors[:, 0].argmin())
+        distance, along, across = sectors[nearest].tolist()
         if distance >= RANGE:
             return f"{item}: no car within {RANGE:g} m"
-        ahead = math.cos(places[int(sectors[:, 0].argmin())] * SECTOR) >= 0
-        closing = round(-along if ahead else along)
-        motion = "as fast as you"
+        angle = places[nearest] * SECTOR
+        closing = round(-along * math.cos(angle) - across * math.sin(angle))
         if closing:
             motion = f"{'coming closer' if closing > 0 else 'drawing away'} at {abs(closing)} m/s"
+        elif round(along):  # abreast
+            motion = "overtaking you" if along > 0 else "falling back"
+        else:
+            motion = "as fast as you"
         return f"{item}: car at {distance:.0f} m, {motion}"
 
     def deed(self, observation: Observation, item: str | None, action: int) -> str:

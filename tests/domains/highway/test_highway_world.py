@@ -77,6 +77,21 @@ def test_what_cars_do_is_said_from_the_driver_on():
         "rear: car at 18 m, coming closer at 3 m/s",
         "front-right: car at 7 m, as fast as you",
     ]
+    beside = WORLD.observe(state_of())
+    for sectors, group in (((9, "90 degrees"), "rear-right"), ((27, "270 degrees"), "rear-left")):
+        number, item = sectors
+        outwards = 1.0 if number == 9 else -1.0
+        for motion, words in (
+            ((5.0, 0.0), "overtaking you"),
+            ((-5.0, 0.0), "falling back"),
+            ((0.0, -3.6 * outwards), "coming closer at 4 m/s"),
+            ((0.0, 3.6 * outwards), "drawing away at 4 m/s"),
+            ((0.0, 0.0), "as fast as you"),
+        ):
+            now = {name: value.clone() for name, value in beside.items()}
+            now["visual"][number] = torch.tensor([3.0, *motion])
+            assert WORLD.describe(now, "visual", item) == f"{item}: car at 3 m, {words}"
+            assert WORLD.describe(now, "visual", group) == f"{group}: car at 3 m, {words}"
     deeds = [Highway().deed(now, None, action) for action in (0, 5, 6, 11)]
     assert deeds == [
         "stop in the left lane",
@@ -90,7 +105,7 @@ def test_what_cars_do_is_said_from_the_driver_on():
     ("modality", "place", "value", "rule"),
     [
         ("ego", 3, 999.0, "speed of ego has to be from -1 to 20"),
-        ("ego", 1, -40.0, "lane_offset of ego has to be from -10 to 10"),
+        ("ego", 1, -40.0, "lane_offset of ego has to be from -15 to 15"),
         ("ego", 2, 100.0, "heading of ego has to be from -3.142 to 3.142"),
         ("ego", 4, 7.0, "steering of ego has to be from -1 to 1"),
         ("visual", 0, 70.0, "distance of visual has to be from 0 to 60"),
@@ -115,6 +130,9 @@ def test_what_cannot_be_observed_is_named(generator, modality, place, value, rul
         (torch.zeros(3, 5), "not numbers [3, 5]"),
         (torch.tensor(12), "count from 0 to 11, not 12"),
         (torch.tensor([-1, 2]), "count from 0 to 11, not [-1, 2]"),
+        (torch.tensor([True, False]), "an action of the highway is a tensor of manoeuvres"),
+        (torch.tensor([1j, 0j]), "an action of the highway is a tensor of manoeuvres"),
+        (3, "an action of the highway is a tensor of manoeuvres"),
     ],
 )
 def test_actions_of_another_kind_are_refused(generator, action, message):
@@ -122,6 +140,14 @@ def test_actions_of_another_kind_are_refused(generator, action, message):
     for function in (WORLD.transition, lambda s, a: WORLD.rewards(s, a, s)):
         with pytest.raises(InputError, match=re.escape(message)):
             function(state, action)
+
+
+@pytest.mark.parametrize("kind", [torch.uint8, torch.int8, torch.int16, torch.int32])
+def test_manoeuvres_are_whole_numbers_of_any_kind(generator, kind):
+    state = WORLD.initial(12, generator)
+    action = torch.ones(12, dtype=torch.long)
+    found, expected = (WORLD.transition(state, one).x for one in (action.to(kind), action))
+    assert torch.equal(found, expected)
 
 
 def test_lanes_that_do_not_exist_are_not_spoken_of():
