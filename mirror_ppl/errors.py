@@ -5,6 +5,7 @@ Errors of the code itself stay `ValueError`, `TypeError` and so on. Messages say
 and what was given, in one printable line (see `shown`).
 """
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from reprlib import repr as short_repr
@@ -12,6 +13,7 @@ from typing import Any, Self
 
 MOST_CHARACTERS = 100
 """Most characters of a name that a user chooses, such as a person's id."""
+NUMBER = re.compile(r"[0-9]+")
 SHOWN = 40
 """Characters of a longer text that a message shows."""
 
@@ -99,7 +101,9 @@ class UnknownNameError(MirrorError):
             return cls(message)
         lowered = {candidate.lower(): candidate for candidate in names}
         for close in get_close_matches(name.lower(), lowered, n=1):
-            message += f'; perhaps you meant "{lowered[close]}"'
+            # Of names that differ in their numbers only, none is closer.
+            if NUMBER.sub("", close) != NUMBER.sub("", name.lower()):
+                message += f'; perhaps you meant "{lowered[close]}"'
         return cls(message)
 
 
@@ -142,6 +146,10 @@ class StaleSelfModel(UserWarning):
 
 class LacksSitesOfWorld(UserWarning):
     """Warns that a human model is not derived from the one that its world needs."""
+
+
+class MisspeltMember(UserWarning):
+    """Warns that a method of a user's class overrides none, but almost has the name of one."""
 
 
 class UnreliableWeights(UserWarning):

@@ -8,12 +8,15 @@ import os
 import sys
 import traceback
 from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar
 
 from mirror_ppl.errors import MirrorError
 
+ALMOST = 0.85
+"""Similarity from which another name counts as misspelt."""
 Base = TypeVar("Base")
 _FILES: set[Path] = set()
 _PACKAGE = Path(__file__).resolve().parent
@@ -131,3 +134,24 @@ def passed_user_code(error: BaseException) -> bool:
 
 def _own_frames(frames: traceback.StackSummary, files: set[Path]) -> list[traceback.FrameSummary]:
     return [frame for frame in frames if Path(frame.filename).resolve() in files]
+
+
+def misspelt(kind: type) -> dict[str, str]:
+    """Return public attributes of a user's class that almost have the name of a member.
+
+    Returns:
+        The package's members that may have been meant, by attribute.
+    """
+    members, own = set[str](), set[str]()
+    for base in kind.__mro__:
+        package = base.__module__.partition(".")[0]
+        if package == "mirror_ppl":
+            members |= {*vars(base), *vars(base).get("__annotations__", {})}
+        elif package not in _LIBRARIES:
+            own |= {*vars(base)} - {*vars(base).get("_derived", ())}
+    found = {}
+    for name in sorted(own - members):
+        close = get_close_matches(name, members - own, 1, ALMOST)
+        if close and not name.startswith("_"):
+            found[name] = close[0]
+    return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from mirror_ppl.checks import require_kind
@@ -12,7 +12,7 @@ from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import require_known
 from mirror_ppl.domains.controls import action_at
-from mirror_ppl.errors import InputError
+from mirror_ppl.errors import InputError, shown
 
 
 class Companion:
@@ -88,8 +88,7 @@ class Companion:
         if message is None and self._decision is not None:
             told = self._decision.told
         else:
-            items = {name: tuple(own) for name, own in (message or {}).items()}
-            told = channels.split(channels.flags(items))
+            told = channels.split(channels.flags(_named(message or {})))
         if domain.controls:
             number = action_at(domain.controls, action)
         elif isinstance(action, str):
@@ -104,3 +103,14 @@ class Companion:
         if self.past is None:
             raise InputError("no round has begun; call begin with the first observation")
         return self.past
+
+
+def _named(message: Any) -> dict[str, tuple[str, ...]]:
+    """Return the names of a message's items by modality."""
+    expected = 'a message has lists of names by modality, as {"visual": ["front-left"]}'
+    if not isinstance(message, Mapping):
+        raise InputError(f"{expected}, not {shown(message)}")
+    for items in message.values():
+        if isinstance(items, str) or not isinstance(items, Iterable):
+            raise InputError(f"{expected}, not {shown(message)}")
+    return {name: tuple(items) for name, items in message.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 import torch
@@ -11,11 +10,10 @@ from torch import Tensor
 
 from mirror_ppl.domains.base import total_reward
 from mirror_ppl.domains.world import World, offers
+from mirror_ppl.user_code import misspelt
 
 REMARKED = 100
 """Number of rounds on which remarks rest."""
-ALMOST = 0.85
-"""Similarity from which another name counts as misspelt."""
 
 
 @dataclass(frozen=True)
@@ -77,29 +75,14 @@ def remarks_on(world: World) -> str:
     if not earned:
         return "all rounds are over where they begin"
     remark = f"random actions: rewards {min(earned):.3g} to {max(earned):.3g} a step"
-    remark += "".join(f"; {one}" for one in _misspelt(world))
+    for name, meant in misspelt(type(world)).items():
+        remark += f"; {name} is no member of worlds; perhaps you meant {meant}"
     if world.random and not chance:
         remark += "; no step depended on chance, so random may be left out"
     if not offers(world, "over"):
         return remark
     remark += f"; {number} of {REMARKED} rounds ended"
     return remark if number else f"{remark}, so ends were not checked"
-
-
-def _misspelt(world: World) -> list[str]:
-    """Return a remark on each public attribute of a user that almost has a member's name."""
-    members, own = set[str](), set[str]()
-    for kind in type(world).__mro__:
-        if kind.__module__.partition(".")[0] == "mirror_ppl":
-            members |= {*vars(kind), *vars(kind).get("__annotations__", {})}
-        else:
-            own |= {*vars(kind)} - {*vars(kind).get("_derived", ())}
-    found = []
-    for name in sorted(own - members):
-        close = get_close_matches(name, members - own, 1, ALMOST)
-        if close and not name.startswith("_"):
-            found.append(f"{name} is no member of worlds; perhaps you meant {close[0]}")
-    return found
 
 
 def _outcome(world: World, state: Any, action: Tensor) -> dict[str, Tensor]:

@@ -75,10 +75,13 @@ def strip(
         sees: what the person sees of an observation without messages.
     """
     log = [entry for entry in played.log if entry["round"] == number]
-    states = [state]
-    for entry in log:
+    states, mishaps = [state], []
+    for step, entry in enumerate(log):
         action = torch.tensor([[domain.actions.index(entry["action"])]])
         states.append(domain.transition(states[-1], action))
+        rewards = domain.rewards(states[-2], action, states[-1])
+        if bool(rewards[domain.mishap[0]] < 0):
+            mishaps.append(step)
     channels = Channels(domain)
     messages = [*(entry["message"] for entry in log), {}]
     told = [channels.split(channels.flags(message)) for message in messages]
@@ -94,7 +97,7 @@ def strip(
         [entry["action"] for entry in log],
         [_gain(entry) for entry in log],
         float(played.net[number]),
-        played.mishaps[number],
+        mishaps,
     )
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from mirror_ppl.checks import require_kind
 from mirror_ppl.domains.base import Domain
 from mirror_ppl.domains.registry import known_domains
-from mirror_ppl.errors import HumanModelError, LacksSitesOfWorld
+from mirror_ppl.errors import HumanModelError, LacksSitesOfWorld, MisspeltMember
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.variants import VARIANTS
-from mirror_ppl.user_code import class_in_file, describe
+from mirror_ppl.user_code import class_in_file, describe, misspelt
 
 MIRROR = "mirror"
 """Name of the package's own model, which depends on the domain."""
@@ -36,11 +36,19 @@ def human_models_of(domain: Domain) -> Mapping[str, type[HumanModel]]:
 
 
 def checked_base(human: HumanModel) -> HumanModel:
-    """Return a user's human model, with a warning if its world needs another base class.
+    """Return a user's human model, with warnings about its base class and misspelt methods.
 
     Warns:
         LacksSitesOfWorld: the world has a human model of its own, whose sites this one lacks.
+        MisspeltMember: a method almost has the name of one that the model could override.
     """
+    for name, meant in misspelt(type(human)).items():
+        warnings.warn(
+            f"{name} of {type(human).__name__} is no member of human models, and nothing calls it "
+            f"unless you do; perhaps you meant {meant}",
+            MisspeltMember,
+            stacklevel=3,
+        )
     own = human.self_model.domain.record.part("human_models")
     if own and not isinstance(human, tuple(own.values())):
         needed = own[MIRROR]

@@ -35,7 +35,7 @@ class Strip:
         actions: of the person, by name, T.
         gains: what each message was expected to gain, T; 0 for silence, or if not known.
         net: rewards less costs of the round.
-        mishaps: number of steps with the world's mishap.
+        mishaps: steps with the world's mishap.
     """
 
     communicator: str
@@ -45,7 +45,7 @@ class Strip:
     actions: list[str]
     gains: list[float]
     net: float
-    mishaps: int
+    mishaps: list[int]
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
     """Draw the same round with two communicators, step by step.
 
     Communicators stand below each other, or side by side where pictures of the world are wide.
-    Of the steps at which messages or actions differ, the first one is drawn and those at which
-    messages were expected to gain most, then others. Below each frame stand what was communicated
-    (blue) and what the person did then.
+    Drawn are the first step at which messages or actions differ, mishaps, and steps that differ and
+    at which messages were expected to gain most, then others. Below each frame stand what was
+    communicated (blue) and what the person did then.
 
     Args:
         film: from :func:`mirror_ppl.evaluation.film.film`.
@@ -108,7 +108,7 @@ def plot_film(film: Film, people: Sequence[str], frames: int = FRAMES) -> Pictur
 
 
 def _steps(film: Film, frames: int) -> list[int]:
-    """Choose steps: the last, the first that differs, those of the largest gains, and others."""
+    """Choose steps: the last, the first that differs, mishaps, the largest gains, and others."""
     one, other = film.strips
     last = max(len(one.actions), len(other.actions))
     differ = [
@@ -123,7 +123,11 @@ def _steps(film: Film, frames: int) -> list[int]:
         for step in range(last)
     ]
     ranked = sorted(differ[1:], key=lambda step: -max(gains[step], gains[last + step]))
-    chosen = {last, *differ[:1], *ranked[: frames - 2]}
+    hurt = sorted({step for strip in film.strips for step in strip.mishaps})
+    chosen = {last}
+    for step in (*differ[:1], *hurt, *ranked):
+        if len(chosen) < frames:
+            chosen.add(step)
     for step in np.linspace(max(min(differ, default=0) - 1, 0), last, frames):
         if len(chosen) < frames:
             chosen.add(round(step))
@@ -132,7 +136,7 @@ def _steps(film: Film, frames: int) -> list[int]:
 
 def _result(strip: Strip, film: Film) -> str:
     what = film.domain.mishap[1]
-    return f"{strip.communicator}: net return {strip.net:.2f}, {what}: {strip.mishaps}"
+    return f"{strip.communicator}: net return {strip.net:.2f}, {what}: {len(strip.mishaps)}"
 
 
 def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> None:
@@ -142,7 +146,8 @@ def _frame(ax: Axes, film: Film, strip: Strip, step: int, characters: int) -> No
     shown = min(step, end)
     ax.imshow(film.domain.render_seen(strip.states[shown], strip.seen[shown]))
     if step >= end:
-        ax.set_title("the end" if step == end else f"over since step {end}", fontsize=9)
+        over = f"the end, step {end}" if step == end else f"over since step {end}"
+        ax.set_title(over, fontsize=9)
         return
     ax.set_title(f"step {step}", fontsize=9)
     for number, (text, colour) in enumerate(_below(strip, step, characters)):

@@ -67,6 +67,9 @@ def test_what_was_really_said_counts(communicator):
     assert not companion.past.told["verbal"][1].any()
     with pytest.raises(UnknownNameError, match="unknown verbal item"):
         companion.observe(next(seen), 0, {"verbal": ["above"]})
+    for message in ("rear-left", ["rear-left"], 5, {"verbal": "rear-left"}, {"verbal": 3}):
+        with pytest.raises(InputError, match="a message has lists of names by modality, as"):
+            companion.observe(next(rounds(3)), 0, message)
 
 
 def test_what_cannot_be_is_refused_and_changes_nothing(communicator):

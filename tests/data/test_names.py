@@ -10,7 +10,7 @@ from running import command
 
 from mirror_ppl.commands import compare, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations, to_dataset
-from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.errors import DemonstrationsError, UnknownNameError
 from mirror_ppl.plots.picture import Picture, displayable, label_of
 
 STRANGE = (
@@ -93,3 +93,9 @@ def test_characters_without_a_glyph_are_shown_by_their_number():
     assert displayable("a\u05d0\n\u5c71") == "a\u05d0\n[U+5C71]"
     assert displayable("plain") == "plain"
     assert label_of("n" * 100) == "n" * 39 + "\N{HORIZONTAL ELLIPSIS}"
+
+
+def test_names_that_differ_in_their_numbers_are_not_suggested():
+    people = ["person-01", "person-02", "person-10"]
+    assert "perhaps" not in str(UnknownNameError.of("person", "person-1", people))
+    assert str(UnknownNameError.of("person", "persn-01", people)).endswith('meant "person-01"')

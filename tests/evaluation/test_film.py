@@ -60,6 +60,7 @@ def test_a_round_played_back_has_the_rewards_that_it_had(listener, played, name)
         )
         assert len(one.states) == len(one.actions) + 1 == len(one.messages) + 1
         assert sum(rewards_along(DOMAIN, one)) == pytest.approx(own.task[number])
+        assert len(one.mishaps) == own.mishaps[number]
         assert one.net == pytest.approx(own.task[number] - own.cost[number])
         assert any(one.messages) == (name == "all")
 
@@ -75,7 +76,7 @@ def test_the_film_is_of_the_round_with_the_largest_gain(listener, played):
 def test_silence_comes_first_and_one_communicator_is_too_few():
     assert compared(("mirror", "none", "oracle")) == ("none", "mirror")
     assert compared(("mirror", "oracle")) == ("mirror", "oracle")
-    first = ("oracle", "none", "mirror")
+    first = ("oracle", "none", "mirror")  # in the order given
     assert compared(first) == ("none", "oracle")
     with pytest.raises(OptionError, match="--film compares two communicators, not mirror alone"):
         compared(("mirror",))
@@ -96,10 +97,15 @@ def test_steps_that_differ_are_drawn_first(listener, played):
         silent, messages=[["said: rear-left"] if step in (7, 9) else [] for step in range(20)]
     )
     figure = plot_film(replace(shown, strips=(silent, spoken)), ["ann"], frames=4)
-    assert titles(figure) == 2 * ["step 6", "step 7", "step 9", "the end"]
+    assert titles(figure) == 2 * [
+        "step 6",
+        "step 7",
+        "step 9",
+        f"the end, step {len(silent.actions)}",
+    ]
     assert "said: rear-left" in texts(figure)
     figure = plot_film(replace(shown, strips=(silent, spoken)), ["ann"], frames=2)
-    assert titles(figure) == 2 * ["step 7", "the end"]
+    assert titles(figure) == 2 * ["step 7", f"the end, step {len(silent.actions)}"]
 
 
 def test_steps_of_the_largest_gains_are_drawn(listener, played):
@@ -112,7 +118,15 @@ def test_steps_of_the_largest_gains_are_drawn(listener, played):
     for strips in ((silent, spoken), (spoken, silent)):
         figure = plot_film(replace(shown, strips=strips), ["ann"], frames=4)
         own = [f"step {number}" for number in (0, steps - 2, steps - 1)]
-        assert titles(figure) == 2 * [*own, "the end"]
+        assert titles(figure) == 2 * [*own, f"the end, step {steps}"]
+
+
+def test_mishaps_are_drawn(listener, played):
+    shown = film(pairing(listener), played)
+    silent, spoken = (replace(one, mishaps=[]) for one in shown.strips)
+    spoken = replace(spoken, messages=[["said: rear-left"]] * len(spoken.actions), mishaps=[11])
+    figure = plot_film(replace(shown, strips=(silent, spoken)), ["ann"], frames=3)
+    assert titles(figure)[:2] == ["step 0", "step 11"]
 
 
 def test_a_film_of_the_highway_shows_what_the_driver_sees():
@@ -121,7 +135,7 @@ def test_a_film_of_the_highway_shows_what_the_driver_sees():
     world = driver.domain
     state = driver.start.round(0).state
     log = [{"round": 0, "message": {"visual": ["rear"]}, "action": world.actions[7], "gain": 0.5}]
-    own = SimpleNamespace(log=log, net=[1.0], mishaps=[0])
+    own = SimpleNamespace(log=log, net=[1.0])
     one = strip(world, state, "mirror", own, 0, driver.driver.sees)
     alone = people.sees(world.observe(state))["visual"][0, 0]
     rear = one.seen[0]["visual"] & ~alone
@@ -152,19 +166,19 @@ def test_a_round_that_ended_early_stands_still(listener, played):
     )
     figure = plot_film(replace(shown, strips=(short, silent)), ["ann"], frames=3)
     assert titles(figure) == [
-        "the end",
+        "the end, step 5",
         "over since step 5",
         "over since step 5",
         "step 5",
         "step 6",
-        "the end",
+        f"the end, step {len(silent.actions)}",
     ]
 
 
 def test_equal_rounds_are_drawn_too(listener, played):
     shown = film(pairing(listener), {"none": played["none"], "nearest": played["none"]})
     figure = plot_film(shown, ["ann"], frames=3)
-    assert titles(figure) == 2 * ["step 0", "step 8", "the end"]
+    assert titles(figure) == 2 * ["step 0", "step 8", "the end, step 15"]
 
 
 def test_pictures_that_are_not_wide_stand_below_each_other():

@@ -17,7 +17,7 @@ from example_implants import (
 )
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.errors import HumanModelError
+from mirror_ppl.errors import HumanModelError, MisspeltMember
 from mirror_ppl.inference.svi import SVIOptions, fit_implants
 from mirror_ppl.likelihood.compiled import ViewTables
 from mirror_ppl.likelihood.contract import check_contract
@@ -259,6 +259,25 @@ def test_a_broken_contract_is_reported_before_any_work(tmp_path, human, method, 
     with pytest.raises(HumanModelError, match=message):
         check_contract(mine)
     assert torch.equal(torch.random.get_rng_state(), state)
+
+
+def test_a_misspelt_method_is_named(tmp_path, human):
+    code = """
+class Habit(HumanModel):
+    def actt(self, implants, belief, values):
+        return values
+
+    def _beleive(self):
+        return None
+
+    def habits(self):
+        return None
+"""
+    path = tmp_path / "habit.py"
+    path.write_text("from mirror_ppl import HumanModel\n" + code)
+    with pytest.warns(MisspeltMember, match="actt of Habit is no member .* you meant act$") as told:
+        load_human_model(f"{path}:Habit", human.self_model)
+    assert len(told) == 1
 
 
 def test_own_model_keeps_the_contract(human):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from example_drivers import PEOPLE, SITES, draw, made_up
+from matplotlib.patches import FancyBboxPatch
 
 from mirror_ppl.domains.driving import road
 from mirror_ppl.domains.driving.road import (
@@ -16,7 +17,7 @@ from mirror_ppl.domains.driving.road import (
     sight_probability,
     true_sight,
 )
-from mirror_ppl.domains.driving.samples import samples_picture
+from mirror_ppl.domains.driving.samples import CARS, samples_picture
 from mirror_ppl.plots.picture import Picture
 
 
@@ -107,6 +108,11 @@ def test_samples_are_drawn_beside_what_is_really_seen(data):
     assert black == [int(50 - true_sight(data, "anna").sum()), *own] + [0] * 5
     assert len(set(own)) > 1
     assert not figure.axes[5].axison
+    # Red bodies of the cars in sight, nothing of others.
+    for ax, one in zip(figure.axes[1:5], seen_of_draws(data, "anna").values, strict=True):
+        assert len(ax.findobj(FancyBboxPatch)) == 1 + sum(
+            one[lane, distance + 12] for distance, lane in CARS
+        )
     draw(figure)
 
 

@@ -81,15 +81,16 @@ def samples_picture(data: az.InferenceData) -> Picture:
 
 
 def _draw(ax: Axes, seen: xr.DataArray) -> None:
-    """Draw a road with four cars, black where ``seen`` ``[2, 25]`` is 0."""
+    """Draw a road with those of four cars that are seen, black where ``seen`` ``[2, 25]`` is 0."""
     end = ROAD_END + 0.5
     ax.add_patch(Rectangle((-end, 0), 2 * end, 2, fc=HEADLIGHT, ec="none"))
-    for distance, lane in CARS:
-        draw_car(ax, distance, lane + 0.5, RED)
+    for distance, lane in CARS:  # whole, with their arrows, or not at all
+        if seen.values[lane, distance + ROAD_END]:
+            draw_car(ax, distance, lane + 0.5, RED)
     draw_car(ax)
     # One artist for all cells: a hundred roads have thousands of them.
     dark = [Rectangle((cell - end, lane), 1, 1) for lane, cell in np.argwhere(seen.values == 0)]
-    ax.add_collection(PatchCollection(dark, fc=DARK, ec=DARK, lw=0.4, zorder=8))
+    ax.add_collection(PatchCollection(dark, fc=DARK, ec=DARK, lw=0.4, zorder=3))
     ax.set(xlim=(-end, end), ylim=(0, 2), xticks=[], yticks=[])
     ax.set_aspect(1.4)
     for spine in ax.spines.values():

@@ -123,11 +123,13 @@ def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -
     ):
         own = attributes.get(name)
         if own != mine:
+            given = "what it was fitted with"
             if name == "human_model":
                 own, mine = (model_name(str(one)) for one in (own, mine))
+                given += " (--human-model; in Python human=)"
             raise PosteriorError(
                 f"{path}: is of {name.replace('_', ' ')} {own}, not {mine}; fit again, or "
-                "give what it was fitted with"
+                f"give {given}"
             )
 
 
