@@ -100,9 +100,10 @@ class UnknownNameError(MirrorError):
         if not isinstance(name, str):
             return cls(message)
         lowered = {candidate.lower(): candidate for candidate in names}
-        for close in get_close_matches(name.lower(), lowered, n=1):
+        mine = name.lower()
+        for close in get_close_matches(mine, lowered, n=1):
             # Of names that differ in their numbers only, none is closer.
-            if NUMBER.sub("", close) != NUMBER.sub("", name.lower()):
+            if close == mine or NUMBER.sub("", close) != NUMBER.sub("", mine):
                 message += f'; perhaps you meant "{lowered[close]}"'
         return cls(message)
 
