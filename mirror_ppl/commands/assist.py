@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,7 @@ class Options:
     """Whom to help, how, and where the results go."""
 
     posterior: Path = Path("runs/demo/posterior.nc")
-    """A posterior of simulated people, from python -m mirror_ppl.fit (or make demo)."""
+    """A posterior of simulated people, or the folder of their fit (of make demo unless given)."""
     domain: str | None = None
     """The world that the posterior has to be of; that of the posterior unless given. One of your
     own has to be: path/to/file.py:Class, whose code is run."""
@@ -138,8 +138,10 @@ def main(options: Options) -> None:
     from mirror_ppl.evaluation.assistance_report import print_assistance
     from mirror_ppl.evaluation.assistance_summary import summarize_assistance
     from mirror_ppl.files import lock_of, output_folder, write_together
+    from mirror_ppl.inference.results.posterior_file import posterior_at
     from mirror_ppl.jobs import Runner
 
+    options = replace(options, posterior=posterior_at(options.posterior))
     chosen = options.communicator or COMMUNICATORS
     for name in chosen:
         if name not in COMMUNICATORS:

@@ -234,6 +234,14 @@ def test_another_domain_than_the_one_asked_for(path, tmp_path, draws):
         load_posterior(other)
 
 
+def test_the_folder_of_a_fit_stands_for_its_posterior(tmp_path, draws):
+    path = write(tmp_path / "posterior.nc", draws)
+    assert load_posterior(tmp_path).people == load_posterior(path).people
+    path.unlink()
+    with pytest.raises(PosteriorError, match="is not a regular file"):
+        load_posterior(tmp_path)
+
+
 def test_a_file_that_does_not_say_of_which_domain_it_is(tmp_path, draws):
     path = write(tmp_path / "x.nc", draws, domain=None)
     with pytest.raises(PosteriorError, match='is for the domain "unknown", not "driving"'):

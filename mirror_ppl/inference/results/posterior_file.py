@@ -23,6 +23,9 @@ from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.netcdf import read_netcdf
 from mirror_ppl.randomness import forked
 
+POSTERIOR = "posterior.nc"
+"""Name of the file in the folder of a fit."""
+
 
 @dataclass(frozen=True)
 class PosteriorFile:
@@ -133,11 +136,18 @@ def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -
             )
 
 
+def posterior_at(path: Path) -> Path:
+    """Return the file of a posterior, given that or the folder of its fit."""
+    own = path / POSTERIOR
+    return own if own.is_file() else path
+
+
 def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
     """Read a posterior file.
 
     Args:
-        path: a file that ``python -m mirror_ppl.fit`` or `save_inference_data` wrote.
+        path: a file that ``python -m mirror_ppl.fit`` or `save_inference_data` wrote, or the folder
+            of a fit.
         domain: required domain; any by default.
 
     Raises:
@@ -145,6 +155,7 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
         UnknownNameError: its domain does not exist.
     """
     path = as_path(path)
+    path = posterior_at(path)
     group = read_results(path, "posterior")["posterior"]
     try:
         attributes = {str(name): str(value) for name, value in group.attrs.items()}
