@@ -24,17 +24,18 @@ def derived_generator(
     return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
 
 
-def person_number(person: str) -> int:
-    """Return a number for the seeds of a person's draws, by their id.
+def person_seed(seed: int, person: str) -> int:
+    """Return the seed of a person's draws, given that of the whole and the person's id.
 
     So results do not depend on who else is inferred, nor on the order, unless people are sampled
     together, as by `svi` and `nuts`. Ids that the package gives, such as ``person-01``, are counted
     from 0; others are hashed.
     """
     if found := NUMBERED.fullmatch(person):
-        return int(found[1]) - 1
-    digest = hashlib.blake2b(person.encode(), digest_size=4).digest()
-    return int.from_bytes(digest)
+        number = int(found[1]) - 1
+    else:
+        number = int.from_bytes(hashlib.blake2b(person.encode(), digest_size=4).digest())
+    return seed * 1_000_003 + number
 
 
 def seed_everything(seed: int) -> None:

@@ -106,21 +106,21 @@ def main(options: Options) -> None:
 
 def _require_different(posteriors: tuple[Path, ...]) -> None:
     """Refuse a posterior that is given twice, whose difference to itself says nothing."""
-    from mirror_ppl.evaluation.compared_files import posterior_path
+    from mirror_ppl.inference.results.posterior_file import posterior_at
 
     seen = set()
     for path in posteriors:
-        real = os.path.realpath(posterior_path(path))
+        real = os.path.realpath(posterior_at(path))
         if real in seen:
             raise OptionError(f"{path} is given twice")
         seen.add(real)
 
 
 def _check_outputs(options: Options) -> None:
-    from mirror_ppl.evaluation.compared_files import posterior_path
     from mirror_ppl.files import require_files_of_their_own
+    from mirror_ppl.inference.results.posterior_file import posterior_at
 
-    inputs = {"a posterior": [posterior_path(path) for path in options.posteriors]}
+    inputs = {"a posterior": [posterior_at(path) for path in options.posteriors]}
     require_files_of_their_own({"--json": options.json, "--figure": options.figure}, inputs)
 
 

@@ -377,7 +377,7 @@ class Domain(Protocol):
         ...
 
     def render_seen(self, state: Any, visible: Visibility) -> Any:
-        """Draw one state where somebody perceives some items ``[K]``."""
+        """Draw one state as a person perceives it, to whom the items ``[K]`` are visible."""
         ...
 
 

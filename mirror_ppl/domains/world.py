@@ -358,7 +358,7 @@ class World(ABC):
         return np.kron(grey, np.ones((PIXELS, PIXELS), np.uint8))[..., None].repeat(3, -1)
 
     def render_seen(self, state: Any, visible: Visibility) -> np.ndarray:
-        """Draw a state where somebody perceives some items ``[K]``; by default :meth:`render`."""
+        """Draw a state as a person perceives it who sees items ``[K]``; by default as `render`."""
         del visible
         return self.render(state)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,11 +14,9 @@ import xarray as xr
 
 from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.errors import PosteriorError
-from mirror_ppl.inference.results.posterior_file import read_results
+from mirror_ppl.inference.results.posterior_file import POSTERIOR, posterior_at, read_results
 from mirror_ppl.models.loading import model_name
 
-FILE = "posterior.nc"
-"""File name of a fit's posterior."""
 GROUPS = {
     "loo": ("log_likelihood", "observed_data", "constant_data"),
     "heldout": ("predictions", "observed_data", "constant_data", "predictions_constant_data"),
@@ -82,11 +79,6 @@ class EvidenceFile(ComparedFile):
     error: np.ndarray
 
 
-def posterior_path(path: Path) -> Path:
-    """Path of the posterior file, given the file or a fit's folder."""
-    return path / FILE if os.path.isdir(path) else path
-
-
 def read_fit(path: Path, by: str = "loo") -> FitFile:
     """Read the compared content of a posterior file.
 
@@ -97,7 +89,7 @@ def read_fit(path: Path, by: str = "loo") -> FitFile:
     Raises:
         PosteriorError: the file is missing or damaged, or lacks the data of the measure.
     """
-    file = _read(posterior_path(path), by, partial(_predictions, by=by))
+    file = _read(posterior_at(path), by, partial(_predictions, by=by))
     path, power = file.path, float(file.attributes.get("likelihood_power", 1))
     if by == "loo" and power != 1:
         raise PosteriorError(
@@ -118,7 +110,7 @@ def read_evidence(path: Path) -> EvidenceFile:
     Raises:
         PosteriorError: the file is missing or damaged, or lacks the evidence of a person.
     """
-    file = _read(posterior_path(path), "evidence", _evidence)
+    file = _read(posterior_at(path), "evidence", _evidence)
     power = float(file.attributes.get("likelihood_power", 1))
     unknown = [
         person
@@ -209,7 +201,7 @@ def label_models(files: Sequence[ComparedFile]) -> tuple[str, ...]:
     models = [compared_model(file) for file in files]
     paths = [file.path.resolve() for file in files]
     # A fit's folder is used in place of the file in it, whose name is always the same.
-    shown = [(path.parent if path.name == FILE else path).parts[1:] for path in paths]
+    shown = [(path.parent if path.name == POSTERIOR else path).parts[1:] for path in paths]
     alike, labels = Counter(models), models
     for depth in range(1, 1 + max(map(len, shown))):
         if len(set(labels)) == len(set(paths)):

@@ -25,7 +25,7 @@ def compared(communicators: Sequence[str]) -> tuple[str, str]:
     Raises:
         OptionError: there is only one.
     """
-    others = [name for name in communicators if name != SILENT]
+    others = [name for name in dict.fromkeys(communicators) if name != SILENT]
     chosen = ([SILENT] if SILENT in communicators else []) + others
     if len(chosen) == 1:
         raise OptionError(f"--film compares two communicators, not {chosen[0]} alone")

@@ -17,7 +17,7 @@ from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import RESIDUAL
 from mirror_ppl.progress import Report, silent
-from mirror_ppl.randomness import person_number
+from mirror_ppl.randomness import person_seed
 
 if TYPE_CHECKING:
     from mirror_ppl.inference.amortized_guide import AmortizedGuide
@@ -107,7 +107,7 @@ class Job:
 
     def seed_of(self, person: int) -> int:
         """Return the seed of one of the people, by their place; it depends on their id alone."""
-        return (self.seed + 1) * 1_000_003 + person_number(self.rounds.people[person])
+        return person_seed(self.seed + 1, self.rounds.people[person])
 
     def of(self, people: range) -> Job:
         """The job for some of the people."""

@@ -57,7 +57,7 @@ def log_softmax_of_few(logits: Tensor) -> Tensor:
 
 
 def log_of_sum(first: Tensor, second: Tensor) -> Tensor:
-    """Return ``torch.logaddexp`` of log-probabilities, in a fifth of its time on a processor.
+    """Return ``torch.logaddexp`` of log-probabilities, faster where there are many on a processor.
 
     It takes as long as ``torch`` if some of ``second``, which is broadcast, is so low that its
     exponential could be rounded to 0.

@@ -17,7 +17,7 @@ from mirror_ppl.checks import as_tensor, require_kind, seed_number, whole_number
 from mirror_ppl.errors import HumanModelError, InputError, shown
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.sites import latent_sites
-from mirror_ppl.randomness import forked, person_number, seed_everything
+from mirror_ppl.randomness import forked, person_seed, seed_everything
 
 Draws = dict[str, Tensor]
 """Posterior or prior draws by site, ``[S, P, 1, ...]``: people at -2 of the batch dimensions."""
@@ -96,7 +96,7 @@ def draw_prior_of_each(human: HumanModel, people: Sequence[str], number: int, se
     each = []
     with forked():
         for person in people:
-            seed_everything(seed * 1_000_003 + person_number(person))
+            seed_everything(person_seed(seed, person))
             each.append(values_of(sample_sites(human, 1, number)))
     return {name: torch.cat([own[name] for own in each], 1) for name in each[0]}
 

@@ -117,12 +117,10 @@ def _steps(film: Film, frames: int) -> list[int]:
         if one.messages[step : step + 1] != other.messages[step : step + 1]
         or one.actions[step : step + 1] != other.actions[step : step + 1]
     ]
-    gains = [
-        max(strip.gains[step : step + 1], default=0.0)
-        for strip in film.strips
-        for step in range(last)
-    ]
-    ranked = sorted(differ[1:], key=lambda step: -max(gains[step], gains[last + step]))
+    ranked = sorted(
+        differ[1:],
+        key=lambda step: -max(sum(strip.gains[step : step + 1]) for strip in film.strips),
+    )
     hurt = sorted({step for strip in film.strips for step in strip.mishaps})
     chosen = {last}
     for step in (*differ[:1], *hurt, *ranked):

@@ -89,11 +89,12 @@ def late():
     return play_rounds(human, implants, 24, "fog", torch.Generator().manual_seed(100))
 
 
+# Of a person whom the model does not explain, Pareto k is near .7 with 256 to 2,048 proposals.
+@pytest.mark.filterwarnings("ignore::mirror_ppl.errors.UnreliableWeights")
 def test_a_fit_says_who_is_late(late):
     human = HumanModel(robot_of_few_reaches())
-    # So few proposals leave Pareto k above .7 in 2 of seeds 1 to 8: with seed 7 it is .4.
     few = {"settings": {"proposals": 256, "enough": 100.0}, "draws": 200, "explore": 0}
-    fit = mirror_ppl.infer(late, human=human, engine="importance", seed=7, **few)
+    fit = mirror_ppl.infer(late, human=human, engine="importance", seed=1, **few)
     check = fit.check
     assert list(check.index) == ["person-01", "person-02"]
     assert check["verdict"].iloc[0] == "ok"

@@ -8,7 +8,7 @@ import pytest
 import mirror_ppl
 from mirror_ppl.errors import InputError
 from mirror_ppl.inference.workers import PART, PEOPLE_OF_A_PROCESS, People, Workers
-from mirror_ppl.randomness import person_number
+from mirror_ppl.randomness import person_seed
 from mirror_ppl.timing import clocked, stage
 
 PEOPLE = 3
@@ -157,8 +157,8 @@ def test_stages_within_others_count_once():
     assert seconds == before
 
 
-def test_numbers_of_people_are_those_of_their_ids():
-    assert [person_number(f"person-{n:02d}") for n in (1, 2, 99, 100, 1000)] == [0, 1, 98, 99, 999]
+def test_seeds_of_people_are_those_of_their_ids():
+    assert [person_seed(0, f"person-{n:02d}") for n in (1, 2, 99, 100, 1000)] == [0, 1, 98, 99, 999]
     others = [
         "person-0",
         "person-00",
@@ -168,4 +168,4 @@ def test_numbers_of_people_are_those_of_their_ids():
         "ann",
         "person-01",
     ]
-    assert len({person_number(name) for name in others}) == len(others)
+    assert len({person_seed(0, name) for name in others}) == len(others)

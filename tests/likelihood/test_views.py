@@ -292,11 +292,9 @@ def test_beginnings_of_long_rounds_drop_combinations_before(
     after.add(rounds)
     assert torch.equal(found.alive, after.alive) and torch.equal(found.score, after.score)
     assert_tables_equal(found.table(), after.table())
-    monkeypatch.setattr(view_table_builder, "LONG", 4)
     monkeypatch.setattr(view_table_builder, "MANY", 2)
-    monkeypatch.setattr(view_table_builder, "LONG", 3)
     margins.clear()
-    one_by_one = ViewTableBuilder(human, screening, candidates=torch.arange(14))
+    one_by_one = ViewTableBuilder(human, screening)
     for number in range(3):
         one_by_one.alive = torch.arange(14)
         one_by_one.add(rounds.at(number, number + 1))

@@ -61,15 +61,11 @@ def require_action(action: Tensor) -> Tensor:
         raise InputError(f"{AN_ACTION}, not {shown(action)}")
     if action.is_floating_point():
         if action.shape[-1:] != (2,) or not bool(action.isfinite().all()):
-            raise InputError(f"{AN_ACTION}, not {_shown(action)}")
+            raise InputError(f"{AN_ACTION}, not {shown(action.tolist())}")
         return action
     if action.numel() and not bool(((action >= 0) & (action < len(MANOEUVRES))).all()):
+        most = len(MANOEUVRES) - 1
         raise InputError(
-            f"manoeuvres of the highway count from 0 to {len(MANOEUVRES) - 1}, not {_shown(action)}"
+            f"manoeuvres of the highway count from 0 to {most}, not {shown(action.tolist())}"
         )
     return action.long()
-
-
-def _shown(action: Tensor) -> str:
-    few = action.numel() <= 4  # noqa: PLR2004
-    return str(action.tolist()) if few else f"numbers {list(action.shape)}"

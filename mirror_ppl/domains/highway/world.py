@@ -348,7 +348,7 @@ class Highway(World):
         return self.render_seen(state, self.visibility(setting, self.observe(state)))
 
     def render_seen(self, state: HighwayState, visible: Visibility) -> np.ndarray:
-        """Draw the same where somebody sees some sectors ``[36]``; others are grey."""
+        """Draw the same as a person perceives it: sectors ``[36]`` out of sight are grey."""
         from mirror_ppl.domains.highway.pictures import picture
 
         return picture(state, self.observe(state), visible["visual"])

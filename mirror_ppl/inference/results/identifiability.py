@@ -42,7 +42,7 @@ from mirror_ppl.likelihood.view_table import combination_number
 from mirror_ppl.likelihood.view_table_builder import ViewTableBuilder
 from mirror_ppl.models.human import HumanModel, has_own_program
 from mirror_ppl.models.simulation import play_rounds
-from mirror_ppl.randomness import person_number
+from mirror_ppl.randomness import person_seed
 
 NEGLIGIBLE = 0.005
 """Nats below which entropies and information gains count as 0; printed as 0.00."""
@@ -180,7 +180,7 @@ def identify(
         if rounds:
             # Each person has their own worlds, so that averages over people use many.
             generator = torch.Generator(weights.device).manual_seed(
-                seed * 1_000_003 + person_number(train.people[person])
+                person_seed(seed, train.people[person])
             )
             some, pairs = _represented(weights, generator)
             told = _information(

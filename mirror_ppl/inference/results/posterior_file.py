@@ -138,8 +138,7 @@ def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -
 
 def posterior_at(path: Path) -> Path:
     """Return the file of a posterior, given that or the folder of its fit."""
-    own = path / POSTERIOR
-    return own if own.is_file() else path
+    return path / POSTERIOR if path.is_dir() else path
 
 
 def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:

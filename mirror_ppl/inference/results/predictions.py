@@ -25,7 +25,7 @@ from mirror_ppl.inference.results.posterior_predictive import (
 from mirror_ppl.inference.results.summary import score
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.progress import Report, silent
-from mirror_ppl.randomness import person_number
+from mirror_ppl.randomness import person_seed
 
 PREDICTIVE_STREAM, CRITICISM_STREAM = 2**31, 2**32
 """Offsets of seeds, so that predictive draws share none with inference and simulated rounds."""
@@ -94,14 +94,14 @@ def predict_people(
     """
     (train, test), parts = rounds, []
     people = train.num_people
-    numbers = [seed * 1_000_003 + person_number(person) for person in train.people]
+    seeds = [person_seed(seed, person) for person in train.people]
     for some in groups(people):
         report("predict", some.start, people, "people")
         posterior, prior = (of_people(own, some) for own in draws)
         own = train.part(some)
         generators = [
-            torch.Generator().manual_seed(PREDICTIVE_STREAM + number)
-            for number in numbers[some.start : some.stop]
+            torch.Generator().manual_seed(PREDICTIVE_STREAM + own_seed)
+            for own_seed in seeds[some.start : some.stop]
         ]
         learned = predict_rounds(human, own, posterior).cpu()
         part = Predictions(
@@ -119,7 +119,7 @@ def predict_people(
                 human,
                 (train.part(one), None if test is None else test.part(one)),
                 (learned[:, place : place + 1], None if found is None else found[:, [place]]),
-                CRITICISM_STREAM + numbers[person],
+                CRITICISM_STREAM + seeds[person],
             )
             for place, (person, one) in enumerate((one, range(one, one + 1)) for one in some)
         ]
