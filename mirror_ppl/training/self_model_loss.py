@@ -78,6 +78,10 @@ def self_model_loss(
     if options.choice_weight:
         chosen, likely = torch.softmax(goal[sure], -1), torch.log_softmax(values[sure], -1)
         total = total + options.choice_weight * _cross_entropy(chosen, likely)
+    if options.regret_weight:
+        behind = goal[sure].amax(-1, keepdim=True) - goal[sure]
+        regret = (torch.softmax(values[sure], -1) * behind).sum(-1)
+        total = total + options.regret_weight * _mean(regret)
     return Loss(total, negative_elbo.detach(), bellman.detach())
 
 

@@ -13,6 +13,9 @@ from mirror_ppl.domains.world import World, offers
 from mirror_ppl.errors import InputError
 from mirror_ppl.training.views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES, KINDS
 
+OF_CHOICES = ("choice_weight", "regret_weight")
+"""Weights of losses of choices."""
+
 
 @dataclass(frozen=True)
 class SelfModelOptions:
@@ -51,6 +54,9 @@ class SelfModelOptions:
             exponential of learned values, if they were made so by the planner's. Of observers who
             know all decisive items, and only with ``distil``: others would take what is likely for
             certain. Errors of values where one action is far better than another hardly count.
+        regret_weight: weight of the regret of such choices: how much less they are worth than the
+            best, by the planner's values. Of the same observers, and only with ``distil``. It makes
+            mistakes count by what they cost, however rare they are.
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
         assumed: share of sight views in which each assumption is made. At 0 the robot does not
             learn what follows from assumptions; imagined items are then like seen ones to it. With
@@ -88,6 +94,7 @@ class SelfModelOptions:
     bin_weight: float = 1.0
     ranked_weight: float = 0.0
     choice_weight: float = 0.0
+    regret_weight: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     assumed: float = ASSUMPTION_PROBABILITY
     at_means: bool = False
@@ -113,15 +120,17 @@ class SelfModelOptions:
             raise InputError(
                 f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
             )
-        for name in ("difference_weight", "bin_weight", "ranked_weight", "choice_weight"):
+        weights = ("difference_weight", "bin_weight", "ranked_weight", *OF_CHOICES)
+        for name in weights:
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be at least 0 and finite, not {getattr(self, name)}")
         if self.window < 0 or self.length < 0:
             raise InputError("window and length must not be negative")
         if self.distil and self.exact:
             raise InputError("distil and exact are two ways to learn a planner's values")
-        if self.choice_weight and not self.distil:
-            raise InputError("choice_weight needs distil: choices are those at a planner's values")
+        for name in OF_CHOICES:
+            if getattr(self, name) and not self.distil:
+                raise InputError(f"{name} needs distil: choices are those at a planner's values")
         if self.distil and not self.window:
             raise InputError("distil needs a window: values are kept with the states of rounds")
         if len(self.kinds) != len(KINDS) or min(self.kinds) < 0 or not sum(self.kinds) > 0:

@@ -37,6 +37,8 @@ STEPS = DRIVING.horizon
         ({"distil": True}, "distil needs a window"),
         ({"distil": True, "window": 3, "exact": True}, "distil and exact are two ways"),
         ({"choice_weight": 1.0}, "choice_weight needs distil"),
+        ({"regret_weight": 1.0}, "regret_weight needs distil"),
+        ({"regret_weight": -1.0}, "regret_weight must be at least 0"),
         ({"distil": True, "window": 5, "length": 4}, "window is 5, longer than rounds of 4 steps"),
     ],
 )
@@ -106,7 +108,7 @@ def three_moments():
 
 
 def test_choices_are_learned_where_all_that_counts_is_known():
-    """The cross entropy, by hand, of those of three moments that are known and go on."""
+    """Cross entropy and regret, by hand, of those of three moments that are known and go on."""
     robot = SelfModel(DRIVING, sizes_of(DRIVING), EMBEDDINGS["words"])
     options = SelfModelOptions(distil=True, window=3, world_weight=0.0)
     lived = three_moments()
@@ -119,6 +121,10 @@ def test_choices_are_learned_where_all_that_counts_is_known():
         found = self_model_loss(
             robot, robot.q_network, lived, replace(options, choice_weight=7.0), True
         ).total
+        torch.manual_seed(0)
+        regretted = self_model_loss(
+            robot, robot.q_network, lived, replace(options, regret_weight=3.0), True
+        ).total
         evidence = robot.evidence(
             lived.rounds.observation, lived.rounds.visible, lived.rounds.actions
         )
@@ -126,6 +132,8 @@ def test_choices_are_learned_where_all_that_counts_is_known():
     wanted = torch.softmax(lived.exact[0, 0], -1)
     entropy = -(wanted * torch.log_softmax(values, -1)).sum()
     torch.testing.assert_close(found - without, 7 * entropy)
+    behind = lived.exact[0, 0].max() - lived.exact[0, 0]
+    torch.testing.assert_close(regretted - without, 3 * torch.softmax(values, -1) @ behind)
 
 
 def test_bins_of_values_are_learned_by_cross_entropy():
