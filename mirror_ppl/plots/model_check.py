@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mirror_ppl.inference.results.checks import REPLICATES, SHARE
+from mirror_ppl.inference.results.checks import ONE_SIDED, REPLICATES, SHARE, tail
 from mirror_ppl.inference.results.criticism import FINE, LEVEL
 from mirror_ppl.plots.picture import Picture, label_of
 from mirror_ppl.plots.reading import BLACK, BLUE, ORANGE
@@ -30,10 +30,10 @@ MOST_PEOPLE = 60
 def plot_model_check(data: az.InferenceData) -> Picture:
     """Draw each person's posterior predictive checks and likelihoods of held-out actions.
 
-    Left: two-sided p-values, with an arrow up (blue) where there is more than the model predicts
-    and down (red) where there is less; frames mark those that make a person suspect. Right, if
-    rounds were held out: NLL in nats an action of the model, of the base rate of each action, and
-    of the model without implants.
+    Left: p-values, two-sided but for those of perception, with an arrow up (blue) where there is
+    more than the model predicts and down (red) where there is less; frames mark those that make a
+    person suspect. Right, if rounds were held out: NLL in nats an action of the model, of the base
+    rate of each action, and of the model without implants.
 
     Args:
         data: with the group ``model_check``; of more than 60 people the first are drawn.
@@ -62,7 +62,8 @@ def plot_model_check(data: az.InferenceData) -> Picture:
 
 def _p_values(ax, group: xr.Dataset) -> None:
     values = group["p_value"].values
-    tails = 2 * np.minimum(values, 1 - values)
+    checks = [str(name) for name in group["check"].values]
+    tails = np.array([[tail(*pair) for pair in zip(checks, own, strict=True)] for own in values])
     # As powers of ten, with the sign of the deviation.
     depth = -np.log10(tails.clip(1 / REPLICATES, 1))
     ax.imshow(
@@ -74,11 +75,11 @@ def _p_values(ax, group: xr.Dataset) -> None:
     )
     limit = LEVEL / np.maximum(np.isfinite(values).sum(1), 1)
     for row, own in enumerate(tails):
-        for column, tail in enumerate(own):
-            if not np.isfinite(tail):
+        for column, value in enumerate(own):
+            if not np.isfinite(value):
                 continue
-            text = f"{tail:.2f}" if tail >= 0.01 else f"{tail:.3f}"  # noqa: PLR2004
-            text = f"<{2 / REPLICATES:.3f}" if tail < 2 / REPLICATES else text
+            text = f"{value:.2f}" if value >= 0.01 else f"{value:.3f}"  # noqa: PLR2004
+            text = f"<{2 / REPLICATES:.3f}" if value < 2 / REPLICATES else text
             # Grey prints do not tell the colours apart.
             text = (
                 "\N{UPWARDS ARROW}" if values[row, column] < 0.5 else "\N{DOWNWARDS ARROW}"
@@ -93,15 +94,16 @@ def _p_values(ax, group: xr.Dataset) -> None:
                 va="center",
                 color=colour,
                 fontsize=8,
-                bbox=frame if tail < limit[row] else None,
+                bbox=frame if value < limit[row] else None,
             )
-    names = [str(name) for name in group["check"].values]
-    shares = [place for place, name in enumerate(names) if name.startswith(SHARE)]
+    shares = [place for place, name in enumerate(checks) if name.startswith(SHARE)]
     several = len(shares) > 1
-    _name_columns(ax, [name.removeprefix(SHARE) if several else name for name in names])
+    _name_columns(ax, [name.removeprefix(SHARE) if several else name for name in checks])
+    single = [name for name in checks if name in ONE_SIDED]
+    sided = f" (one-sided: {', '.join(single)})" if single else ""
     title = (
-        "Two-sided p-values; \N{UPWARDS ARROW} more, \N{DOWNWARDS ARROW} less than predicted;\n"
-        "frames: such people are suspect"
+        f"Two-sided p-values{sided};\n"
+        "\N{UPWARDS ARROW} more, \N{DOWNWARDS ARROW} less than predicted; framed: suspect"
     )
     ax.set_title(title, fontsize=11, pad=22 if several else None)
     if several:

@@ -129,6 +129,12 @@ CHECKS: Mapping[str, Check] = {
 }
 """Registry of checks besides the shares of actions; a new check is one more entry."""
 
+ONE_SIDED: Mapping[str, str] = {
+    "missed": "acts as if noticing late, or not at all, what the model says they see",
+    "forgot": "acts as if forgetting earlier steps",
+}
+"""Checks of perception, with descriptions of people to whom they point; only small p-values do."""
+
 
 def steps_of(domain: Domain, rounds: Demonstrations, log_probability: Tensor) -> Steps:
     """The recorded steps of one person.
@@ -161,6 +167,11 @@ def steps_of(domain: Domain, rounds: Demonstrations, log_probability: Tensor) ->
     )
 
 
+def tail(name: str, p_value: float) -> float:
+    """Return the p-value by which a check is judged: two-sided but for `ONE_SIDED` ones."""
+    return p_value if name in ONE_SIDED else 2 * min(p_value, 1 - p_value)
+
+
 def p_values(steps: Steps, actions: Sequence[str], generator: torch.Generator) -> dict[str, float]:
     """Posterior predictive p-value of each check, with equally many replicates per draw.
 
@@ -182,20 +193,20 @@ def p_values(steps: Steps, actions: Sequence[str], generator: torch.Generator) -
             continue
         values = values.expand(draws, -1, -1)
         own = steps.actions[some][None, :, None].expand(draws, -1, 1)
-        found[name] = _more(
+        found[name] = more_often(
             values.gather(-1, drawn[:, some]).double().sum(1),
             values.gather(-1, own).double().sum(1),
         )
     # With two actions, the share of one determines the other.
     for action, name in enumerate(actions if len(actions) > 2 else actions[:1]):  # noqa: PLR2004
-        found[SHARE + name] = _more(
+        found[SHARE + name] = more_often(
             (drawn == action).double().sum(1), (steps.actions == action).double().sum()
         )
     return found
 
 
-def _more(replicated: Tensor, recorded: Tensor) -> float:
-    """Probability that a replicate exceeds the recorded value, with ties counted by half."""
+def more_often(replicated: Tensor, recorded: Tensor) -> float:
+    """Return how often replicates exceed the recorded value, with ties counted by half."""
     near = (replicated - recorded).abs() <= TIE * (1 + recorded.abs())
     # Actions of probability 0 have infinite surprise.
     same = torch.where(recorded.isfinite(), near, replicated == recorded)

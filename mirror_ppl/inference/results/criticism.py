@@ -19,11 +19,14 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.inference.adaptive_importance import ImportanceOptions, sample_importance
 from mirror_ppl.inference.results.checks import (
     CHECKS,
+    ONE_SIDED,
     REPLICATES,
     SHARE,
     p_values,
     steps_of,
+    tail,
 )
+from mirror_ppl.inference.results.perception_checks import perception_p_values
 from mirror_ppl.inference.results.posterior_predictive import chosen_log_probability, predict_rounds
 from mirror_ppl.inference.results.summary import predictive
 from mirror_ppl.likelihood.combinations import grid_of, perceived_sites
@@ -77,7 +80,7 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
     """
     if not found:
         return Verdict(UNCHECKED)
-    tails = {name: 2 * min(value, 1 - value) for name, value in found.items()}
+    tails = {name: tail(name, value) for name, value in found.items()}
     limit, least = LEVEL / len(tails), 2 / REPLICATES
     reasons = []
     for name in sorted(tails, key=lambda one: tails[one]):  # stable: ties keep their order
@@ -99,6 +102,8 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
 
 
 def _says(name: str, more: bool) -> str:
+    if name in ONE_SIDED:
+        return ONE_SIDED[name]
     if name in CHECKS:
         return CHECKS[name].more if more else CHECKS[name].less
     action = name.removeprefix(SHARE)
@@ -146,6 +151,7 @@ def criticize(
     human: HumanModel,
     rounds: tuple[Demonstrations, Demonstrations | None],
     log_probabilities: tuple[Tensor, Tensor | None],
+    draws: Mapping[str, Tensor],
     seed: int,
 ) -> dict[str, Any]:
     """Check whether the model explains one person; the result is stored in ``summary.json``.
@@ -154,6 +160,7 @@ def criticize(
         human: the model of people.
         rounds: training rounds of one person, and held-out rounds, if any.
         log_probabilities: log-probabilities of actions there, ``[S, 1, B, T, A]``.
+        draws: posterior draws of the person's implants ``[S, 1, 1, ...]``.
         seed: seed of all random draws.
 
     Returns:
@@ -162,7 +169,9 @@ def criticize(
     """
     domain, (train, test) = human.domain, rounds
     steps = steps_of(domain, train.to("cpu"), log_probabilities[0])
-    found = p_values(steps, domain.actions, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    found = p_values(steps, domain.actions, generator)
+    found |= perception_p_values(human, train, draws, generator)
     often = robot = lead = None
     if test is not None and log_probabilities[1] is not None and bool(test.mask.any()):
         own = test.to("cpu")

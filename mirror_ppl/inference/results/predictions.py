@@ -119,6 +119,7 @@ def predict_people(
                 human,
                 (train.part(one), None if test is None else test.part(one)),
                 (learned[:, place : place + 1], None if found is None else found[:, [place]]),
+                {name: value[:, [place]] for name, value in posterior.items()},
                 CRITICISM_STREAM + seeds[person],
             )
             for place, (person, one) in enumerate((one, range(one, one + 1)) for one in some)
