@@ -23,6 +23,7 @@ from mirror_ppl.models.implants import sight_sites
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.simulation import play_rounds
+from mirror_ppl.models.view import View
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
@@ -179,10 +180,19 @@ def test_models_of_which_perception_is_not_checked(name, world, rounds):
     assert perception_p_values(model, rounds, {}, torch.Generator()) == {}
 
 
-def test_without_items_in_sight_nothing_is_missed(again):
-    blind = replace(again, human=Blind(again.human.self_model))
-    replicates = blind.replicates(torch.Generator().manual_seed(0))
-    assert blind.missed(replicates, torch.Generator()) == 1 / 2
+class PerceivesAll(HumanModel):
+    """Perceives everything, without a look."""
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        """Everything."""
+        return View({name: torch.ones_like(mask) for name, mask in told.items()}), knowledge
+
+
+@pytest.mark.parametrize("kind", [Blind, PerceivesAll])
+def test_without_items_that_come_into_sight_nothing_is_missed(again, rounds, kind):
+    human = kind(again.human.self_model)
+    found = perception_p_values(human, rounds, again.draws, torch.Generator().manual_seed(0))
+    assert found.keys() == {"forgot"}
 
 
 def test_only_small_p_values_of_perception_are_reasons():

@@ -81,7 +81,8 @@ def perception_p_values(
     own = {name: value[some] for name, value in draws.items()}
     again = PerceivedOtherwise(human, tuple(sites), rounds_of(rounds, 0), own)
     replicates = again.replicates(generator)
-    return {"missed": again.missed(replicates, generator), "forgot": again.forgot(replicates)}
+    found = {"missed": again.missed(replicates, generator), "forgot": again.forgot(replicates)}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,7 @@ class PerceivedOtherwise:
 
     @property
     def device(self) -> torch.device:
+        """The device of the rounds."""
         return self.rounds.actions.device
 
     @cached_property
@@ -136,11 +138,11 @@ class PerceivedOtherwise:
         )
         return drawn.view(*probabilities.shape[:2], times).to(self.device)
 
-    def missed(self, replicates: Tensor, generator: torch.Generator) -> float:
-        """Return the p-value of a person who notices items late."""
+    def missed(self, replicates: Tensor, generator: torch.Generator) -> float | None:
+        """Return the p-value of a person who notices items late; ``None`` if none are in sight."""
         rows, begins, masks = self._events(generator)
         if not len(rows):
-            return 1 / 2
+            return None
         row, drawn = self.row[rows], self.drawn[rows]
         steps = torch.arange(self.rounds.actions.shape[1], device=self.device)
         late = torch.tensor(list(DELAYS), device=self.device)[:, None, None]
@@ -172,13 +174,19 @@ class PerceivedOtherwise:
 
     def _events(self, generator: torch.Generator) -> tuple[Tensor, Tensor, Visibility]:
         """Return where items come into sight: pairs ``[J]``, steps ``[J]``, items ``[J, K]``."""
-        seen: list[Visibility] = []
-        for step in range(self.rounds.actions.shape[1]):
-            now = {name: value[self.row] for name, value in at_step(self.observation, step).items()}
-            masks = self.human.sees(self._implants(self.drawn), now, step)
-            seen.append({name: mask.expand(len(self.row), -1) for name, mask in masks.items()})
+        seen: dict[int, Visibility] = {}
+
+        def sees(implants: Implants, observation: Observation, step: int) -> Visibility:
+            masks = self.human.sees(implants, observation, step)
+            own = {name: mask.expand(len(self.row), -1) for name, mask in masks.items()}
+            seen.setdefault(step, own)  # later at a step: whether what is expected would be seen
+            return masks
+
+        self._believed(self.row, self.drawn, human=_seeing(self.human, sees))
+        if not seen:  # perceive() does not call it
+            return self.row[:0], self.row[:0], {}
         sizes = {name: mask.shape[-1] for name, mask in seen[0].items()}
-        masks = torch.stack([torch.cat(list(one.values()), -1) for one in seen], 1)  # [n, T, K]
+        masks = torch.stack([torch.cat(list(one.values()), -1) for one in seen.values()], 1)
         fresh = masks.clone()
         fresh[:, 1:] &= ~masks[:, :-1]
         fresh &= self.rounds.real[self.row][..., None]
@@ -215,7 +223,11 @@ class PerceivedOtherwise:
         return BeliefState.initial(human, number, self.memory)
 
     def _believed(
-        self, row: Tensor, drawn: Tensor, unseen: Visibility | None = None
+        self,
+        row: Tensor,
+        drawn: Tensor,
+        unseen: Visibility | None = None,
+        human: HumanModel | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return distinct beliefs ``[m, Z]``, and which each has at each step ``[n, T]``.
 
@@ -223,8 +235,10 @@ class PerceivedOtherwise:
             row: rounds ``[n]``.
             drawn: their draws ``[n]``.
             unseen: items that are not seen, ``[n, T, K]``.
+            human: the model, if it is another one.
         """
-        human = self.human if unseen is None else _missing(self.human)
+        if human is None:
+            human = self.human if unseen is None else _missing(self.human)
         transitions = []
         for step in range(self.rounds.actions.shape[1]):
             masks = {UNSEEN + name: mask[:, step] for name, mask in (unseen or {}).items()}
@@ -297,6 +311,11 @@ def _missing(human: HumanModel) -> HumanModel:
         masks = human.sees(implants, observation, step)
         return {name: mask & ~implants[UNSEEN + name] for name, mask in masks.items()}
 
-    missing = copy.copy(human)
-    missing.sees = sees  # type: ignore[method-assign]
-    return missing
+    return _seeing(human, sees)
+
+
+def _seeing(human: HumanModel, sees: Callable[..., Visibility]) -> HumanModel:
+    """Return the same model with another method ``sees``."""
+    other = copy.copy(human)
+    other.sees = sees  # type: ignore[method-assign]
+    return other
