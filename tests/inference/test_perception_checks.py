@@ -13,6 +13,7 @@ from mirror_ppl.inference.results.criticism import verdict
 from mirror_ppl.inference.results.perception_checks import (
     DELAYS,
     PerceivedOtherwise,
+    _missing,
     perception_p_values,
 )
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
@@ -58,8 +59,8 @@ def test_who_sees_nothing_of_all_items_sees_nothing(again):
     blind = replace(again, human=Blind(again.human.self_model))
     shape = (*again.rounds.actions[again.row].shape, 4)
     unseen = {"visual": torch.ones(shape, dtype=torch.bool), "verbal": torch.zeros(shape).bool()}
-    beliefs, which = again._believed(again.row, again.drawn, unseen)
-    wanted, place = blind._believed(again.row, again.drawn)
+    beliefs, which = again._believed(_missing(again.human), again.row, again.drawn, unseen)
+    wanted, place = blind._believed(blind.human, again.row, again.drawn)
     real = again.rounds.real[again.row]
     torch.testing.assert_close(beliefs[which][real], wanted[place][real])
 
@@ -75,7 +76,7 @@ def test_who_forgets_all_earlier_steps_begins_anew(again):
             actions=again.rounds.actions[:, step:],
             real=again.rounds.real[:, step:],
         )
-        wanted, place = replace(again, rounds=later)._believed(again.row, again.drawn)
+        wanted, place = replace(again, rounds=later)._believed(again.human, again.row, again.drawn)
         torch.testing.assert_close(beliefs[which[:, step]], wanted[place[:, 0]])
 
 
@@ -96,10 +97,12 @@ def test_statistics_are_those_by_hand(again):
             unseen[event, begin : begin + delay] = mask
         hidden = {"visual": unseen, "verbal": torch.zeros_like(unseen)}
         drawn = again.drawn[rows]
-        late[delay] = again._acting(*again._believed(again.row[rows], drawn, hidden), drawn)
+        late[delay] = again._acting(
+            *again._believed(_missing(again.human), again.row[rows], drawn, hidden), drawn
+        )
     for course in range(8):
         for event, row in enumerate(rows.tolist()):
-            total = 0.0
+            total = 1 / 2
             for delay, weight in DELAYS.items():
                 ratio = 1.0
                 for step in real[row].nonzero()[:, 0].tolist():

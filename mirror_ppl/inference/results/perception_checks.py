@@ -38,8 +38,8 @@ from mirror_ppl.models.human import HumanModel, Implants, at_step, has_own_progr
 
 DRAWS = 4
 """Posterior draws under which rounds are perceived once more."""
-DELAYS = {0: 1 / 2, 1: 1 / 4, 2: 1 / 8, 3: 1 / 8}
-"""Steps after which an item in sight is noticed, and their probabilities."""
+DELAYS = {1: 1 / 4, 2: 1 / 8, 3: 1 / 8}
+"""Steps after which an item in sight is noticed late, and their probabilities."""
 FORGETS = 1 / 2
 """Probability of forgetting at a step."""
 EVENTS = 100
@@ -125,9 +125,26 @@ class PerceivedOtherwise:
         return self.rounds.actions.device
 
     @cached_property
+    def usual(self) -> tuple[Tensor, dict[int, Visibility]]:
+        """Log-probabilities ``[n, T, A]`` of actions as the model has them, and what is seen.
+
+        The items seen at each step are ``[n, K]``; there are none if ``perceive`` does not look.
+        """
+        seen: dict[int, Visibility] = {}
+
+        def sees(implants: Implants, observation: Observation, step: int) -> Visibility:
+            masks = self.human.sees(implants, observation, step)
+            own = {name: mask.expand(len(self.row), -1) for name, mask in masks.items()}
+            seen.setdefault(step, own)  # later at a step: whether what is expected would be seen
+            return masks
+
+        believed = self._believed(_seeing(self.human, sees), self.row, self.drawn)
+        return self._acting(*believed, self.drawn), seen
+
+    @property
     def log_probabilities(self) -> Tensor:
         """Log-probabilities ``[n, T, A]`` of actions, as the model has them."""
-        return self._acting(*self._believed(self.row, self.drawn), self.drawn)
+        return self.usual[0]
 
     def replicates(self, generator: torch.Generator) -> Tensor:
         """Draw actions ``[n, T, k]`` as the model has them."""
@@ -150,15 +167,18 @@ class PerceivedOtherwise:
         unseen = {
             name: (mask[:, None] & now[..., None]).flatten(0, 1) for name, mask in masks.items()
         }
-        believed = self._believed(row.repeat(len(DELAYS)), drawn.repeat(len(DELAYS)), unseen)
+        missing = _missing(self.human)
+        believed = self._believed(
+            missing, row.repeat(len(DELAYS)), drawn.repeat(len(DELAYS)), unseen
+        )
         acting = self._acting(*believed, drawn.repeat(len(DELAYS)))
         ratios = self._ratios(acting, rows.repeat(len(DELAYS))).unflatten(0, (len(DELAYS), -1))
-        log_weights = torch.tensor(list(DELAYS.values()), device=self.device).log()
+        weights = torch.tensor(list(DELAYS.values()), device=self.device)[:, None, None]
 
         def statistic(actions: Tensor, own: Tensor) -> Tensor:
             chosen = actions[rows[own]].expand(len(DELAYS), -1, -1, -1)
-            found = ratios[:, own].gather(-1, chosen).sum(2) + log_weights[:, None, None]
-            return found.logsumexp(0).sum(0)
+            found = ratios[:, own].gather(-1, chosen).sum(2)
+            return torch.log1p((weights * torch.expm1(found)).sum(0)).sum(0)
 
         return self._p_value(statistic, drawn, replicates)
 
@@ -174,16 +194,8 @@ class PerceivedOtherwise:
 
     def _events(self, generator: torch.Generator) -> tuple[Tensor, Tensor, Visibility]:
         """Return where items come into sight: pairs ``[J]``, steps ``[J]``, items ``[J, K]``."""
-        seen: dict[int, Visibility] = {}
-
-        def sees(implants: Implants, observation: Observation, step: int) -> Visibility:
-            masks = self.human.sees(implants, observation, step)
-            own = {name: mask.expand(len(self.row), -1) for name, mask in masks.items()}
-            seen.setdefault(step, own)  # later at a step: whether what is expected would be seen
-            return masks
-
-        self._believed(self.row, self.drawn, human=_seeing(self.human, sees))
-        if not seen:  # perceive() does not call it
+        _, seen = self.usual
+        if not seen:
             return self.row[:0], self.row[:0], {}
         sizes = {name: mask.shape[-1] for name, mask in seen[0].items()}
         masks = torch.stack([torch.cat(list(one.values()), -1) for one in seen.values()], 1)
@@ -223,22 +235,16 @@ class PerceivedOtherwise:
         return BeliefState.initial(human, number, self.memory)
 
     def _believed(
-        self,
-        row: Tensor,
-        drawn: Tensor,
-        unseen: Visibility | None = None,
-        human: HumanModel | None = None,
+        self, human: HumanModel, row: Tensor, drawn: Tensor, unseen: Visibility | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return distinct beliefs ``[m, Z]``, and which each has at each step ``[n, T]``.
 
         Args:
+            human: the model, or one of people who see otherwise.
             row: rounds ``[n]``.
             drawn: their draws ``[n]``.
-            unseen: items that are not seen, ``[n, T, K]``.
-            human: the model, if it is another one.
+            unseen: items that they do not see, ``[n, T, K]``.
         """
-        if human is None:
-            human = self.human if unseen is None else _missing(self.human)
         transitions = []
         for step in range(self.rounds.actions.shape[1]):
             masks = {UNSEEN + name: mask[:, step] for name, mask in (unseen or {}).items()}
