@@ -13,7 +13,7 @@ from mirror_ppl.inference.results.criticism import verdict
 from mirror_ppl.inference.results.perception_checks import (
     DELAYS,
     PerceivedOtherwise,
-    _missing,
+    missing,
     perception_p_values,
 )
 from mirror_ppl.inference.results.posterior_predictive import predict_rounds
@@ -59,7 +59,7 @@ def test_who_sees_nothing_of_all_items_sees_nothing(again):
     blind = replace(again, human=Blind(again.human.self_model))
     shape = (*again.rounds.actions[again.row].shape, 4)
     unseen = {"visual": torch.ones(shape, dtype=torch.bool), "verbal": torch.zeros(shape).bool()}
-    beliefs, which = again._believed(_missing(again.human), again.row, again.drawn, unseen)
+    beliefs, which = again._believed(missing(again.human, unseen), again.row, again.drawn)
     wanted, place = blind._believed(blind.human, again.row, again.drawn)
     real = again.rounds.real[again.row]
     torch.testing.assert_close(beliefs[which][real], wanted[place][real])
@@ -97,9 +97,9 @@ def test_statistics_are_those_by_hand(again):
             unseen[event, begin : begin + delay] = mask
         hidden = {"visual": unseen, "verbal": torch.zeros_like(unseen)}
         drawn = again.drawn[rows]
-        late[delay] = again._acting(
-            *again._believed(_missing(again.human), again.row[rows], drawn, hidden), drawn
-        )
+        human = missing(again.human, hidden)
+        believed = again._believed(human, again.row[rows], drawn)
+        late[delay] = again._acting(*believed, drawn)
     for course in range(8):
         for event, row in enumerate(rows.tolist()):
             total = 1 / 2
@@ -169,9 +169,9 @@ def test_who_misses_things_is_told_from_who_does_not(human):
         implants = {name: value[0] for name, value in draws.items()}
         played = play_rounds(model, implants, 20, "fog", torch.Generator().manual_seed(6))
         found.append(perception_p_values(human, played, draws, torch.Generator().manual_seed(7)))
-    usual, missing = found
+    usual, late = found
     assert min(usual.values()) > 0.001
-    assert missing["missed"] < 0.001
+    assert late["missed"] < 0.001
 
 
 @pytest.mark.parametrize(

@@ -44,8 +44,6 @@ FORGETS = 1 / 2
 """Probability of forgetting at a step."""
 EVENTS = 100
 """Largest number of items that come into sight, of each draw; a random subset of more."""
-UNSEEN = "unseen "
-"""Prefix of the masks of items that are not seen, among implants."""
 
 
 @torch.no_grad()
@@ -160,19 +158,17 @@ class PerceivedOtherwise:
         rows, begins, masks = self._events(generator)
         if not len(rows):
             return None
-        row, drawn = self.row[rows], self.drawn[rows]
+        each = rows.repeat(len(DELAYS))
+        row, drawn = self.row[each], self.drawn[each]
         steps = torch.arange(self.rounds.actions.shape[1], device=self.device)
         late = torch.tensor(list(DELAYS), device=self.device)[:, None, None]
         now = (steps >= begins[:, None]) & (steps < begins[:, None] + late)  # [D, J, T]
         unseen = {
             name: (mask[:, None] & now[..., None]).flatten(0, 1) for name, mask in masks.items()
         }
-        missing = _missing(self.human)
-        believed = self._believed(
-            missing, row.repeat(len(DELAYS)), drawn.repeat(len(DELAYS)), unseen
-        )
-        acting = self._acting(*believed, drawn.repeat(len(DELAYS)))
-        ratios = self._ratios(acting, rows.repeat(len(DELAYS))).unflatten(0, (len(DELAYS), -1))
+        believed = self._believed(missing(self.human, unseen), row, drawn)
+        ratios = self._ratios(self._acting(*believed, drawn), each)
+        ratios = ratios.unflatten(0, (len(DELAYS), -1))
         weights = torch.tensor(list(DELAYS.values()), device=self.device)[:, None, None]
 
         def statistic(actions: Tensor, own: Tensor) -> Tensor:
@@ -180,7 +176,7 @@ class PerceivedOtherwise:
             found = ratios[:, own].gather(-1, chosen).sum(2)
             return torch.log1p((weights * torch.expm1(found)).sum(0)).sum(0)
 
-        return self._p_value(statistic, drawn, replicates)
+        return self._p_value(statistic, self.drawn[rows], replicates)
 
     def forgot(self, replicates: Tensor) -> float:
         """Return the p-value of a person who forgets earlier steps."""
@@ -234,22 +230,17 @@ class PerceivedOtherwise:
     def _begin(self, human: HumanModel, number: int) -> BeliefState:
         return BeliefState.initial(human, number, self.memory)
 
-    def _believed(
-        self, human: HumanModel, row: Tensor, drawn: Tensor, unseen: Visibility | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def _believed(self, human: HumanModel, row: Tensor, drawn: Tensor) -> tuple[Tensor, Tensor]:
         """Return distinct beliefs ``[m, Z]``, and which each has at each step ``[n, T]``.
 
         Args:
             human: the model, or one of people who see otherwise.
             row: rounds ``[n]``.
             drawn: their draws ``[n]``.
-            unseen: items that they do not see, ``[n, T, K]``.
         """
-        transitions = []
-        for step in range(self.rounds.actions.shape[1]):
-            masks = {UNSEEN + name: mask[:, step] for name, mask in (unseen or {}).items()}
-            implants = {**self._implants(drawn), **masks}
-            transitions.append(self._step(step, row, implants, step == 0))
+        implants = self._implants(drawn)
+        steps = range(self.rounds.actions.shape[1])
+        transitions = [self._step(step, row, implants, step == 0) for step in steps]
         states = self._begin(human, len(row)).through(transitions)
         return states[-1].mean, torch.stack([state.belief for state in states], 1)
 
@@ -310,12 +301,12 @@ class PerceivedOtherwise:
         return sum(found) / len(found)
 
 
-def _missing(human: HumanModel) -> HumanModel:
-    """Return the same model of people who do not see what ``implants`` name as unseen."""
+def missing(human: HumanModel, unseen: Visibility) -> HumanModel:
+    """Return the same model of n people who do not see some items, ``unseen`` ``[n, T, K]``."""
 
     def sees(implants: Implants, observation: Observation, step: int) -> Visibility:
         masks = human.sees(implants, observation, step)
-        return {name: mask & ~implants[UNSEEN + name] for name, mask in masks.items()}
+        return {name: mask & ~unseen[name][:, step] for name, mask in masks.items()}
 
     return _seeing(human, sees)
 
