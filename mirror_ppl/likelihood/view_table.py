@@ -7,7 +7,7 @@ distinct view; the program then looks up the view that its implants lead to.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -15,7 +15,9 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
+from torch.nn.functional import pad
 
+from mirror_ppl.likelihood.attention import AttentionValues
 from mirror_ppl.likelihood.chain import Chain
 from mirror_ppl.likelihood.densities import log_weighted_latents
 from mirror_ppl.likelihood.sums import Sums
@@ -64,6 +66,30 @@ class Attention:
     sights: Tensor
     rounds: Tensor
     covariates: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def of_rounds(cls, attended: Sequence[AttentionValues], sights: Sequence[Tensor]) -> Attention:
+        """Join the attention of one person's rounds, given the sights of each ``[U, G']``."""
+        most = max(part.shape[1] for part in sights)
+        device = sights[0].device
+        rounds = [
+            torch.full((len(part),), place, device=device) for place, part in enumerate(sights)
+        ]
+        return cls(
+            values={
+                name: _stacked([one.values[name] for one in attended])
+                for name in attended[0].values
+            },
+            log_weights=_stacked([one.log_weights for one in attended], -torch.inf),
+            kept=_stacked([one.kept for one in attended]),
+            log_kept=_stacked([one.log_kept for one in attended], torch.inf),
+            sights=torch.cat([pad(part, [0, most - part.shape[1]]) for part in sights])[None],
+            rounds=torch.cat(rounds)[None],
+            covariates={
+                name: torch.cat([one.covariates[name] for one in attended], 1)
+                for name in attended[0].covariates
+            },
+        )
 
     def log_probabilities(self, human: HumanModel, implants: Implants, rounds: int) -> Tensor:
         """Weighted log-probabilities of the values ``[..., P, B, G]``, inside the person plate."""
@@ -231,3 +257,9 @@ class RecordedActions(TorchDistribution):
         ).reshape(*self.log_likelihoods.shape[:-1], 1)
         found = self.log_likelihoods.reshape(-1)[begin * number + self.place.clamp(min=0)]
         return torch.where(self.place == NO_VIEW, IMPOSSIBLE, found)
+
+
+def _stacked(parts: Sequence[Tensor], fill: float = 0) -> Tensor:
+    """Values ``[...]`` of each round as ``[1, B, ...]``, padded at the end."""
+    most = max(len(part) for part in parts)
+    return torch.stack([pad(part, [0, most - len(part)], value=fill) for part in parts])[None]

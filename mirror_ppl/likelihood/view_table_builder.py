@@ -339,7 +339,7 @@ class ViewTableBuilder:
         if chains:
             attention = Chain.one_after_another(chains, counts)
         elif attended:
-            attention = self._attention(attended)
+            attention = Attention.of_rounds(self._attended, attended)
         return ViewTable(
             sites=tuple(self.grid),
             sizes=self.sizes,
@@ -352,27 +352,6 @@ class ViewTableBuilder:
             steps=self._padded_to(steps, 1)[None],
             view_counts=torch.tensor([views]),
             attention=attention,
-        )
-
-    def _attention(self, sights: list[Tensor]) -> Attention:
-        """Attention of all rounds, given the sights of each ``[U, G']``."""
-        attended = self._attended
-        rounds = [torch.full((len(part),), place) for place, part in enumerate(sights)]
-        most = max(part.shape[1] for part in sights)
-        return Attention(
-            values={
-                name: _stacked([one.values[name] for one in attended])
-                for name in attended[0].values
-            },
-            log_weights=_stacked([one.log_weights for one in attended], -torch.inf),
-            kept=_stacked([one.kept for one in attended]),
-            log_kept=_stacked([one.log_kept for one in attended], torch.inf),
-            sights=torch.cat([pad(part, [0, most - part.shape[1]]) for part in sights])[None],
-            rounds=torch.cat(rounds).to(self.alive.device)[None],
-            covariates={
-                name: torch.cat([one.covariates[name] for one in attended], 1)
-                for name in attended[0].covariates
-            },
         )
 
     def _weights(self) -> Tensor:
@@ -414,9 +393,3 @@ def _number_of(values: Mapping[str, Tensor]) -> int:
         whole = as_whole_numbers(value).flatten()
         total += int((whole * random_keys(len(whole), whole.device)).sum())
     return total % 2**62
-
-
-def _stacked(parts: list[Tensor], fill: float = 0) -> Tensor:
-    """Values ``[...]`` of each round as ``[1, B, ...]``, padded at the end."""
-    most = max(len(part) for part in parts)
-    return torch.stack([pad(part, [0, most - len(part)], value=fill) for part in parts])[None]
