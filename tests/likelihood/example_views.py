@@ -1,5 +1,7 @@
 """People of whom little is unknown, rounds of several lengths, and their likelihoods by hand."""
 
+from dataclasses import fields
+
 import pyro
 import pyro.distributions as dist
 import torch
@@ -7,6 +9,7 @@ from example_course import gone_through
 
 from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import get_domain
+from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.implants import policy_implants
 
@@ -102,3 +105,32 @@ def log_likelihoods_by_hand(human, rounds, person, number, values, policy):
         chosen = human.act(policy, belief, human.action_values(belief))
         result.append(chosen[0].gather(-1, actions[0, :, None]).sum())
     return torch.stack(result)
+
+
+def assert_tables_equal(one, other, tolerance=0.0):
+    for field in fields(one):
+        left, right = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(left, torch.Tensor):
+            torch.testing.assert_close(left, right, rtol=0.0, atol=tolerance)
+        else:
+            assert left == right, field.name
+
+
+def assert_rounds_equal(one, other):
+    """Each combination has the same rounds in both tables, however their views are numbered."""
+
+    def rounds_of_combinations(table):
+        people = torch.arange(len(table.index))[:, None, None]
+        moments = table.moments[people, table.index.clamp(min=0)]  # [P, B, M, T]
+        real = (moments != NO_VIEW) & (table.index != NO_VIEW)[..., None]
+        place = people[..., None], moments.clamp(min=0)
+        belief, values = (part[place] * real[..., None] for part in (table.belief, table.values))
+        return real, belief, values, table.acted[place] * real, table.recorded, table.steps
+
+    assert (one.sites, one.sizes) == (other.sites, other.sizes)
+    assert torch.equal(one.index == NO_VIEW, other.index == NO_VIEW)
+    assert torch.equal(one.view_counts, other.view_counts)
+    assert one.belief.shape == other.belief.shape and one.moments.shape == other.moments.shape
+    parts = zip(rounds_of_combinations(one), rounds_of_combinations(other), strict=True)
+    for mine, theirs in parts:
+        torch.testing.assert_close(mine, theirs, rtol=0.0, atol=1e-4)

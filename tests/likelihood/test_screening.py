@@ -1,0 +1,196 @@
+"""Screening and merging: which combinations and moments are given up."""
+
+import math
+
+import pyro
+import pytest
+import torch
+from example_person import Averaging
+from example_views import (
+    DRIVING,
+    Few,
+    Sure,
+    assert_rounds_equal,
+    assert_tables_equal,
+    ragged,
+)
+from torch.nn.functional import pad
+
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.likelihood import view_table_builder
+from mirror_ppl.likelihood.combinations import log_priors
+from mirror_ppl.likelihood.enumeration import combination_values
+from mirror_ppl.likelihood.round_views import Rounds
+from mirror_ppl.likelihood.screening import Screening
+from mirror_ppl.likelihood.table_program import log_likelihoods
+from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted, rounds_of
+from mirror_ppl.likelihood.view_table import NO_VIEW
+from mirror_ppl.likelihood.view_table_builder import GROWTH, ViewTableBuilder
+from mirror_ppl.models import HumanModel
+from mirror_ppl.models.implants import assumption_sites, sight_sites
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+
+STEPS = DRIVING.horizon
+SIGHTS, ASSUMED = sight_sites(DRIVING), assumption_sites(DRIVING)
+LENGTHS = [[15, 4], [], [7, 1]]
+
+
+@pytest.fixture(scope="module")
+def self_model():
+    return load_self_model(shipped_weights("driving"))[0]
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return load_demonstrations(asset_path("driving_fog_diverse.nc"))
+
+
+def test_infinite_margin_without_merging_changes_nothing(self_model, recordings):
+    rounds = ragged(recordings, LENGTHS)
+    for human in (Few(self_model), Sure(self_model)):
+        screening = Screening(margin=math.inf, resolution=0.0)
+        assert_rounds_equal(
+            build_view_table(human, rounds, screening=screening), build_view_table(human, rounds)
+        )
+
+
+@pytest.mark.parametrize(("margin", "early"), [(0.7, 0.0), (2.0, 1.5), (15.0, 25.0)])
+def test_screening_drops_whoever_falls_behind_and_never_the_best(
+    self_model, recordings, margin, early
+):
+    human, screening = Few(self_model), Screening(margin=margin, early=early, resolution=0.0)
+    rounds = recordings.select_rounds(range(4))
+    whole = build_view_table(human, rounds)
+    with pyro.plate("policy", screening.policies, dim=-3), pyro.plate("person", 1, dim=-2):
+        torch.manual_seed(screening.seed)
+        ways = human.prior()
+    likelihood = log_likelihoods(human, ways, whole)
+    grid = combination_values(human, whole)
+    others = {name: value for name, value in ways.items() if name not in grid}
+    prior = log_priors(human, grid, others, 1)
+    expected = torch.ones(rounds.num_people, 14, dtype=torch.bool)
+    score = torch.zeros(screening.policies, rounds.num_people, 14)
+    for number in range(4):
+        score += likelihood.gather(-1, whole.index[:, number].expand(screening.policies, -1, -1))
+        if 0 < number < GROWTH:
+            continue  # these are gone through together
+        best = (score + prior).amax(0).masked_fill(~expected, -math.inf)
+        distance = best.amax(-1, keepdim=True) - best
+        # Rounding may decide either way at the very margin; nobody is there here.
+        allowed = screening.margin_after(number + 1)
+        assert (distance - allowed).abs().min() > 1e-3
+        expected &= distance <= allowed
+        # The best one so far stays.
+        assert expected.gather(-1, best.argmax(-1, keepdim=True)).all()
+    screened = build_view_table(human, rounds, screening=screening)
+    assert torch.equal((screened.index != NO_VIEW).all(1), expected)
+    assert_rounds_equal(screened, restricted(whole, expected))
+    dropped = 1 - expected.float().mean().item()
+    assert (dropped > 0.05) if margin < 15 else (dropped < 1)
+    # With the margin that is used, the best of all rounds is never among the dropped.
+    best = (score + prior).amax(0).argmax(-1, keepdim=True)
+    assert margin < 15 or expected.gather(-1, best).all()
+
+
+@pytest.mark.parametrize("early", [0.0, 1.0])
+def test_beginnings_of_long_rounds_drop_combinations_before(
+    self_model, recordings, monkeypatch, early
+):
+    human, rounds = Few(self_model), rounds_of(recordings.select_rounds(range(6)), 0)
+    screening = Screening(margin=1.0, early=early, resolution=0.0)
+    plain = ViewTableBuilder(human, Screening(margin=1.0 + early, early=0.0, resolution=0.0))
+    plain.add(rounds.first_steps(5))
+    monkeypatch.setattr(view_table_builder, "MANY", 2)
+    monkeypatch.setattr(view_table_builder, "BEGINNING", 5)
+    margins, margin_after = [], Screening.margin_after
+
+    def noted(self, number):
+        margins.append(number)
+        return margin_after(self, number)
+
+    monkeypatch.setattr(Screening, "margin_after", noted)
+    monkeypatch.setattr(ViewTableBuilder, "_order", lambda self, rounds: None)
+    found = ViewTableBuilder(human, screening)
+    found.add(rounds)
+    # Rounds 0; 1 to 3; 4 and 5: the beginnings, which count as no rounds, then the whole.
+    assert margins == [0, 0, 0, 1, 4, 6]
+    begun = [part for part, _ in found._seen][0]
+    assert len(begun) < 14
+    assert torch.equal(begun, plain.alive)
+    after = ViewTableBuilder(human, screening, candidates=begun)
+    monkeypatch.setattr(view_table_builder, "MANY", 15)
+    after.add(rounds)
+    assert torch.equal(found.alive, after.alive) and torch.equal(found.score, after.score)
+    assert_tables_equal(found.table(), after.table())
+    monkeypatch.setattr(view_table_builder, "MANY", 2)
+    margins.clear()
+    one_by_one = ViewTableBuilder(human, screening)
+    for number in range(3):
+        one_by_one.alive = torch.arange(14)
+        one_by_one.add(rounds.at(number, number + 1))
+    assert margins == [0, 1, 0, 2, 0, 3]
+    monkeypatch.setattr(view_table_builder, "LONG", 4)
+    for steps in (0, 20):  # padding, as beside people with longer rounds, changes nothing
+        short = ViewTableBuilder(human, screening)
+        short.add(padded(rounds, steps))
+        assert len(short._seen[0][0]) == 14
+
+
+def padded(rounds, steps):
+    """Rounds with unused steps at their ends."""
+
+    def longer(value):
+        return torch.cat([value, value[:, -1:].expand(-1, steps, *value.shape[2:])], 1)
+
+    return Rounds(
+        {name: longer(value) for name, value in rounds.observation.items()},
+        {name: longer(mask) for name, mask in rounds.told.items()},
+        longer(rounds.actions),
+        pad(rounds.real, [0, steps]),
+    )
+
+
+def test_what_one_round_contradicts_is_kept_until_others_agree(self_model, recordings):
+    """A round that leaves one combination 20 nats behind drops it only without other rounds."""
+    human = Few(self_model)
+    for early, kept in ((0.0, False), (25.0, True)):
+        builder = ViewTableBuilder(human, Screening(early=early))
+        builder.add(rounds_of(recordings.select_rounds([0]), 0))
+        builder.alive, builder._evidence = torch.arange(14), 1.0
+        builder.score.zero_()
+        found = torch.zeros_like(builder.score)
+        found[:, 3] = -20.0
+        builder._screen(found, builder.screening)
+        assert (3 in builder.alive.tolist()) == kept
+        builder._evidence = 20.0
+        builder._screen(torch.zeros_like(builder.score)[:, builder.alive], builder.screening)
+        assert 3 not in builder.alive.tolist()
+
+
+@pytest.mark.parametrize("kind", [HumanModel, Averaging], ids=["own", "averaging"])
+def test_merging_moves_likelihoods_by_at_most_the_resolution(self_model, recordings, kind):
+    human, rounds = kind(self_model), ragged(recordings, [[15, 9]])
+    resolution = 0.1
+    screening = Screening(margin=math.inf, resolution=resolution, merge_policies=8)
+    whole, merged = ViewTableBuilder(human, None), ViewTableBuilder(human, screening)
+    for builder in (whole, merged):
+        builder.add(rounds_of(rounds, 0))
+    tables = [builder.table() for builder in (whole, merged)]
+    policies = merged.policies
+    scores = []
+    for table in tables:
+        with (
+            pyro.condition(data=policies),
+            pyro.plate("policy", screening.policies, dim=-3),
+            pyro.plate("person", 1, dim=-2),
+        ):
+            likelihoods = log_likelihoods(human, human.prior(), table)
+        scores.append(combination_scores(table, likelihoods)[:, 0])
+    torch.testing.assert_close(scores[1], merged.score, rtol=1e-4, atol=1e-3)
+    off = (scores[1] - scores[0]).abs().amax(-1)
+    # Under policies that are compared, both are within half a step of one point, at every moment.
+    assert off[: screening.merge_policies].max() <= (15 + 9) * resolution
+    assert off.max() > 1e-3 and off[screening.merge_policies :].mean() < 0.5
+    assert (tables[1].index != NO_VIEW).all()
+    number = [table.belief.shape[1] for table in tables]
+    assert number[1] < 0.3 * number[0]
