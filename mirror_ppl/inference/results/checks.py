@@ -130,10 +130,11 @@ CHECKS: Mapping[str, Check] = {
 """Registry of checks besides the shares of actions; a new check is one more entry."""
 
 ONE_SIDED: Mapping[str, str] = {
-    "missed": "acts as if noticing late, or not at all, what the model says they see",
-    "forgot": "acts as if forgetting earlier steps",
+    "missed": "is better explained by noticing late, or missing, what the model says they see",
+    "forgot": "is better explained by forgetting earlier steps",
 }
-"""Checks of perception, with descriptions of people to whom they point; only small p-values do."""
+"""Checks of perception, with descriptions of people whose p-value is small; large ones say nothing.
+"""
 
 
 def steps_of(domain: Domain, rounds: Demonstrations, log_probability: Tensor) -> Steps:
