@@ -325,7 +325,11 @@ def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
     columns = ["message", "later", "cost", "gain", "standard_error", "chosen"]
     table = decision.alternatives[columns]
     shown = [row for place, row in enumerate(table.to_numpy().tolist()) if place < most or row[-1]]
-    turn = decision.turning_point
+    turning = None
+    if decision.turning_point is not None:
+        step, action, silent, told = decision.turning_point
+        named = decision.domain.actions[action]
+        turning = {"steps_ahead": step, "action": named, "silent": silent, "told": told}
     return {
         "gain": decision.gain.mean,
         "gain_interval": [low, high],
@@ -333,9 +337,7 @@ def audit(decision: Decision, most: int = 5) -> dict[str, Any]:
         "advice": decision.advice,
         "plan": [str(message) for message in decision.plan],
         "matters": [[*pair, value] for pair, value in decision.matters.items()],
-        "turning_point": None
-        if turn is None
-        else dict(zip(("steps_ahead", "action", "silent", "told"), turn, strict=True)),
+        "turning_point": turning,
         "alternatives": [dict(zip(columns, row, strict=True)) for row in shown],
     }
 

@@ -66,8 +66,10 @@ def _p_values(ax, group: xr.Dataset) -> None:
     tails = np.array([[tail(*pair) for pair in zip(checks, own, strict=True)] for own in values])
     # As powers of ten, with the sign of the deviation.
     depth = -np.log10(tails.clip(1 / REPLICATES, 1))
+    single = np.array([name in ONE_SIDED for name in checks])
+    more = single | (values < 0.5)  # noqa: PLR2004 - the middle of p-values
     ax.imshow(
-        np.where(values < 0.5, depth, -depth),
+        np.where(more, depth, -depth),
         cmap="RdBu",
         vmin=-4,
         vmax=4,
@@ -80,10 +82,9 @@ def _p_values(ax, group: xr.Dataset) -> None:
                 continue
             text = f"{value:.2f}" if value >= 0.01 else f"{value:.3f}"  # noqa: PLR2004
             text = f"<{2 / REPLICATES:.3f}" if value < 2 / REPLICATES else text
-            # Grey prints do not tell the colours apart.
-            text = (
-                "\N{UPWARDS ARROW}" if values[row, column] < 0.5 else "\N{DOWNWARDS ARROW}"
-            ) + text
+            if not single[column]:  # grey prints do not tell the colours apart
+                arrow = "\N{UPWARDS ARROW}" if more[row, column] else "\N{DOWNWARDS ARROW}"
+                text = arrow + text
             colour = "white" if depth[row, column] > DARK else BLACK
             frame = {"edgecolor": colour, "facecolor": "none", "pad": 1.5, "lw": 1}
             ax.text(
@@ -99,8 +100,8 @@ def _p_values(ax, group: xr.Dataset) -> None:
     shares = [place for place, name in enumerate(checks) if name.startswith(SHARE)]
     several = len(shares) > 1
     _name_columns(ax, [name.removeprefix(SHARE) if several else name for name in checks])
-    single = [name for name in checks if name in ONE_SIDED]
-    sided = f" (one-sided: {', '.join(single)})" if single else ""
+    named = [name for name in checks if name in ONE_SIDED]
+    sided = f" (one-sided: {', '.join(named)})" if named else ""
     title = (
         f"Two-sided p-values{sided};\n"
         "\N{UPWARDS ARROW} more, \N{DOWNWARDS ARROW} less than predicted; framed: suspect"

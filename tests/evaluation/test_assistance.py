@@ -319,8 +319,9 @@ def test_an_audit_is_the_decision_as_plain_data():
     assert told["gain"] == 1.5
     assert told["gain_interval"] == pytest.approx([1.5 - 1.645 * 0.5, 1.5 + 1.645 * 0.5])
     assert told["matters"] == [["verbal", "front-left", 1.5]]
-    turn = {"steps_ahead": 0, "action": 0, "silent": 0.9, "told": 0.2}
-    assert told["turning_point"] == pytest.approx(turn)
+    turn = told["turning_point"]
+    assert (turn["steps_ahead"], turn["action"]) == (0, "stay")
+    assert (turn["silent"], turn["told"]) == pytest.approx((0.9, 0.2))
     assert "front car in the left lane, 3 cells ahead, closing" in told["why"]
     best, second = told["alternatives"]
     assert best["message"] == "verbal: front-left" and second["message"] == "visual: front-left"
