@@ -80,7 +80,8 @@ def self_model_loss(
         total = total + options.choice_weight * _cross_entropy(chosen, likely)
     if options.regret_weight:
         behind = goal[sure].amax(-1, keepdim=True) - goal[sure]
-        regret = (torch.softmax(values[sure], -1) * behind).sum(-1)
+        counted = torch.relu(behind - options.regret_margin)
+        regret = (torch.softmax(values[sure], -1) * counted).sum(-1)
         total = total + options.regret_weight * _mean(regret)
     return Loss(total, negative_elbo.detach(), bellman.detach())
 

@@ -54,9 +54,12 @@ class SelfModelOptions:
             exponential of learned values, if they were made so by the planner's. Of observers who
             know all decisive items, and only with ``distil``: others would take what is likely for
             certain. Errors of values where one action is far better than another hardly count.
-        regret_weight: weight of the regret of such choices: how much less they are worth than the
-            best, by the planner's values. Of the same observers, and only with ``distil``. It makes
-            mistakes count by what they cost, however rare they are.
+        regret_weight: weight of the expected regret of such choices: how much less than the best
+            they are worth by the planner's values, beyond ``regret_margin``. Of the same observers,
+            and only with ``distil``. It makes mistakes count by what they cost, however rare they
+            are.
+        regret_margin: regret that does not count. Without a margin the network would exaggerate
+            all differences of values, as regret is least if the best choice is certain.
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
         assumed: share of sight views in which each assumption is made. At 0 the robot does not
             learn what follows from assumptions; imagined items are then like seen ones to it. With
@@ -95,6 +98,7 @@ class SelfModelOptions:
     ranked_weight: float = 0.0
     choice_weight: float = 0.0
     regret_weight: float = 0.0
+    regret_margin: float = 0.0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     assumed: float = ASSUMPTION_PROBABILITY
     at_means: bool = False
@@ -121,7 +125,7 @@ class SelfModelOptions:
                 f"learning_rate must be above 0 and at most 1, not {self.learning_rate}"
             )
         weights = ("difference_weight", "bin_weight", "ranked_weight", *OF_CHOICES)
-        for name in weights:
+        for name in (*weights, "regret_margin"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be at least 0 and finite, not {getattr(self, name)}")
         if self.window < 0 or self.length < 0:

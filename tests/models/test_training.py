@@ -39,6 +39,7 @@ STEPS = DRIVING.horizon
         ({"choice_weight": 1.0}, "choice_weight needs distil"),
         ({"regret_weight": 1.0}, "regret_weight needs distil"),
         ({"regret_weight": -1.0}, "regret_weight must be at least 0"),
+        ({"regret_margin": -1.0}, "regret_margin must be at least 0"),
         ({"distil": True, "window": 5, "length": 4}, "window is 5, longer than rounds of 4 steps"),
     ],
 )
@@ -125,6 +126,9 @@ def test_choices_are_learned_where_all_that_counts_is_known():
         regretted = self_model_loss(
             robot, robot.q_network, lived, replace(options, regret_weight=3.0), True
         ).total
+        torch.manual_seed(0)
+        beyond = replace(options, regret_weight=3.0, regret_margin=2.0)
+        far = self_model_loss(robot, robot.q_network, lived, beyond, True).total
         evidence = robot.evidence(
             lived.rounds.observation, lived.rounds.visible, lived.rounds.actions
         )
@@ -134,6 +138,9 @@ def test_choices_are_learned_where_all_that_counts_is_known():
     torch.testing.assert_close(found - without, 7 * entropy)
     behind = lived.exact[0, 0].max() - lived.exact[0, 0]
     torch.testing.assert_close(regretted - without, 3 * torch.softmax(values, -1) @ behind)
+    assert 0 < behind.max() != 2
+    counted = (behind - 2).clamp(min=0)
+    torch.testing.assert_close(far - without, 3 * torch.softmax(values, -1) @ counted)
 
 
 def test_bins_of_values_are_learned_by_cross_entropy():
