@@ -24,6 +24,8 @@ from mirror_ppl.timing import clocked, stage
 if TYPE_CHECKING:
     import pandas as pd
 
+NLLS = ("nll", "nll_base_rate", "nll_no_implants")
+"""Columns of the model check, in nats an action of held-out rounds."""
 RESULTS = ("summary.json", "posterior.nc", *FILES)
 """Names of all files that a fit may write."""
 
@@ -79,11 +81,12 @@ class Fit(fitting.Fit):
             rows.append(
                 {"verdict": told.pop("verdict"), "reasons": "; ".join(told.pop("reasons"))}
                 | {"nll": (person["test"] or {}).get("nll")}
-                | {name: told[name] for name in ("nll_base_rate", "nll_no_implants")}
+                | {name: told[name] for name in NLLS[1:]}
                 | {f"p({name})": value for name, value in told.get("models", {}).items()}
                 | told["p_values"]
             )
-        return pd.DataFrame(rows, index=pd.Index(self.people, name="person"))
+        table = pd.DataFrame(rows, index=pd.Index(self.people, name="person"))
+        return table.astype(dict.fromkeys(NLLS, float))  # NaN without held-out rounds
 
     def person(self, name: str | None = None) -> FittedPerson:
         """Select one of the people; the only one unless named.

@@ -28,6 +28,7 @@ from mirror_ppl.likelihood.span_contract import check_spans_hold
 from mirror_ppl.models.handlers import BELIEVING, WithoutSites
 from mirror_ppl.models.human import HumanModel, Implants, has_own_program, overrides
 from mirror_ppl.models.sites import Readable, discrete_names, latent_sites, latent_values
+from mirror_ppl.models.view import View
 from mirror_ppl.randomness import forked, seed_everything
 from mirror_ppl.shapes import broadcast_shapes
 from mirror_ppl.user_code import describe, is_of_package
@@ -110,7 +111,9 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
                         method = "sees"
                         _check_sees(domain, human.sees(readable, now, step), people)
                     method = "perceive"
-                    view, knowledge = human.perceive(readable, knowledge, now, told, step)
+                    view, knowledge = _perceived(
+                        human.perceive(readable, knowledge, now, told, step)
+                    )
                     _check_knowledge("perceive returned {} as knowledge", knowledge)
                     method = "evidence"
                     evidence = human.evidence(view, now)
@@ -140,6 +143,19 @@ def check_contract(human: HumanModel, shipped: bool = False) -> None:
         file = getattr(sys.modules.get(type(human).__module__), "__file__", None)
         where = describe(error, None if file is None else Path(file))
         raise HumanModelError(f"{type(human).__name__}.{method} fails: {where}") from error
+
+
+def _perceived(found: Any) -> tuple[View, Any]:
+    """Return what ``perceive`` returned, checked to be a view and knowledge."""
+    if isinstance(found, tuple) and len(found) == 2 and isinstance(found[0], View):  # noqa: PLR2004
+        return found
+    given = type(found).__name__
+    if isinstance(found, tuple):
+        given = f"({', '.join(type(part).__name__ for part in found)})"
+    raise HumanModelError(
+        f"perceive returned {given}, expected (View, knowledge): what is perceived "
+        "(mirror_ppl.models.View), and the person's memory after this step"
+    )
 
 
 def _check_knowledge(what: str, knowledge: Any) -> None:

@@ -141,10 +141,11 @@ def require_acting_on_beliefs(human: HumanModel, sites: Iterable[str]) -> None:
     Raises:
         HumanModelError: ``act`` reads one of the sites.
     """
-    if not acts_on_beliefs(human, sites):
+    both = sorted(dependencies(human).actions & set(sites))
+    if both:
         raise HumanModelError(
-            "act() reads a site that perceive() reads, too; only the engines svi and nuts can fit "
-            "this"
+            f"act() reads a site that perceive() reads, too ({', '.join(both)}); only the engines "
+            "svi and nuts can fit this"
         )
 
 

@@ -115,11 +115,12 @@ def network_for(engine: str, path: Path | None, human: HumanModel) -> AmortizedG
         try:
             path = shipped_guide(human.domain.name, own[0] if own else FIRST)
         except AssetError as error:
-            name = model_name(type(human).__name__)
+            name, world = model_name(type(human).__name__), human.domain.name
+            which = f" --human-model {own[0]}" if own and own[0] != FIRST else ""
             raise AssetError(
-                f"no guide ships for {name} in {human.domain.name}: train one with "
-                f"python -m mirror_ppl.train --what guide --domain {human.domain.name} and name it "
-                "with --guide-file, or use --guide importance"
+                f"no guide ships for {name} in {world}: train one with python -m mirror_ppl.train "
+                f"--what guide --domain {world}{which} and name it with --guide-file, or use "
+                "--guide importance"
             ) from error
     return load_guide(path, human)[0]
 

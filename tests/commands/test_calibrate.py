@@ -128,7 +128,8 @@ def test_a_stopped_run_goes_on_where_it_was(whole, tmp_path, monkeypatch):
         (("--guide-file", "nowhere.x"), "--guide-file is for --guide auto and amortized"),
         (
             ("--guide", "amortized", "--human-model", "one-radius"),
-            "no guide ships for one-radius in driving: train one with python -m",
+            "no guide ships for one-radius in driving: train one with python -m mirror_ppl.train "
+            "--what guide --domain driving --human-model one-radius and name it with --guide-file",
         ),
         (("--jobs", 0), "--jobs must be at least 1, or -1 for all, not 0"),
         (("--guide", "magic"), 'unknown engine "magic"'),

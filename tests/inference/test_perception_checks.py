@@ -327,7 +327,8 @@ def test_fits_of_unusual_models_end_with_a_verdict(human, rounds, kind):
 
 
 def test_a_user_s_model_is_fitted_and_checked(human, rounds):
-    fit = mirror_ppl.infer(rounds, human=Blinks, explore=0, draws=20)
+    fit = mirror_ppl.infer(rounds, human=Blinks, explore=0, draws=20, train_rounds=3)
+    assert fit.check["nll"].dtype == float and fit.check["nll"].isna().all()  # none held out
     assert {"missed", "forgot"} <= fit.summary["people"][0]["check"]["p_values"].keys()
 
 

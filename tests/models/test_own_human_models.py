@@ -171,7 +171,22 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
             "return torch.zeros(*batch)",
             "nothing_known returned Tensor, expected a dataclass of tensors",
         ),
-        ("perceive(self, *look)", "return None", r"Mine\.perceive fails: TypeError"),
+        (
+            "perceive(self, *now)",
+            "return None",
+            r"perceive returned NoneType, expected \(View, know",
+        ),
+        (
+            "perceive(self, *now)",
+            "return super().perceive(*now)[0]",
+            r"perceive returned View, expected \(View, knowledge\): what is perceived "
+            r"\(mirror_ppl\.models\.View\), and the person's memory after this step",
+        ),
+        (
+            "perceive(self, *now)",
+            "return super().perceive(*now)[::-1]",
+            r"perceive returned \(CarKnowledge, View\), expected \(View, knowledge\)",
+        ),
         ("evidence(self, view, observation)", "return view.seen", r"Mine\.evidence fails: Attr"),
         ("believe(self, *now)", "return None", r"Mine\.believe fails"),
         (

@@ -101,7 +101,7 @@ def perception_p_values(
         if name in statistics:
             each = zip(statistics[name](replicates), statistics[name](recorded), strict=True)
             p_values = [more_often(one[None], own[None]) for one, own in each]
-            found[name] = float(torch.tensor(p_values)[possible.cpu()].mean())
+            found[name] = float(torch.tensor(p_values).double()[possible.cpu()].mean())
     return found
 
 
