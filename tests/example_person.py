@@ -8,7 +8,7 @@ from mirror_ppl.communication import Channels, Person, RoundSoFar
 from mirror_ppl.communication.person import transitions
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import DrivingState
-from mirror_ppl.models import HumanModel
+from mirror_ppl.models import HumanModel, View
 from mirror_ppl.models.belief_tracking import BeliefState
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, SIGHT, assumption_sites, sight_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -67,6 +67,15 @@ class Unused(Averaging):
 
     def act(self, implants, belief, values):
         return HumanModel.act(self, implants, self.parts(belief)[0], values)
+
+
+class AssumesAtOddSteps(HumanModel):
+    """At even steps they perceive what is communicated, and their views assume nothing."""
+
+    def perceive(self, implants, knowledge, observation, told, step):
+        if step % 2:
+            return super().perceive(implants, knowledge, observation, told, step)
+        return View(dict(told)), knowledge
 
 
 def implants(number=1, model=None, sight=BLIND, **values):

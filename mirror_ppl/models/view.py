@@ -55,10 +55,20 @@ class View:
 
     @classmethod
     def joined(cls, parts: Sequence[View]) -> View:
-        """Concatenate views ``[n, K]`` of different people."""
+        """Concatenate views ``[n, K]`` of different people, some of which may assume nothing."""
+        numbers = [len(next(iter(part.visible.values()), ())) for part in parts]
 
         def cat(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-            return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+            some = {name: value for part in parts for name, value in part.items()}
+            return {
+                name: torch.cat(
+                    [
+                        part[name] if name in part else value.new_zeros(number, *value.shape[1:])
+                        for part, number in zip(parts, numbers, strict=True)
+                    ]
+                )
+                for name, value in some.items()
+            }
 
         still = [part.still for part in parts if part.still is not None]
         return cls(

@@ -7,7 +7,7 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
-from example_person import Averaging, Unused
+from example_person import AssumesAtOddSteps, Averaging, Unused
 from example_views import (
     DRIVING,
     Few,
@@ -46,7 +46,7 @@ def recordings():
 # --- tables of views --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [HumanModel, Averaging, Few], ids=["own", "averaging", "few"])
+@pytest.mark.parametrize("kind", [HumanModel, Averaging, AssumesAtOddSteps, Few])
 def test_table_agrees_with_perceive_believe_act(self_model, recordings, kind):
     human, rounds = kind(self_model), ragged(recordings, LENGTHS)
     number = 14 if kind is Few else 9604
