@@ -85,6 +85,9 @@ def load_demonstrations(
         get_domain(domain)
     path = as_path(path)
     dataset = read_netcdf(path, DemonstrationsError)["/"]
+    unnamed = "format" not in dataset.attrs
+    if unnamed and read_netcdf(path, DemonstrationsError, ("posterior",)):
+        raise DemonstrationsError(f"{path} is a posterior, not recordings")
     try:
         return from_dataset(dataset, domain, setting)
     except (DemonstrationsError, UnknownNameError) as error:

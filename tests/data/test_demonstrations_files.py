@@ -280,6 +280,12 @@ def test_bad_files_are_refused_in_one_line_that_names_them(ragged, path, change,
     assert str(error.value) == f"{path}: {message}"
 
 
+def test_a_posterior_is_not_recordings(path):
+    xr.Dataset({"lapse": ("draw", [0.1])}).to_netcdf(path, group="posterior", engine="h5netcdf")
+    with pytest.raises(DemonstrationsError, match=f"{path} is a posterior, not recordings"):
+        load_demonstrations(path)
+
+
 def test_files_that_cannot_be_read(ragged, path, tmp_path):
     with pytest.raises(DemonstrationsError, match="recordings.nc: there is no such file"):
         load_demonstrations(path)
