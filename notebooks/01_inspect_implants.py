@@ -169,7 +169,8 @@ fit.plot.predictive_check()
 # %% [markdown]
 # **Model check of each person.** Posterior predictive p-values compare the recorded actions with
 # 2,000 replicates: how often the person switches, whether actions fit the prediction of one step
-# earlier, reward, surprise. Dark cells are statistics of which a person has more (blue) or less
+# earlier, reward, surprise, and whether missing (`missed`) or forgetting something (`forgot`)
+# explains them better. Dark cells are statistics of which a person has more (blue) or less
 # (red) than predicted; a frame marks a *suspect* person. Right: held-out NLL beside the base rate
 # of each action and the robot without implants.
 
