@@ -132,7 +132,7 @@ def acts_on_beliefs(human: HumanModel, sites: Iterable[str]) -> bool:
     If ``act`` reads one of the ``sites`` that ``perceive`` reads, likelihoods of views do not
     suffice.
     """
-    return not dependencies(human).actions & set(sites)
+    return not _acted_on(human, sites)
 
 
 def require_acting_on_beliefs(human: HumanModel, sites: Iterable[str]) -> None:
@@ -141,12 +141,17 @@ def require_acting_on_beliefs(human: HumanModel, sites: Iterable[str]) -> None:
     Raises:
         HumanModelError: ``act`` reads one of the sites.
     """
-    both = sorted(dependencies(human).actions & set(sites))
+    both = _acted_on(human, sites)
     if both:
         raise HumanModelError(
-            f"act() reads a site that perceive() reads, too ({', '.join(both)}); only the engines "
-            "svi and nuts can fit this"
+            f"act() reads a site that perceive() reads, too ({', '.join(sorted(both))}); only the "
+            "engines svi and nuts can fit this"
         )
+
+
+def _acted_on(human: HumanModel, sites: Iterable[str]) -> set[str]:
+    """Return those of the sites that ``act`` reads."""
+    return set(dependencies(human).actions) & set(sites)
 
 
 def draw_combinations(

@@ -11,9 +11,13 @@ from mirror_ppl.data import Demonstrations
 from mirror_ppl.domains import get_domain
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.models import HumanModel, View
-from mirror_ppl.models.implants import policy_implants
+from mirror_ppl.models.implants import assumption_sites, policy_implants, sight_sites
 
 DRIVING = get_domain("driving")
+STEPS = DRIVING.horizon
+SIGHTS, ASSUMED = sight_sites(DRIVING), assumption_sites(DRIVING)
+LENGTHS = [[15, 4], [], [7, 1]]
+"""Lengths of the rounds of three people."""
 
 
 class Few(HumanModel):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from example_person import Averaging
 from example_views import (
-    DRIVING,
+    LENGTHS,
     Few,
     Sure,
     assert_rounds_equal,
@@ -27,17 +27,6 @@ from mirror_ppl.likelihood.tables import build_view_table, combination_scores, r
 from mirror_ppl.likelihood.view_table import NO_VIEW
 from mirror_ppl.likelihood.view_table_builder import GROWTH, ViewTableBuilder
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.implants import assumption_sites, sight_sites
-from mirror_ppl.models.weights import load_self_model, shipped_weights
-
-STEPS = DRIVING.horizon
-SIGHTS, ASSUMED = sight_sites(DRIVING), assumption_sites(DRIVING)
-LENGTHS = [[15, 4], [], [7, 1]]
-
-
-@pytest.fixture(scope="module")
-def self_model():
-    return load_self_model(shipped_weights("driving"))[0]
 
 
 @pytest.fixture(scope="module")

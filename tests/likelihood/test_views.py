@@ -9,7 +9,10 @@ import pytest
 import torch
 from example_person import AssumesAtOddSteps, Averaging, Unused
 from example_views import (
-    DRIVING,
+    ASSUMED,
+    LENGTHS,
+    SIGHTS,
+    STEPS,
     Few,
     Sure,
     assert_tables_equal,
@@ -25,17 +28,6 @@ from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted
 from mirror_ppl.likelihood.view_table import IMPOSSIBLE, NO_VIEW, RecordedActions
 from mirror_ppl.models import HumanModel
-from mirror_ppl.models.implants import assumption_sites, sight_sites
-from mirror_ppl.models.weights import load_self_model, shipped_weights
-
-STEPS = DRIVING.horizon
-SIGHTS, ASSUMED = sight_sites(DRIVING), assumption_sites(DRIVING)
-LENGTHS = [[15, 4], [], [7, 1]]
-
-
-@pytest.fixture(scope="module")
-def self_model():
-    return load_self_model(shipped_weights("driving"))[0]
 
 
 @pytest.fixture(scope="module")

@@ -93,15 +93,12 @@ def perception_p_values(
         return {}
     replicates, recorded = perceived.replicates(generator), perceived.recorded
     events = perceived.events(generator)
-    statistics = {"forgot": perceived.forgot}
-    if len(events.pair):
-        statistics["missed"] = perceived.missed(events)
+    statistics = {"missed": perceived.missed(events)} if len(events.pair) else {}
     found = {}
-    for name in ("missed", "forgot"):
-        if name in statistics:
-            each = zip(statistics[name](replicates), statistics[name](recorded), strict=True)
-            p_values = [more_often(one[None], own[None]) for one, own in each]
-            found[name] = float(torch.tensor(p_values).double()[possible.cpu()].mean())
+    for name, statistic in (statistics | {"forgot": perceived.forgot}).items():
+        each = zip(statistic(replicates), statistic(recorded), strict=True)
+        p_values = [more_often(one[None], own[None]) for one, own in each]
+        found[name] = float(torch.tensor(p_values).double()[possible.cpu()].mean())
     return found
 
 
