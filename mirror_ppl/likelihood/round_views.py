@@ -53,15 +53,6 @@ class Rounds:
             self.real[some],
         )
 
-    def first_steps(self, number: int) -> Rounds:
-        """Cut all rounds to their first steps."""
-        return Rounds(
-            {name: value[:, :number] for name, value in self.observation.items()},
-            {name: mask[:, :number] for name, mask in self.told.items()},
-            self.actions[:, :number],
-            self.real[:, :number],
-        )
-
     def each(self) -> Iterator[Rounds]:
         """Iterate over the rounds."""
         return (self.at(number, number + 1) for number in range(len(self)))

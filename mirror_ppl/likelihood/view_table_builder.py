@@ -7,7 +7,6 @@ and exact marginalization stays cheap.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -50,9 +49,6 @@ SCREENED_ROWS, MOST_ROWS = 4096, 32768
 the number at which they take as long as the calls' overhead: later rounds have fewer left."""
 CHAINED_ROUNDS = 32
 """Rounds that are processed at once where attention is summed out exactly."""
-BEGINNING, LONG = 12, 3
-"""Steps of a round's beginning, and how many times as long rounds must be for it to be looked at
-first. In shorter rounds views of these take as long as views of the whole."""
 FEW_ROUNDS = 2
 """Number of rounds up to which they are processed in the given order."""
 GROWTH = 3
@@ -117,7 +113,6 @@ class ViewTableBuilder:
             number = len(next(iter(self.policies.values())))
         self.score = torch.zeros(number, prod(self.sizes), device=device)
         self._likelihoods = PolicyLikelihoods(human, self.policies, number)
-        self._share, self._evidence = 1.0, 0.0  # what a round counts; rounds counted so far
         self._rounds: list[RoundViews] = []
         self._seen: list[tuple[Tensor, Tensor]] = []
         self._recorded: list[tuple[Tensor, Tensor]] = []
@@ -133,8 +128,6 @@ class ViewTableBuilder:
     @torch.no_grad()
     def add(self, rounds: Rounds) -> None:
         """Add rounds: the fewer combinations are left, the more rounds at once."""
-        if self._begins_with_beginnings(rounds):
-            self._drop_by_beginnings(rounds)
         order, before = self._order(rounds), len(self._rounds)
         if order is None:
             self._go_through(rounds)
@@ -148,31 +141,11 @@ class ViewTableBuilder:
         first = 0
         while first < len(rounds):
             some = rounds.at(first, first + self._at_once())
-            self._evidence += len(some) * self._share
             if self.human.chained:
                 self._add_chained(some)
             else:
                 self._add_together(some)
             first += len(some)
-
-    def _begins_with_beginnings(self, rounds: Rounds) -> bool:
-        """True if rounds are so long that a look at their beginnings saves time."""
-        long = int(rounds.real.sum(-1).max()) >= LONG * BEGINNING
-        many = self.screening is not None and len(self.alive) >= MANY
-        return long and many and not self.human.has_round_latents
-
-    def _drop_by_beginnings(self, rounds: Rounds) -> None:
-        """Drop combinations by the first steps of all rounds, where views have hardly branched.
-
-        With the margin of a first round throughout, since the rest of each round, of which nothing
-        is known yet, can contradict all beginnings.
-        """
-        first = copy.copy(self)
-        first.score, first._rounds, first._seen, first._recorded = self.score.clone(), [], [], []
-        first._share = first._evidence = 0.0
-        order = first._order(beginnings := rounds.first_steps(BEGINNING))
-        first._go_through(beginnings if order is None else beginnings.chosen(order))
-        self.alive = first.alive
 
     def _order(self, rounds: Rounds) -> list[int] | None:
         """Order in which rounds are processed: the most informative about combinations first.
@@ -283,6 +256,9 @@ class ViewTableBuilder:
                 for chain, first, begin in zip(chains, before, begins, strict=True)
             ]
         parts = views.split()
+        every = torch.arange(len(alive), device=alive.device)
+        for one, chain, (_, part) in zip(rounds.each(), chains, parts, strict=True):
+            self._take(one, replace(part, chain=chain), every, alive)
         if self.screening is not None:
             likelihoods = self._likelihoods.of_views(views)[:, None]
             together = Chain.one_after_another(chains, [len(part.moments) for _, part in parts])
@@ -292,9 +268,6 @@ class ViewTableBuilder:
                 )
             found = together.marginal(likelihoods, probabilities)[:, 0]
             self._screen(found.unflatten(-1, (len(rounds), -1)).sum(1), self.screening)
-        every = torch.arange(len(alive), device=alive.device)
-        for one, chain, (_, part) in zip(rounds.each(), chains, parts, strict=True):
-            self._take(one, replace(part, chain=chain), every, alive)
 
     def _take(self, one: Rounds, part: RoundViews, seen: Tensor, alive: Tensor) -> None:
         """Store a round, with the view of each combination that was alive."""
@@ -309,7 +282,7 @@ class ViewTableBuilder:
         self.score[:, alive] = score
         # With the prior, whose factors and observed sites may rule combinations out.
         joint = score + self.log_prior[:, alive]
-        margin = screening.margin_after(self._evidence)
+        margin = screening.margin_after(len(self._rounds))
         self.alive = alive[within(self.human, joint, margin)]
 
     def table(self) -> ViewTable:

@@ -38,6 +38,9 @@ TINY = 1e-30
 """Least probability whose logarithm is taken."""
 LOW = math.log(TINY)
 """Log-probability above which exponentials of 32-bit numbers are safe."""
+AT_ONCE, BLOCK = 1536, 32
+"""Action values that are computed at once, so that layers fit into a processor's cache, and the
+number of which the latents of these are a multiple, as processors round rows of a block alike."""
 
 
 class Gaussian(NamedTuple):
@@ -271,9 +274,18 @@ class QNetwork(nn.Module):
         first = torch.relu(self.latent(latent)[..., None, :] + self.action.weight)
         return self.value(self.body(first))
 
+    def values(self, latent: Tensor) -> Tensor:
+        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``, all at once."""
+        return self.output(latent).squeeze(-1)
+
     def forward(self, latent: Tensor) -> Tensor:
         """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
-        return self.output(latent).squeeze(-1)
+        size = max(1, AT_ONCE // self.action.num_embeddings // BLOCK) * BLOCK
+        rows = math.prod(latent.shape[:-1])
+        if torch.is_grad_enabled() or latent.device.type != "cpu" or rows <= size:
+            return self.values(latent)
+        parts = [self.values(part) for part in latent.reshape(rows, -1).split(size)]
+        return torch.cat(parts).view(*latent.shape[:-1], -1)
 
 
 class BinnedQNetwork(QNetwork):
@@ -314,8 +326,8 @@ class BinnedQNetwork(QNetwork):
         """Return the values ``[..., A]`` of distributions ``[..., A, V]``."""
         return log_probabilities.exp() @ self.centres
 
-    def forward(self, latent: Tensor) -> Tensor:
-        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
+    def values(self, latent: Tensor) -> Tensor:
+        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``, all at once."""
         return torch.softmax(self.output(latent), -1) @ self.centres
 
     def target(self, values: Tensor) -> Tensor:

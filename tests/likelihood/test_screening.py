@@ -11,16 +11,12 @@ from example_views import (
     Few,
     Sure,
     assert_rounds_equal,
-    assert_tables_equal,
     ragged,
 )
-from torch.nn.functional import pad
 
 from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.likelihood import view_table_builder
 from mirror_ppl.likelihood.combinations import log_priors
 from mirror_ppl.likelihood.enumeration import combination_values
-from mirror_ppl.likelihood.round_views import Rounds
 from mirror_ppl.likelihood.screening import Screening
 from mirror_ppl.likelihood.table_program import log_likelihoods
 from mirror_ppl.likelihood.tables import build_view_table, combination_scores, restricted, rounds_of
@@ -79,64 +75,6 @@ def test_screening_drops_whoever_falls_behind_and_never_the_best(
     # With the margin that is used, the best of all rounds is never among the dropped.
     best = (score + prior).amax(0).argmax(-1, keepdim=True)
     assert margin < 15 or expected.gather(-1, best).all()
-
-
-@pytest.mark.parametrize("early", [0.0, 1.0])
-def test_beginnings_of_long_rounds_drop_combinations_before(
-    self_model, recordings, monkeypatch, early
-):
-    human, rounds = Few(self_model), rounds_of(recordings.select_rounds(range(6)), 0)
-    screening = Screening(margin=1.0, early=early, resolution=0.0)
-    plain = ViewTableBuilder(human, Screening(margin=1.0 + early, early=0.0, resolution=0.0))
-    plain.add(rounds.first_steps(5))
-    monkeypatch.setattr(view_table_builder, "MANY", 2)
-    monkeypatch.setattr(view_table_builder, "BEGINNING", 5)
-    margins, margin_after = [], Screening.margin_after
-
-    def noted(self, number):
-        margins.append(number)
-        return margin_after(self, number)
-
-    monkeypatch.setattr(Screening, "margin_after", noted)
-    monkeypatch.setattr(ViewTableBuilder, "_order", lambda self, rounds: None)
-    found = ViewTableBuilder(human, screening)
-    found.add(rounds)
-    # Rounds 0; 1 to 3; 4 and 5: the beginnings, which count as no rounds, then the whole.
-    assert margins == [0, 0, 0, 1, 4, 6]
-    begun = [part for part, _ in found._seen][0]
-    assert len(begun) < 14
-    assert torch.equal(begun, plain.alive)
-    after = ViewTableBuilder(human, screening, candidates=begun)
-    monkeypatch.setattr(view_table_builder, "MANY", 15)
-    after.add(rounds)
-    assert torch.equal(found.alive, after.alive) and torch.equal(found.score, after.score)
-    assert_tables_equal(found.table(), after.table())
-    monkeypatch.setattr(view_table_builder, "MANY", 2)
-    margins.clear()
-    one_by_one = ViewTableBuilder(human, screening)
-    for number in range(3):
-        one_by_one.alive = torch.arange(14)
-        one_by_one.add(rounds.at(number, number + 1))
-    assert margins == [0, 1, 0, 2, 0, 3]
-    monkeypatch.setattr(view_table_builder, "LONG", 4)
-    for steps in (0, 20):  # padding, as beside people with longer rounds, changes nothing
-        short = ViewTableBuilder(human, screening)
-        short.add(padded(rounds, steps))
-        assert len(short._seen[0][0]) == 14
-
-
-def padded(rounds, steps):
-    """Rounds with unused steps at their ends."""
-
-    def longer(value):
-        return torch.cat([value, value[:, -1:].expand(-1, steps, *value.shape[2:])], 1)
-
-    return Rounds(
-        {name: longer(value) for name, value in rounds.observation.items()},
-        {name: longer(mask) for name, mask in rounds.told.items()},
-        longer(rounds.actions),
-        pad(rounds.real, [0, steps]),
-    )
 
 
 def test_what_one_round_contradicts_is_kept_until_others_agree(self_model, recordings):

@@ -103,6 +103,29 @@ def test_binned_q_network_has_an_output_for_each_bin():
     torch.testing.assert_close(network(z), by_hand)
 
 
+@pytest.mark.parametrize("network", [QNetwork(7, 5, 16), BinnedQNetwork(7, 5, 16, 4, -1.0, 3.0)])
+@pytest.mark.parametrize(
+    ("shape", "parts"),
+    [((0,), [0]), ((288,), [288]), ((289,), [288, 1]), ((2, 5, 70), [288, 288, 124])],
+)
+def test_many_values_are_computed_in_parts(network, shape, parts, monkeypatch):
+    """1,536 values at once are those of 307 latents, rounded down to blocks of 32."""
+    sizes, values = [], type(network).values
+
+    def noted(self, latent):
+        sizes.append(latent.shape[:-1].numel())
+        return values(self, latent)
+
+    monkeypatch.setattr(type(network), "values", noted)
+    z = torch.randn(*shape, 7, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        found = network(z)
+        assert sizes == parts
+        torch.testing.assert_close(found, values(network, z))
+    sizes.clear()
+    assert network(z).requires_grad and len(sizes) == 1  # gradients are of all at once
+
+
 @pytest.mark.parametrize("ends", [(-20.0, 20.0), (-200.0, 5.0), (-30.0, 0.0), (5.0, 20.0)])
 def test_binned_values_begin_next_to_0(ends):
     least, most = ends
