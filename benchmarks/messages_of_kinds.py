@@ -4,11 +4,12 @@ r"""What messages of `mirror` are worth to drivers whom its human model does not
     python -m benchmarks.messages_of_kinds --seeds 0 --human-model all
 
 Drivers of the kinds of benchmarks/model_check.py, and drivers whom no message reaches, play 20
-rounds in fog, without messages. Posteriors of the human model are inferred from these. Then each driver
-plays further rounds twice: in silence, and with messages planned with that posterior, which learns
-from round to round only whether messages reach them. Both have the same initial states and the same
-random numbers. This writes a row for each driver to docs/results/driving_messages_of_kinds.csv;
-seeds that are there are not done again. The table of docs/communicator.md is printed.
+rounds in fog, without messages. Posteriors of the human model are inferred from these. Then each
+driver plays further rounds twice: in silence, and with messages planned with that posterior, which
+learns from round to round only whether messages reach them. Both have the same initial states and
+the same random numbers. This writes a row for each driver to
+docs/results/driving_messages_of_kinds.csv; seeds that are there are not done again. The table of
+docs/communicator.md is printed.
 """
 
 from __future__ import annotations
