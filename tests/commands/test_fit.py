@@ -145,6 +145,19 @@ def test_shipped_recordings_are_those_that_are_asked_for():
             assert recordings.shape == (10, 40, 15)
 
 
+def test_a_cluster_finds_the_same(folder, cluster):
+    """Each person is a task of its own, so that both workers have one."""
+    demos = "--demos", folder / "some.nc", *RADIUS, "--draws", 10, "--explore", 2
+    found = []
+    for out, where in (("here", ("--jobs", 1)), ("there", ("--scheduler", cluster))):
+        assert command(fit, *demos, "--guide", "importance", "--out", folder / out, *where) == 0
+        found.append(summary_of(folder / out))
+    assert found[0] == found[1]
+    here, there = (xr.load_datatree(folder / out / "posterior.nc") for out in ("here", "there"))
+    assert here.posterior.to_dataset().equals(there.posterior.to_dataset())
+    assert here.predictions.to_dataset().equals(there.predictions.to_dataset())
+
+
 def test_killed_fit_leaves_no_results_and_goes_on_from_its_checkpoint(folder, forks, monkeypatch):
     """A fit of some more steps, as there is a checkpoint in 25, of a model that is quick."""
     whole, args = (
