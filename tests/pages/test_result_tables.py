@@ -1,6 +1,7 @@
 """Pages of studies are what their rows say: `make tables` changes nothing."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
@@ -10,6 +11,7 @@ from benchmarks import (
     hearing,
     highway_gap,
     highway_messages,
+    model_check,
     planner_settings,
     pooling,
     sbc,
@@ -201,7 +203,10 @@ def test_the_tables_of_messages_in_driving_are_what_their_rows_say():
 
 def test_tables_of_trust_are_what_their_rows_say():
     page = (DOCS / "trust.md").read_text()
+    checks = pd.read_csv(RESULTS / "model_check.csv")
     for name, expected in (
+        ("verdicts", model_check.verdict_table(checks)),
+        ("models", model_check.model_table(checks)),
         ("hearing", hearing.table(rows_in(hearing.ROWS))),
         ("calibration", sbc.table(rows_in(sbc.ROWS))),
         ("together", pooling.together_table(rows_in(pooling.ROWS))),
@@ -209,6 +214,7 @@ def test_tables_of_trust_are_what_their_rows_say():
         found = page.partition(f"<!-- {name} -->\n")[2].partition("\n<!-- end -->")[0]
         assert found == expected
     assert all(int(row["seed"]) < 100 for row in rows_in(hearing.ROWS))
+    assert (checks["seed"] < 100).all()
     assert all(int(row["seed"]) >= 100 for row in rows_in(pooling.ROWS))
 
 
