@@ -65,6 +65,8 @@ results: $(STAMP) ## The paper's comparisons in all domains; hours; results in r
 			--domain driving search_rescue bomb_defusal --out runs/results || worst=$$?; \
 	done; exit $$worst
 
+include benchmarks/highway.mk
+
 tables: $(STAMP) ## Pages and tables of docs/results.md from the rows in docs/results
 	$(BIN)/python -m benchmarks.tables
 
