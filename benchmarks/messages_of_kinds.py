@@ -1,7 +1,8 @@
 r"""What messages of `mirror` are worth to drivers whom its human model does not describe.
 
     python -m benchmarks.messages_of_kinds --seeds 0 1 2 3
-    python -m benchmarks.messages_of_kinds --seeds 0 --human-model all
+    python -m benchmarks.messages_of_kinds --seeds 0 1 --human-model all \
+        --kinds "another goal" "a step late"
 
 Drivers of the kinds of benchmarks/model_check.py, and drivers whom no message reaches, play 20
 rounds in fog, without messages. Posteriors of the human model are inferred from these. Then each
@@ -168,13 +169,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of drivers and rounds")
+    parser.add_argument("--kinds", nargs="*", default=[], help="of drivers; all unless given")
     parser.add_argument("--human-model", default="mirror", help="that is planned with")
     given = parser.parse_args()
     torch.set_num_threads(1)
     self_model, _ = load_self_model(shipped_weights("driving"))
     rows = rows_in(ROWS) if ROWS.exists() else []
     for seed in given.seeds:
-        for name, (human, known) in every_kind(self_model).items():
+        every = every_kind(self_model)
+        for name in given.kinds or every:
+            human, known = every[name]
             cell = name, given.human_model, str(seed)
             if cell not in {(row["kind"], row["human_model"], row["seed"]) for row in rows}:
                 new = measured(name, human, known, seed, given.human_model)

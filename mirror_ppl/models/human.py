@@ -40,7 +40,7 @@ from mirror_ppl.errors import HumanModelError
 from mirror_ppl.models import implants as implant_priors
 from mirror_ppl.models.distributions import NormalizedCategorical
 from mirror_ppl.models.handlers import AtStep, MaskObserved
-from mirror_ppl.models.networks import Gaussian, log_of_sum, log_softmax_of_few
+from mirror_ppl.models.networks import Gaussian, log_softmax_with_lapse
 from mirror_ppl.models.perception import perceived_by
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
@@ -303,12 +303,11 @@ class HumanModel(nn.Module):
             belief: ``[..., P, B, Z]``.
             values: the self-model's action values at the belief, ``[..., P, B, A]``.
         """
-        logits = implants["consistency"][..., None] * values
-        logits = logits + implant_priors.residual(implants, belief)
-        lapse = implants["lapse"][..., None]
-        aware = torch.log1p(-lapse) + log_softmax_of_few(logits)
-        lapsed = torch.log(lapse / logits.shape[-1])
-        return implant_priors.executed(self.domain, implants, log_of_sum(aware, lapsed))
+        # The residual is laid out in memory for what follows.
+        residual = implant_priors.residual(implants, belief)
+        logits = torch.addcmul(residual, implants["consistency"][..., None], values)
+        chosen = log_softmax_with_lapse(logits, implants["lapse"][..., None])
+        return implant_priors.executed(self.domain, implants, chosen)
 
     def choose(
         self, implants: Implants, belief: Tensor, values: Tensor, action: Tensor | None = None

@@ -36,8 +36,6 @@ START = 0.05
 *e*, as a share of the range of values."""
 TINY = 1e-30
 """Least probability whose logarithm is taken."""
-LOW = math.log(TINY)
-"""Log-probability above which exponentials of 32-bit numbers are safe."""
 AT_ONCE, BLOCK = 1536, 32
 """Action values that are computed at once, so that layers fit into a processor's cache, and the
 number of which the latents of these are a multiple, as processors round rows of a block alike."""
@@ -50,24 +48,28 @@ class Gaussian(NamedTuple):
     scale: Tensor
 
 
-def log_softmax_of_few(logits: Tensor) -> Tensor:
-    """Return the log-softmax of logits ``[..., A]`` of few actions, faster than ``torch``.
+def softmax_of_few(logits: Tensor) -> Tensor:
+    """Return the softmax of logits ``[..., A]`` of few actions, faster than ``torch``.
 
     ``torch`` processes rows one by one; here rows are processed in parallel.
     """
-    side_by_side = logits.reshape(-1, logits.shape[-1]).T.contiguous().log_softmax(0)
+    if logits.dim() > 1 and logits.mT.is_contiguous():
+        return torch.softmax(logits.mT, -2).mT
+    side_by_side = logits.reshape(-1, logits.shape[-1]).T.contiguous().softmax(0)
     return side_by_side.view(logits.shape[-1], *logits.shape[:-1]).movedim(0, -1)
 
 
-def log_of_sum(first: Tensor, second: Tensor) -> Tensor:
-    """Return ``torch.logaddexp`` of log-probabilities, faster where there are many on a processor.
+def log_softmax_with_lapse(logits: Tensor, lapse: Tensor) -> Tensor:
+    """Return ``log((1 - lapse) softmax(logits) + lapse / A)`` ``[..., A]``.
 
-    It takes as long as ``torch`` if some of ``second``, which is broadcast, is so low that its
-    exponential could be rounded to 0.
+    Logarithms of the summands are used, which takes longer, if some ``lapse`` ``[..., 1]`` is so
+    low that the probability of an action could be rounded to 0.
     """
-    if bool((second > LOW).all()):
-        return torch.log(first.exp() + second.exp())
-    return torch.logaddexp(first, second.expand_as(first))
+    at_random = lapse / logits.shape[-1]
+    if bool((at_random > TINY).all()):
+        return torch.log(torch.addcmul(at_random, softmax_of_few(logits), 1 - lapse))
+    aware = torch.log1p(-lapse) + torch.log_softmax(logits, -1)
+    return torch.logaddexp(aware, torch.log(at_random).expand_as(aware))
 
 
 class GaussianHead(nn.Module):

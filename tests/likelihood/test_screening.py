@@ -83,13 +83,13 @@ def test_what_one_round_contradicts_is_kept_until_others_agree(self_model, recor
     for early, kept in ((0.0, False), (25.0, True)):
         builder = ViewTableBuilder(human, Screening(early=early))
         builder.add(rounds_of(recordings.select_rounds([0]), 0))
-        builder.alive, builder._evidence = torch.arange(14), 1.0
+        builder.alive = torch.arange(14)
         builder.score.zero_()
         found = torch.zeros_like(builder.score)
         found[:, 3] = -20.0
         builder._screen(found, builder.screening)
         assert (3 in builder.alive.tolist()) == kept
-        builder._evidence = 20.0
+        builder._rounds *= 20
         builder._screen(torch.zeros_like(builder.score)[:, builder.alive], builder.screening)
         assert 3 not in builder.alive.tolist()
 

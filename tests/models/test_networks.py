@@ -11,16 +11,16 @@ from torch import nn
 
 from mirror_ppl.errors import InputError
 from mirror_ppl.models.networks import (
-    LOW,
     MIN_SCALE,
+    TINY,
     BinnedQNetwork,
     Decoder,
     GaussianHead,
     QNetwork,
     Reward,
     Transition,
-    log_of_sum,
-    log_softmax_of_few,
+    log_softmax_with_lapse,
+    softmax_of_few,
 )
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.sizes import Sizes
@@ -290,30 +290,36 @@ def test_first_layer_is_the_linear_layer_on_masked_values_and_masks():
 
 
 @pytest.mark.parametrize("shape", [(3,), (4, 2), (2, 3, 1, 5), (0, 3), (2, 0, 4)])
-def test_log_softmax_of_few_is_that_of_torch(shape, generator):
+def test_softmax_of_few_is_that_of_torch(shape, generator):
     logits = 5 * torch.randn(shape, generator=generator).double()
-    logits.requires_grad_()
-    found = log_softmax_of_few(logits)
-    assert found.shape == logits.shape
-    torch.testing.assert_close(found, logits.log_softmax(-1))
     weights = torch.randn(shape, generator=generator).double()
-    (own,) = torch.autograd.grad((found * weights).sum(), logits)
-    (expected,) = torch.autograd.grad((logits.log_softmax(-1) * weights).sum(), logits)
-    torch.testing.assert_close(own, expected)
-    # Of expanded inputs, too.
-    wide = logits.detach().expand(2, *shape)
-    torch.testing.assert_close(log_softmax_of_few(wide), wide.log_softmax(-1))
+    ways = [logits, logits.expand(2, *shape)]
+    if len(shape) > 1:  # values of an action are next to each other
+        ways.append(logits.mT.contiguous().mT)
+    for way in ways:
+        way = way.detach().requires_grad_()
+        found = softmax_of_few(way)
+        assert found.shape == way.shape
+        torch.testing.assert_close(found, way.softmax(-1))
+        (own,) = torch.autograd.grad((found * weights).sum(), way)
+        (expected,) = torch.autograd.grad((way.softmax(-1) * weights).sum(), way)
+        torch.testing.assert_close(own, expected)
 
 
-@pytest.mark.parametrize("least", [-5.0, LOW + 0.1, LOW - 0.1, -200.0, -torch.inf])
-def test_log_of_sum_is_that_of_torch(least, generator):
-    first = -80 * torch.rand(50, 4, generator=generator)
-    first[0] = torch.tensor([0.0, -500.0, -90.0, -100.0])
-    first.requires_grad_()
-    second = torch.linspace(-1, -3, 50)[:, None].clone()
-    second[:2] = least
-    second.requires_grad_()
-    found, expected = log_of_sum(first, second), torch.logaddexp(first, second.expand_as(first))
+@pytest.mark.parametrize("least", [0.3, 8 * TINY, 2 * TINY, 1e-40, 0.0])
+def test_log_softmax_with_lapse_is_the_mixture(least, generator):
+    """Of four actions, some of which have no probability but that of a lapse."""
+    logits = -80 * torch.rand(50, 4, generator=generator)
+    logits[0] = torch.tensor([0.0, -500.0, -90.0, -100.0])
+    logits.requires_grad_()
+    lapse = torch.linspace(0.4, 0.99, 50)[:, None].clone()
+    lapse[:2] = least
+    lapse.requires_grad_()
+    found = log_softmax_with_lapse(logits, lapse)
+    aware = torch.log1p(-lapse) + logits.log_softmax(-1)
+    expected = torch.logaddexp(aware, torch.log(lapse / 4).expand_as(aware))
     torch.testing.assert_close(found, expected)
-    own, others = (torch.autograd.grad(value.sum(), [first, second]) for value in (found, expected))
-    torch.testing.assert_close(own, others)
+    own, others = (torch.autograd.grad(value.sum(), [logits, lapse]) for value in (found, expected))
+    torch.testing.assert_close(own[0], others[0])
+    some = slice(2 if least == 0 else 0, None)  # the logarithm of 0 has no slope
+    torch.testing.assert_close(own[1][some], others[1][some], rtol=1e-5, atol=1e-5)
