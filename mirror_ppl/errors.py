@@ -153,5 +153,9 @@ class MisspeltMember(UserWarning):
     """Warns that a method of a user's class overrides none, but almost has the name of one."""
 
 
+class UnexplainedPerson(UserWarning):
+    """Warns that messages are planned for a person whose actions the model does not explain."""
+
+
 class UnreliableWeights(UserWarning):
     """Warns that a person's importance weights are not reliable."""

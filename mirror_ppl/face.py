@@ -25,13 +25,14 @@ from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.devices import usable_device
 from mirror_ppl.domains import DOMAINS as worlds
 from mirror_ppl.domains import World, add_domain, domain_of, get_domain, require_known
-from mirror_ppl.errors import InputError, UnreliableWeights
+from mirror_ppl.errors import InputError, UnexplainedPerson, UnreliableWeights
 from mirror_ppl.fitted import Fit, doubtful_people, one_of
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
+from mirror_ppl.inference.results.criticism import UNEXPLAINED
 from mirror_ppl.inference.results.population_file import load_population
-from mirror_ppl.inference.results.posterior_file import load_posterior
+from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.inference.workers import Workers
 from mirror_ppl.likelihood.contract import check_contract
@@ -89,6 +90,9 @@ class Communicator(PlannedCommunicator):
             kind.
         PosteriorError: the file is missing or damaged, or of another human model or self-model.
         UnknownNameError: there is no such person, planner or setting.
+
+    Warns:
+        UnexplainedPerson: the model check's verdict on the person is ``unexplained``.
     """
 
     def __init__(
@@ -104,11 +108,23 @@ class Communicator(PlannedCommunicator):
         **settings: Any,
     ) -> None:
         if isinstance(fit, str | Path):
-            listener = _saved_person(Path(fit), person, draws, human, self_model)
+            saved = load_posterior(Path(fit))
+            name = one_of(saved.people, person, str(fit))
+            listener = _saved_person(saved, name, draws, human, self_model)
+            verdict = saved.verdicts.get(name)
         else:
             if not (human is None and self_model is None):
                 raise InputError("human and self_model are for a saved posterior; a fit has both")
-            listener = require_kind(fit, Fit, "fit").person(person).listener(draws)
+            fitted = require_kind(fit, Fit, "fit").person(person)
+            name, verdict = fitted.name, fitted.summary["check"]["verdict"]
+            listener = fitted.listener(draws)
+        if verdict == UNEXPLAINED:
+            warnings.warn(
+                f"the actions of {name} are not explained by the human model (verdict "
+                f"{UNEXPLAINED}): messages that are planned with it may do harm",
+                UnexplainedPerson,
+                stacklevel=2,
+            )
         known = [field.name for field in fields(PlannerOptions)]
         for name in settings:
             require_known(name, "setting", known)
@@ -301,15 +317,14 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
 
 
 def _saved_person(
-    path: Path,
-    person: str | None,
+    saved: PosteriorFile,
+    person: str,
     draws: int,
     human: HumanModel | type[HumanModel] | str | None,
     self_model: SelfModel | str | Path | None,
 ) -> Person:
     """Make the person to plan messages for from a posterior file."""
-    saved = load_posterior(path)
-    number = saved.people.index(one_of(saved.people, person, str(path)))
+    path, number = saved.path, saved.people.index(person)
     domain = saved.attributes["domain"]
     if human is None:
         human = model_name(saved.attributes.get("human_model", "unknown"))

@@ -159,6 +159,7 @@ def main(options: Options) -> None:
         raise PosteriorError(
             f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
         )
+    _say_who_is_unexplained(posterior, number)
     pairing = _pairing(options, posterior, source)
     pairing.check()
     chosen = _possible(options, chosen, pairing)
@@ -216,6 +217,20 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
         seed=options.seed,
         keep_log=options.log is not None or options.film is not None,
     )
+
+
+def _say_who_is_unexplained(posterior: PosteriorFile, number: int) -> None:
+    """Print whose actions, of the first people, the model does not explain."""
+    from mirror_ppl.inference.results.criticism import UNEXPLAINED
+
+    people = posterior.people[:number]
+    some = [name for name in people if posterior.verdicts.get(name) == UNEXPLAINED]
+    if some:
+        print(
+            f"the actions of {', '.join(some)} are not explained by the human model (verdict "
+            f"{UNEXPLAINED}): messages that are planned with it may do harm",
+            file=sys.stderr,
+        )
 
 
 def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tuple[str, ...]:

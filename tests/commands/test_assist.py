@@ -6,11 +6,13 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import h5py
+import numpy as np
 import pytest
 from paths import EXAMPLES
 from running import command
 
 from mirror_ppl import infer
+from mirror_ppl.arviz import az
 from mirror_ppl.commands import assist, fit
 from mirror_ppl.data import asset_path, load_demonstrations, save_demonstrations
 from mirror_ppl.domains import get_domain
@@ -111,6 +113,18 @@ def test_the_table_shows_the_numbers(posterior, capsys):
     assert worth.index(" none ") < worth.index(" oracle ")
     assert all(len(line) <= 80 for line in captured.out.splitlines())
     assert "2/2" in captured.err
+
+
+def test_it_says_whose_actions_are_not_explained(posterior, tmp_path, capsys):
+    data = az.from_netcdf(posterior)
+    first = str(data["posterior"]["person"].values[0])
+    data["model_check"]["verdict"] = "person", np.array(["unexplained", "suspect"])
+    path = tmp_path / "posterior.nc"
+    path.write_bytes(netcdf_content(data))
+    for given, expected in ((path, True), (posterior, False)):
+        assert command(assist, "--posterior", given, *SMALL, "--communicator", "none") == 0
+        said = f"the actions of {first} are not explained by the human model"
+        assert (said in capsys.readouterr().err) == expected
 
 
 def test_another_seed_gives_another_result(posterior, done, tmp_path):

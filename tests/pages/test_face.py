@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,9 +22,11 @@ from mirror_ppl.errors import (
     DemonstrationsError,
     InputError,
     PosteriorError,
+    UnexplainedPerson,
     UnknownNameError,
     UnreliableWeights,
 )
+from mirror_ppl.inference.results.export import netcdf_content
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.variants import VARIANTS
 from mirror_ppl.people import simulate
@@ -297,6 +301,21 @@ def test_unreliable_weights_are_reported(fit, recordings, monkeypatch):
         )
     assert "not to be relied on: person-01" in repr(found)
     assert repr(found.person()) == "FittedPerson(person-01: 3 rounds; weights not to be relied on)"
+
+
+def test_planning_for_somebody_unexplained_is_warned_of(fit, tmp_path):
+    """From a fit and from its file; of others nothing is said."""
+    summary = deepcopy(fit.summary)
+    summary["people"][0]["check"]["verdict"] = "unexplained"
+    data = deepcopy(fit.data)
+    data["model_check"]["verdict"] = "person", np.array(["unexplained", "ok"])
+    other = replace(fit, summary=summary, data=data)
+    (tmp_path / "posterior.nc").write_bytes(netcdf_content(data))
+    first, second = fit.people[:2]
+    for source in (other, tmp_path / "posterior.nc"):
+        with pytest.warns(UnexplainedPerson, match=f"actions of {first} are not explained"):
+            mirror_ppl.Communicator(source, first)
+        mirror_ppl.Communicator(source, second)
 
 
 def test_some_people_are_fitted(tmp_path, monkeypatch, capsys):

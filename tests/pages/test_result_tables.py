@@ -11,6 +11,7 @@ from benchmarks import (
     hearing,
     highway_gap,
     highway_messages,
+    messages_of_kinds,
     model_check,
     planner_settings,
     pooling,
@@ -216,6 +217,13 @@ def test_tables_of_trust_are_what_their_rows_say():
     assert all(int(row["seed"]) < 100 for row in rows_in(hearing.ROWS))
     assert (checks["seed"] < 100).all()
     assert all(int(row["seed"]) >= 100 for row in rows_in(pooling.ROWS))
+
+
+def test_messages_to_drivers_of_other_kinds_are_what_their_rows_say():
+    page, rows = (DOCS / "communicator.md").read_text(), rows_in(messages_of_kinds.ROWS)
+    found = page.partition("<!-- kinds -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == messages_of_kinds.table(rows)
+    assert all(int(row["seed"]) < 100 for row in rows)
 
 
 def test_rows_of_a_calibration_take_the_place_of_those_that_were_there(rng):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -36,12 +36,14 @@ class PosteriorFile:
         attributes: attributes of the file: domain, setting, human model and so on.
         people: ids of the people.
         values: draws ``[S, P, ...]`` by name, in the units of the file.
+        verdicts: the model check's verdict on each person, by id; none if the file has none.
     """
 
     path: Path
     attributes: Mapping[str, str]
     people: tuple[str, ...]
     values: Mapping[str, np.ndarray]
+    verdicts: Mapping[str, str] = field(default_factory=dict)
 
     def draws(self, human: HumanModel, number: int | None = None) -> dict[str, Tensor]:
         """Values ``[S, P, 1, ...]`` of all sites of a human model.
@@ -155,7 +157,8 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
     """
     path = as_path(path)
     path = posterior_at(path)
-    group = read_results(path, "posterior")["posterior"]
+    groups = read_results(path, "posterior", "model_check")
+    group, checked = groups["posterior"], groups.get("model_check", {})
     try:
         attributes = {str(name): str(value) for name, value in group.attrs.items()}
         people = tuple(map(str, group["person"].values))
@@ -163,6 +166,8 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
             str(name): value.transpose("chain", "draw", "person", ...).values
             for name, value in group.data_vars.items()
         }
+        found = map(str, checked["verdict"].values) if "verdict" in checked else ()
+        verdicts = dict(zip(people, found, strict="verdict" in checked))
     except Exception as error:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     own = attributes.get("domain", "unknown")
@@ -172,4 +177,4 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
     values = {name: value.reshape(-1, *value.shape[2:]) for name, value in stacked.items()}
     if not values or min(len(value) for value in values.values()) == 0:
         raise PosteriorError(f"{path}: holds no draws")
-    return PosteriorFile(path, attributes, people, values)
+    return PosteriorFile(path, attributes, people, values, verdicts)
