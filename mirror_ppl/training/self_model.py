@@ -216,8 +216,6 @@ class _Trainer:
 
     def _learn(self) -> str:
         options = self.options
-        if options.regret_phases and self.phase < options.phases - options.regret_phases:
-            options = replace(options, regret_weight=0.0)
         exact = options.exact and offers(self.domain, "reference_values")
         course = self._course() if options.window else None
         actions = torch.cat(self.actions) if course is None else course.actions

@@ -60,8 +60,6 @@ class SelfModelOptions:
             are.
         regret_margin: regret that does not count. Without a margin the network would exaggerate
             all differences of values, as regret is least if the best choice is certain.
-        regret_phases: number of last phases in which regret counts; 0 for all. Values that are
-            learned before that remain more exact where no choice costs much.
         kinds: shares of full, dropout and sight views; see `mirror_ppl.training.views`.
         assumed: share of sight views in which each assumption is made. At 0 the robot does not
             learn what follows from assumptions; imagined items are then like seen ones to it. With
@@ -101,7 +99,6 @@ class SelfModelOptions:
     choice_weight: float = 0.0
     regret_weight: float = 0.0
     regret_margin: float = 0.0
-    regret_phases: int = 0
     kinds: tuple[float, float, float] = KIND_PROBABILITIES
     assumed: float = ASSUMPTION_PROBABILITY
     at_means: bool = False
@@ -131,8 +128,8 @@ class SelfModelOptions:
         for name in (*weights, "regret_margin"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be at least 0 and finite, not {getattr(self, name)}")
-        if min(self.window, self.length, self.regret_phases) < 0:
-            raise InputError("window, length and regret_phases must not be negative")
+        if self.window < 0 or self.length < 0:
+            raise InputError("window and length must not be negative")
         if self.distil and self.exact:
             raise InputError("distil and exact are two ways to learn a planner's values")
         for name in OF_CHOICES:

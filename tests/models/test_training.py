@@ -34,7 +34,6 @@ STEPS = DRIVING.horizon
     ("options", "message"),
     [
         ({"window": -1}, "must not be negative"),
-        ({"regret_phases": -1}, "must not be negative"),
         ({"distil": True}, "distil needs a window"),
         ({"distil": True, "window": 3, "exact": True}, "distil and exact are two ways"),
         ({"choice_weight": 1.0}, "choice_weight needs distil"),
@@ -142,23 +141,6 @@ def test_choices_are_learned_where_all_that_counts_is_known():
     assert 0 < (behind - 0.5).clamp(min=0).max() < behind.max()
     counted = (behind - 0.5).clamp(min=0)
     torch.testing.assert_close(far - without, 3 * torch.softmax(values, -1) @ counted)
-
-
-@pytest.mark.parametrize(("last", "weights"), [(0, [2, 2, 2]), (1, [0, 0, 2]), (5, [2, 2, 2])])
-def test_regret_counts_in_the_last_phases(last, weights, monkeypatch):
-    found = []
-
-    def noted(self_model, target, lived, options, means):
-        found.append(options.regret_weight)
-        return self_model_loss(self_model, target, lived, options, means)
-
-    monkeypatch.setattr(self_model_training, "self_model_loss", noted)
-    options = SelfModelOptions(
-        phases=3, rounds=2, steps=1, batch=2, window=3, distil=True, assumed=0.0
-    )
-    options = replace(options, regret_weight=2.0, regret_phases=last)
-    train_self_model(ShortDriving(), options, torch.Generator().manual_seed(0))
-    assert found == weights
 
 
 def test_bins_of_values_are_learned_by_cross_entropy():
