@@ -81,8 +81,8 @@ def play(
         reward += float(total_reward(world.rewards(state, action[None], following)))
         cost += float(channels.cost(sent))
         state = following
-        told = {name: mask[0] for name, mask in channels.split(sent).items()}
-        past = past.then(told, action, observed())
+        items = {name: mask[0] for name, mask in channels.split(sent).items()}
+        past = past.then(items, action, observed())
     return past, reward, cost
 
 

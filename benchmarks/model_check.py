@@ -3,10 +3,10 @@
     python -m benchmarks.model_check --out docs/results/model_check.csv
 
 People of several kinds, drawn from the prior of the human model but for what their kind says, drive
-in fog, 20 rounds to learn from and 6 held out. Counted are verdicts, the sight thresholds that the
-90% interval holds, of all people and of those with the verdict ``ok``, people of the verdict ``ok``
-of whom a 99% interval leaves a threshold out, and with the human model ``all`` of whom which of its
-models is the most probable one. Printed are the tables of docs/trust.md.
+in fog, 20 rounds to learn from and 6 held out. This counts verdicts; the sight thresholds that 90%
+intervals hold, of all people and of those who are ``ok``; people who are ``ok`` although a 99%
+interval leaves a threshold out; and, with the human model ``all``, which of its models is the most
+probable one. The tables of docs/trust.md are printed.
 """
 
 from __future__ import annotations

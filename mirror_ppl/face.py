@@ -30,7 +30,7 @@ from mirror_ppl.fitted import Fit, doubtful_people, one_of
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
 from mirror_ppl.inference.results import fitting
-from mirror_ppl.inference.results.criticism import UNEXPLAINED
+from mirror_ppl.inference.results.criticism import UNEXPLAINED, warning_of
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.inference.weighted import HIGH_PARETO_K
@@ -92,7 +92,8 @@ class Communicator(PlannedCommunicator):
         UnknownNameError: there is no such person, planner or setting.
 
     Warns:
-        UnexplainedPerson: the model check's verdict on the person is ``unexplained``.
+        UnexplainedPerson: the model check's verdict on the person is ``unexplained``; it never is
+            without held-out rounds.
     """
 
     def __init__(
@@ -109,22 +110,17 @@ class Communicator(PlannedCommunicator):
     ) -> None:
         if isinstance(fit, str | Path):
             saved = load_posterior(Path(fit))
-            name = one_of(saved.people, person, str(fit))
-            listener = _saved_person(saved, name, draws, human, self_model)
-            verdict = saved.verdicts.get(name)
+            own = one_of(saved.people, person, str(fit))
+            listener = _saved_person(saved, own, draws, human, self_model)
+            verdict = saved.verdicts.get(own)
         else:
             if not (human is None and self_model is None):
                 raise InputError("human and self_model are for a saved posterior; a fit has both")
             fitted = require_kind(fit, Fit, "fit").person(person)
-            name, verdict = fitted.name, fitted.summary["check"]["verdict"]
+            own, verdict = fitted.name, fitted.summary["check"]["verdict"]
             listener = fitted.listener(draws)
         if verdict == UNEXPLAINED:
-            warnings.warn(
-                f"the actions of {name} are not explained by the human model (verdict "
-                f"{UNEXPLAINED}): messages that are planned with it may do harm",
-                UnexplainedPerson,
-                stacklevel=2,
-            )
+            warnings.warn(warning_of([own]), UnexplainedPerson, stacklevel=2)
         known = [field.name for field in fields(PlannerOptions)]
         for name in settings:
             require_known(name, "setting", known)

@@ -159,7 +159,7 @@ def main(options: Options) -> None:
         raise PosteriorError(
             f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
         )
-    _say_who_is_unexplained(posterior, number)
+    _warn_of_unexplained_people(posterior, number)
     pairing = _pairing(options, posterior, source)
     pairing.check()
     chosen = _possible(options, chosen, pairing)
@@ -219,18 +219,14 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
     )
 
 
-def _say_who_is_unexplained(posterior: PosteriorFile, number: int) -> None:
-    """Print whose actions, of the first people, the model does not explain."""
-    from mirror_ppl.inference.results.criticism import UNEXPLAINED
+def _warn_of_unexplained_people(posterior: PosteriorFile, number: int) -> None:
+    """Print who of the first people is not explained by the human model."""
+    from mirror_ppl.inference.results.criticism import UNEXPLAINED, warning_of
 
     people = posterior.people[:number]
     some = [name for name in people if posterior.verdicts.get(name) == UNEXPLAINED]
     if some:
-        print(
-            f"the actions of {', '.join(some)} are not explained by the human model (verdict "
-            f"{UNEXPLAINED}): messages that are planned with it may do harm",
-            file=sys.stderr,
-        )
+        print(warning_of(some), file=sys.stderr)
 
 
 def _possible(options: Options, chosen: tuple[str, ...], pairing: Pairing) -> tuple[str, ...]:

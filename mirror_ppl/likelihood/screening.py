@@ -42,6 +42,6 @@ class Screening:
             if not getattr(self, name) >= least:
                 raise InputError(f"{name} must be at least {least}, not {getattr(self, name)}")
 
-    def margin_after(self, rounds: float) -> float:
-        """Return the margin after some rounds; with none, that of the first."""
-        return self.margin + self.early / max(rounds, 1.0)
+    def margin_after(self, rounds: int) -> float:
+        """Return the margin after some rounds."""
+        return self.margin + self.early / rounds

@@ -303,7 +303,7 @@ class HumanModel(nn.Module):
             belief: ``[..., P, B, Z]``.
             values: the self-model's action values at the belief, ``[..., P, B, A]``.
         """
-        # The residual is laid out in memory for what follows.
+        # The sum has the residual's layout in memory, with which softmax_of_few is fast.
         residual = implant_priors.residual(implants, belief)
         logits = torch.addcmul(residual, implants["consistency"][..., None], values)
         chosen = log_softmax_with_lapse(logits, implants["lapse"][..., None])

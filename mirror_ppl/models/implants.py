@@ -262,20 +262,24 @@ def residual(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
     """Return ``delta(zH_t)`` ``[..., P, B, A]`` of beliefs ``[..., P, B, Z]``; 0 if not sampled."""
     if "residual_in" not in implants:
         return belief.new_zeros(())
-    return _layer(implants["residual_out"], torch.tanh(_layer(implants["residual_in"], belief)))
+    return _layer(implants["residual_out"], _hidden(implants, belief))
 
 
 def residual_features(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
     """Return the features that ``residual_out`` weighs, ``[..., P, B, R + 1]``."""
-    hidden = torch.tanh(_layer(implants["residual_in"], belief))
-    return torch.nn.functional.pad(hidden, [0, 1], value=1.0)
+    return torch.nn.functional.pad(_hidden(implants, belief), [0, 1], value=1.0)
+
+
+def _hidden(implants: Mapping[str, Tensor], belief: Tensor) -> Tensor:
+    """Return the hidden layer of the residual's network, ``[..., P, B, R]``."""
+    return torch.tanh(_layer(implants["residual_in"], belief))
 
 
 def _layer(weights: Tensor, inputs: Tensor) -> Tensor:
     """Apply per-person linear weights ``[..., P, 1, I + 1, O]`` to inputs ``[..., P, B, I]``.
 
-    With draws, outputs of one unit for all beliefs are next to each other in memory: products and
-    sums over few units or actions are several times as fast then.
+    Outputs of a unit for all beliefs are next to each other in memory, so that products and sums
+    over few units or actions are fast.
     """
     if weights.dim() > 2 and weights.shape[-3] == 1:
         # The rounds of a person share the weights: one product for all of them.

@@ -36,9 +36,10 @@ START = 0.05
 *e*, as a share of the range of values."""
 TINY = 1e-30
 """Least probability whose logarithm is taken."""
-AT_ONCE, BLOCK = 1536, 32
-"""Action values that are computed at once, so that layers fit into a processor's cache, and the
-number of which the latents of these are a multiple, as processors round rows of a block alike."""
+AT_ONCE = 1536
+"""Largest number of action values that are computed at once, so that layers fit into a cache."""
+BLOCK = 32
+"""Parts have a multiple of so many latents, so that rounding does not depend on the split."""
 
 
 class Gaussian(NamedTuple):
@@ -276,17 +277,21 @@ class QNetwork(nn.Module):
         first = torch.relu(self.latent(latent)[..., None, :] + self.action.weight)
         return self.value(self.body(first))
 
-    def values(self, latent: Tensor) -> Tensor:
-        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``, all at once."""
+    def values_at_once(self, latent: Tensor) -> Tensor:
+        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
         return self.output(latent).squeeze(-1)
 
     def forward(self, latent: Tensor) -> Tensor:
-        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
+        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``.
+
+        Of many latents they are computed in parts, which is faster on a processor; not in training,
+        which needs all of them in memory.
+        """
         size = max(1, AT_ONCE // self.action.num_embeddings // BLOCK) * BLOCK
         rows = math.prod(latent.shape[:-1])
         if torch.is_grad_enabled() or latent.device.type != "cpu" or rows <= size:
-            return self.values(latent)
-        parts = [self.values(part) for part in latent.reshape(rows, -1).split(size)]
+            return self.values_at_once(latent)
+        parts = [self.values_at_once(part) for part in latent.reshape(rows, -1).split(size)]
         return torch.cat(parts).view(*latent.shape[:-1], -1)
 
 
@@ -328,8 +333,8 @@ class BinnedQNetwork(QNetwork):
         """Return the values ``[..., A]`` of distributions ``[..., A, V]``."""
         return log_probabilities.exp() @ self.centres
 
-    def values(self, latent: Tensor) -> Tensor:
-        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``, all at once."""
+    def values_at_once(self, latent: Tensor) -> Tensor:
+        """Return values of all actions ``[..., A]`` at ``latent`` ``[..., Z]``."""
         return torch.softmax(self.output(latent), -1) @ self.centres
 
     def target(self, values: Tensor) -> Tensor:

@@ -124,3 +124,36 @@ def test_every_discrete_implant_changes_the_likelihood(human, recordings):
     for axis, site in enumerate(table.sites, start=1):
         spread = joint.amax(axis) - joint.amin(axis)
         assert spread.flatten(1).amax(1).min() > 0.5, site
+
+
+@pytest.mark.parametrize("draws", [(), (0,), (3,)])
+@pytest.mark.parametrize(("people", "rounds"), [(1, 1), (1, 5), (2, 1), (2, 5)])
+@pytest.mark.parametrize("own", [False, True])
+def test_the_residual_is_a_network_of_two_layers(draws, people, rounds, own, generator):
+    """By hand, with beliefs that draws share or of their own, and its gradients."""
+
+    def drawn(*shape):
+        return torch.randn(shape, generator=generator, dtype=torch.float64).requires_grad_()
+
+    weights = {
+        "residual_in": drawn(*draws, people, 1, LATENT + 1, RESIDUAL_HIDDEN),
+        "residual_out": drawn(*draws, people, 1, RESIDUAL_HIDDEN + 1, ACTIONS),
+    }
+    belief = drawn(*(draws if own else ()), people, rounds, LATENT)
+
+    def layer(weight, inputs):
+        weight = weight.squeeze(-3)
+        product = torch.einsum("...pbi,...pio->...pbo", inputs, weight[..., :-1, :])
+        return product + weight[..., -1:, :]
+
+    expected = layer(weights["residual_out"], torch.tanh(layer(weights["residual_in"], belief)))
+    found = residual(weights, belief)
+    torch.testing.assert_close(found, expected)
+    inputs = [belief, *weights.values()]
+    some = torch.randn(found.shape, generator=generator, dtype=torch.float64)
+    for one, other in zip(
+        torch.autograd.grad((found * some).sum(), inputs),
+        torch.autograd.grad((expected * some).sum(), inputs),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other)

@@ -110,13 +110,13 @@ def test_binned_q_network_has_an_output_for_each_bin():
 )
 def test_many_values_are_computed_in_parts(network, shape, parts, monkeypatch):
     """1,536 values at once are those of 307 latents, rounded down to blocks of 32."""
-    sizes, values = [], type(network).values
+    sizes, values = [], type(network).values_at_once
 
     def noted(self, latent):
         sizes.append(latent.shape[:-1].numel())
         return values(self, latent)
 
-    monkeypatch.setattr(type(network), "values", noted)
+    monkeypatch.setattr(type(network), "values_at_once", noted)
     z = torch.randn(*shape, 7, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         found = network(z)

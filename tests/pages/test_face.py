@@ -303,7 +303,7 @@ def test_unreliable_weights_are_reported(fit, recordings, monkeypatch):
     assert repr(found.person()) == "FittedPerson(person-01: 3 rounds; weights not to be relied on)"
 
 
-def test_planning_for_somebody_unexplained_is_warned_of(fit, tmp_path):
+def test_planning_for_an_unexplained_person_warns(fit, tmp_path):
     """From a fit and from its file; of others nothing is said."""
     summary = deepcopy(fit.summary)
     summary["people"][0]["check"]["verdict"] = "unexplained"

@@ -8,7 +8,7 @@ robot itself, without implants.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,6 +99,14 @@ def verdict(found: Mapping[str, float], lead: Tensor | None, actions: int = 1) -
                 "often each was chosen before"
             )
     return Verdict(word, tuple(reasons))
+
+
+def warning_of(people: Sequence[str]) -> str:
+    """Return what to say to those who plan messages for people who are not explained."""
+    return (
+        f"the actions of {', '.join(people)} are not explained by the human model (verdict "
+        f"{UNEXPLAINED}): messages that are planned with it may do harm"
+    )
 
 
 def _says(name: str, more: bool) -> str:
