@@ -364,3 +364,17 @@ def test_merging_moments_hardly_changes_anything(defuser):
     exact, merged = (log_joints(defuser, table, policy) for table in tables)
     # Twelve steps, each up to half a grid's width off under the ways that are compared.
     assert (exact - merged).abs().max() < 12 * 0.03
+
+
+def test_screening_counts_the_rounds_that_were_added_together(defuser, monkeypatch):
+    counted, margin_after = [], Screening.margin_after
+
+    def noted(self, rounds):
+        counted.append(rounds)
+        return margin_after(self, rounds)
+
+    monkeypatch.setattr(Screening, "margin_after", noted)
+    builder = ViewTableBuilder(defuser, Screening())
+    for _ in range(2):
+        builder.add(rounds_of(recorded(), 0))
+    assert counted == [len(ACTIONS), 2 * len(ACTIONS)]
