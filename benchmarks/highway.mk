@@ -44,8 +44,8 @@ $(HIGHWAY)/reach.txt: $(HIGHWAY)/highway_0/posterior.nc $(HIGHWAY)/highway_1/pos
 	mv $@.new $@
 
 $(HIGHWAY)/gap.txt: $(HIGHWAY)/highway_0/posterior.nc $(HIGHWAY)/ten/posterior.nc
-	$(ONE) benchmarks.highway_gap $< > $@.new
-	$(ONE) benchmarks.highway_gap $< --receive mirror --rounds 2 > $@.new
+	$(ONE) benchmarks.highway_gap $<
+	$(ONE) benchmarks.highway_gap $< --receive mirror --rounds 2
 	$(ONE) benchmarks.highway_gap $(lastword $^) --receive mirror --rounds 4 --seed 1 > $@.new
 	mv $@.new $@
 

@@ -25,7 +25,7 @@ from torch import Tensor
 
 import mirror_ppl
 from benchmarks._rows import rows_in
-from benchmarks.model_check import kinds
+from benchmarks.model_check import drawn_implants, kinds
 from mirror_ppl.communication.messages import Channels
 from mirror_ppl.communication.objectives import predicted_choices
 from mirror_ppl.communication.person import Person, PlanningContext
@@ -34,7 +34,6 @@ from mirror_ppl.domains.base import total_reward
 from mirror_ppl.evaluation.study_summary import interval
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.family import HardOfHearing
-from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.simulation import play_rounds
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -98,13 +97,7 @@ def measured(
         seed: of the drivers and rounds.
         fitted: name of the human model that is fitted and planned with.
     """
-    implants = {site: value[0] for site, value in draw_prior(human, PEOPLE, 1, seed).items()}
-    implants |= {
-        site: torch.full_like(implants[site], value)
-        if site in implants
-        else torch.full((PEOPLE, 1), value)
-        for site, value in known.items()
-    }
+    implants = drawn_implants(human, known, PEOPLE, seed)
     generator = torch.Generator().manual_seed(seed)
     recordings = play_rounds(human, implants, LEARNED, "fog", generator)
     fit = mirror_ppl.infer(recordings, human=fitted, seed=seed, train_rounds=LEARNED, explore=0)
@@ -174,9 +167,8 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     self_model, _ = load_self_model(shipped_weights("driving"))
-    rows = rows_in(ROWS) if ROWS.exists() else []
+    rows, every = rows_in(ROWS) if ROWS.exists() else [], every_kind(self_model)
     for seed in given.seeds:
-        every = every_kind(self_model)
         for name in given.kinds or every:
             human, known = every[name]
             cell = name, given.human_model, str(seed)

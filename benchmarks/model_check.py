@@ -84,6 +84,14 @@ def kinds(self_model: SelfModel) -> dict[str, tuple[HumanModel, dict[str, float]
     }
 
 
+def drawn_implants(
+    human: HumanModel, known: dict[str, float], people: int, seed: int
+) -> dict[str, Tensor]:
+    """Draw implants ``[P, 1, ...]`` from a program's prior, but for values that are known."""
+    implants = {site: value[0] for site, value in draw_prior(human, people, 1, seed).items()}
+    return implants | {site: torch.full_like(implants[site], known[site]) for site in known}
+
+
 @dataclass(frozen=True)
 class Options:
     """What is measured.
@@ -185,9 +193,7 @@ def main(options: Options) -> None:
     every, asked = kinds(self_model), set()
     for kind, seed in itertools.product(options.kinds or every, options.seeds):
         human, known = every[kind]
-        drawn = draw_prior(human, options.people, 1, seed)
-        implants = {name: value[0] for name, value in drawn.items()}
-        implants |= {name: torch.full((options.people, 1), value) for name, value in known.items()}
+        implants = drawn_implants(human, known, options.people, seed)
         generator = torch.Generator().manual_seed(seed)
         recordings = play_rounds(human, implants, 26, "fog", generator)
         truth = reach(human.domain, implants)[:, 0]
@@ -213,7 +219,8 @@ def main(options: Options) -> None:
     table = pd.DataFrame(rows)
     cells = zip(table["kind"], table["seed"], table["human_model"], table["people"], strict=True)
     table = table[[cell in asked for cell in cells]]
-    print(verdict_table(table))
+    if "mirror" in options.human_models:
+        print(verdict_table(table))
     if {"mirror", "all"} <= set(options.human_models):
         print(model_table(table))
     if options.picture is not None:

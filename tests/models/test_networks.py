@@ -308,7 +308,7 @@ def test_softmax_of_few_is_that_of_torch(shape, generator):
 
 @pytest.mark.parametrize("least", [0.3, 8 * TINY, 2 * TINY, 1e-40, 0.0])
 def test_log_softmax_with_lapse_is_the_mixture(least, generator):
-    """Of four actions, some of which have no probability but that of a lapse."""
+    """Four actions, some of which are only done in a lapse."""
     logits = -80 * torch.rand(50, 4, generator=generator)
     logits[0] = torch.tensor([0.0, -500.0, -90.0, -100.0])
     logits.requires_grad_()

@@ -166,8 +166,9 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
             str(name): value.transpose("chain", "draw", "person", ...).values
             for name, value in group.data_vars.items()
         }
-        found = map(str, checked["verdict"].values) if "verdict" in checked else ()
-        verdicts = dict(zip(people, found, strict="verdict" in checked))
+        verdicts = {}
+        if "verdict" in checked:
+            verdicts = dict(zip(people, map(str, checked["verdict"].values), strict=True))
     except Exception as error:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     own = attributes.get("domain", "unknown")
