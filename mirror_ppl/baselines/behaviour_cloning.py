@@ -66,7 +66,6 @@ class BehaviourCloneOptions(TrainingOptions):
     .593 in smoke; in bomb defusal all values are equivalent.
 
     Attributes:
-        layer: units of the layer after the GRU (supplement: 32).
         full_decay_rounds: above this number of training rounds, weight decay falls in inverse
             proportion, as the weight of a fixed prior does. At 60 and 200 rounds (paper population)
             this was better on validation than the full decay.
@@ -77,10 +76,9 @@ class BehaviourCloneOptions(TrainingOptions):
     learning_rate: float = 0.03
     weight_decay: float = 6.0
     check_every: int = 3
-    layer: int = 32
     full_decay_rounds: int = 20
 
-    COUNTS = (*TrainingOptions.COUNTS, "layer", "full_decay_rounds")
+    COUNTS = (*TrainingOptions.COUNTS, "full_decay_rounds")
 
 
 class BehaviourClone(RecurrentNetworks):
@@ -137,7 +135,7 @@ def _initial_weights(
     """Weights ``[P, inputs, outputs]`` and biases ``[P, 1, outputs]`` of each layer by name."""
     domain = get_domain(train.domain)
     actions = len(domain.actions)
-    weights = initial_weights(domain, options.hidden, (options.layer,), generators)
+    weights = initial_weights(domain, options.hidden, options.layers, generators)
     chosen = torch.stack([(train.actions == action).sum((1, 2)) for action in range(actions)], -1)
     # One is added to each count, so that an action that was never taken is not impossible.
     weights["output_bias"] = ((chosen + 1) / (chosen + 1).sum(-1, True)).log()[:, None].cpu()

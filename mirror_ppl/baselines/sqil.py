@@ -59,7 +59,6 @@ class SoftQOptions(TrainingOptions):
     and every other run learned nothing.
 
     Attributes:
-        layers: units of the layers after the GRU (supplement: 32 each).
         reward: of the person's actions.
         discount: per step.
         target_rate: rate per gradient step at which the target network follows the trained one.

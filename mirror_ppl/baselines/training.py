@@ -32,7 +32,8 @@ class TrainingOptions:
 
     Attributes:
         sight: a name in ``SIGHTS``: which items the networks read.
-        hidden: units of the GRU (supplement: 48).
+        hidden: units of the GRU (supplement: 48, on the highway 128).
+        layers: units of each layer after it (supplement: 32 each, on the highway 128).
         learning_rate: of Adam.
         weight_decay: decoupled weight decay on all weights but biases, as in AdamW.
         epochs: most gradient steps; a step uses all training rounds, or ``batch`` of them.
@@ -43,6 +44,7 @@ class TrainingOptions:
 
     sight: Sight = "setting"
     hidden: int = 48
+    layers: tuple[int, ...] = (32,)
     learning_rate: float = 0.01
     weight_decay: float = 0.0
     epochs: int = 400
@@ -65,6 +67,8 @@ class TrainingOptions:
         for name in self.COUNTS:
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if min(self.layers, default=1) < 1:
+            raise InputError(f"layers must have at least 1 unit each, not {self.layers}")
         if not self.learning_rate > 0:
             raise InputError(f"learning_rate must be positive, not {self.learning_rate}")
         if not 0 <= self.weight_decay * self.learning_rate < 1:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import itertools
 import pyro
 import pyro.distributions as dist
 import pytest
@@ -193,26 +194,38 @@ def test_what_makes_no_sense_in_a_world_is_refused(name):
         load_human_model(name, self_model("bomb_defusal"))
 
 
-def test_late_follows_the_belief_before(driving):
+@pytest.mark.parametrize(
+    ("late", "shares"),
+    [
+        (0.0, (1, 0, 0, 0)),
+        (0.5, (0.5, 0.5, 0, 0)),
+        (1.0, (0, 1, 0, 0)),
+        (2.25, (0, 0, 0.75, 0.25)),
+        (3.0, (0, 0, 0, 1)),
+    ],
+)
+def test_late_follows_the_beliefs_of_so_many_steps_before(driving, late, shares):
     human, base = Late(driving), HumanModel(driving)
     implants = {name: value[0] for name, value in draw_prior(human, 1, 1, 3).items()}
     belief = beliefs(human, "driving")
-    now, before = belief.chunk(2, -1)
-    half = probabilities(human, implants | {LATE: torch.tensor([[0.5]])}, belief).exp()
-    both = [probabilities(base, implants, part).exp() for part in (now, before)]
-    torch.testing.assert_close(half, (both[0] + both[1]) / 2)
+    found = probabilities(human, implants | {LATE: torch.tensor([[late]])}, belief).exp()
+    each = [probabilities(base, implants, part).exp() for part in belief.chunk(4, -1)]
+    expected = sum(share * own for share, own in zip(shares, each, strict=True))
+    torch.testing.assert_close(found, expected)
 
 
-def test_the_belief_before_is_kept(driving):
+def test_the_beliefs_before_are_kept(driving):
     human, base = Late(driving), HumanModel(driving)
-    evidence = torch.randn(2, 3, driving.encoder.ego.out_features)
-    first, second = torch.full((3,), len(human.domain.actions)), torch.zeros(3, dtype=torch.long)
-    one = base.believe(torch.zeros(3, base.belief_size), evidence[0], first).mean
-    other = base.believe(one, evidence[1], second).mean
-    found = human.believe(torch.zeros(3, human.belief_size), evidence[0], first)
-    torch.testing.assert_close(found, torch.cat([one, one], -1))
-    found = human.believe(found, evidence[1], second)
-    torch.testing.assert_close(found, torch.cat([other, one], -1))
+    evidence = torch.randn(5, 3, driving.encoder.ego.out_features)
+    action = torch.full((3,), len(human.domain.actions))
+    own, found = torch.zeros(3, base.belief_size), torch.zeros(3, human.belief_size)
+    kept = []
+    for now in evidence:
+        own, found = base.believe(own, now, action).mean, human.believe(found, now, action)
+        kept = [own, *(kept or [own] * 3)][:4]
+        torch.testing.assert_close(found, torch.cat(kept, -1))
+        action = torch.zeros(3, dtype=torch.long)
+    assert not any(torch.equal(*pair) for pair in itertools.pairwise(kept))
 
 
 def test_who_shares_no_goal_does_not_look_at_values(driving):

@@ -41,7 +41,7 @@ def test_variants_keep_the_contract(self_model, name):
     human = load_human_model(name, self_model)
     check_contract(human)
     assert human.domain.name == "driving"
-    beliefs = {"late": 2, "noticing": 4, "forgetting": 4, "all": 8}
+    beliefs = {"late": 4, "noticing": 4, "forgetting": 4, "all": 10}
     assert human.belief_size == beliefs.get(name, 1) * self_model.latent
 
 

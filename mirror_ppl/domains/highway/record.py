@@ -2,6 +2,8 @@
 
 from mirror_ppl.domains.record import Record
 
+SUPPLEMENT = {"hidden": 128, "layers": (128, 128, 128)}
+"""Networks of baselines as in the supplement."""
 RECORD = Record(
     networks={
         "latent": 128,
@@ -41,4 +43,5 @@ RECORD = Record(
     people="mirror_ppl.domains.highway.participants:DRIVERS",
     pictures="mirror_ppl.domains.highway.sight:PICTURES",
     planning={"predict_with": "values", "items": 2},
+    baselines={"bc": SUPPLEMENT, "sqil": SUPPLEMENT},
 )

@@ -1,4 +1,4 @@
-"""A model of people who act a step late."""
+"""A model of people who act on what they believed one or more steps before."""
 
 from __future__ import annotations
 
@@ -11,36 +11,44 @@ from mirror_ppl.models.family.several import NOW, SeveralBeliefs
 from mirror_ppl.models.human import Implants
 
 LATE = "late"
-"""Site of the probability of acting on the belief of the step before."""
-BEFORE = "before"
-"""The belief of the step before."""
+"""Site of the number of steps by which a person is late, which need not be whole."""
+BEFORE = ("before 1", "before 2", "before 3")
+"""Beliefs of one to three steps before."""
 
 
 class Late(SeveralBeliefs):
-    """Acts at most steps on the belief of the step before; a first step has only its own::
+    """Acts up to three steps late::
 
-    late_p ~ Beta(4, 1)
-    a_t    ~ (1 - late) p(a | zH_t) + late p(a | zH_{t-1})
+    late_p / 3 ~ Beta(2, 2)
+    a_t        ~ sum_{n<=3} max(0, 1 - |late - n|) p(a | zH_{t-n})
+
+    So a person who is 1.2 steps late acts four times of five on the belief of the step before, and
+    otherwise on that of two steps before. The first belief of a round stands for earlier ones.
     """
 
     @property
     def beliefs(self) -> tuple[str, ...]:
-        """Names of the beliefs, with that of the step before."""
-        return (*super().beliefs, BEFORE)
+        """Names of the beliefs, with those of the steps before."""
+        return (*super().beliefs, *BEFORE)
 
     def prior(self) -> dict[str, Tensor]:
-        """Sample the implants of every person, with the probability ``late``."""
+        """Sample the implants of every person, with the number of steps ``late``."""
         one = next(self.self_model.parameters()).new_ones(())
-        return super().prior() | {LATE: pyro.sample(LATE, dist.Beta(4 * one, one))}
+        lateness = dist.AffineBeta(2 * one, 2 * one, 0 * one, len(BEFORE) * one)
+        return super().prior() | {LATE: pyro.sample(LATE, lateness)}
 
     def after(self, before, evidence, action, still) -> dict[str, Tensor]:
-        """Return the beliefs after one step, and the belief before it."""
+        """Return the beliefs after one step, and those before it."""
         found = super().after(before, evidence, action, still)
         first = (action == len(self.domain.actions))[..., None]
-        return found | {BEFORE: torch.where(first, found[NOW], before[NOW])}
+        for name, later in zip(BEFORE, (NOW, *BEFORE[:-1]), strict=True):
+            found[name] = torch.where(first, found[NOW], before[later])
+        return found
 
     def shares(self, implants: Implants) -> dict[str, Tensor]:
         """Return the probabilities of acting on each belief."""
         found = super().shares(implants)
-        late = found[NOW] * implants[LATE]
-        return found | {NOW: found[NOW] - late, BEFORE: late}
+        now, late = found[NOW], implants[LATE]
+        for steps, name in enumerate((NOW, *BEFORE)):
+            found[name] = now * (1 - (late - steps).abs()).clamp(min=0)
+        return found
