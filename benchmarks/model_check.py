@@ -75,7 +75,8 @@ def kinds(self_model: SelfModel) -> dict[str, tuple[HumanModel, dict[str, float]
     own = HumanModel(self_model)
     return {
         "as modelled": (own, {}),
-        "a step late": (Late(self_model), {"late": 0.99}),
+        "a step late": (Late(self_model), {"late": 1.0}),
+        "two steps late": (Late(self_model), {"late": 2.0}),
         "notices half": (NoticesHalf(self_model), {}),
         "mostly forgets": (Forgetting(self_model), {"forgets": 0.8}),
         "dislikes switching": (Staying(self_model), {}),

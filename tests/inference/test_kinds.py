@@ -56,10 +56,10 @@ def test_kinds_are_weighed_by_evidence_and_implants_are_those_of_each(job, found
                 torch.testing.assert_close(
                     found.draws[site][rows, person], value[rows, person], rtol=0, atol=0
                 )
-        # Lateness of those who are of another kind is as before: Beta(4, 1) has the mean .8 and
-        # the standard deviation .163.
+        # Lateness of those who are of another kind is as before: 3 times Beta(2, 2) has the
+        # mean 1.5 and the standard deviation 3 / 20**.5.
         others = found.draws[LATE][kinds != 1, person]
-        assert abs(float(others.mean()) - 0.8) < 4 * 0.163 / len(others) ** 0.5
+        assert abs(float(others.mean()) - 1.5) < 4 * 3 / (20 * len(others)) ** 0.5
 
 
 def test_what_is_probable_of_a_probable_kind_is_probable(job, found):

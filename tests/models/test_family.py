@@ -1,8 +1,8 @@
 """The family of human models: each by itself, and all of them as one program."""
 
+import itertools
 from dataclasses import replace
 
-import itertools
 import pyro
 import pyro.distributions as dist
 import pytest
