@@ -51,34 +51,57 @@ def human_and_rounds(domain, setting, people):
     return human, recordings
 
 
-def plan():
-    """Milliseconds of decisions with the default settings, in recorded moments of one driver."""
-    from mirror_ppl.communication import Communicator, ExpectedUtility, RoundSoFar
-
-    human, recordings = human_and_rounds("driving", "fog", 1)
-    options = named("InferenceOptions")(draws=64)
-    posterior = named("fit_people")(human, recordings, options, seed=0).posterior
-    person = named("Person")(human, posterior.draws)
+def planner(human, recordings, draws=64, seed=0, **settings):
+    """A communicator for one recorded driver, who is fitted first; settings of the objective."""
     import mirror_ppl.communication as communication
 
+    options = named("InferenceOptions")(draws=draws)
+    posterior = named("fit_people")(human, recordings, options, seed=seed).posterior
+    person = named("Person")(human, posterior.draws)
     dynamics = next(
         getattr(communication, name)
         for name in ("SimulatorDynamics", "SimulatorWorld")
         if hasattr(communication, name)
     )
-    communicator = Communicator(person, ExpectedUtility(dynamics(human.domain)))
-    observation, seconds = recordings.observation(), []
-    for place in range(MOMENTS):
-        number, step = ROUNDS + place % 10, place * 7 % human.domain.horizon
-        past = RoundSoFar(
-            {name: value[0, number, : step + 1] for name, value in observation.items()},
-            recordings.actions[0, number, :step],
-            {name: mask[0, number, :step] for name, mask in recordings.told.items()},
+    objective = communication.ExpectedUtility(dynamics(human.domain), **settings)
+    return communication.Communicator(person, objective)
+
+
+def moments(recordings, number):
+    """Moments of one driver's rounds that were not learned from."""
+    from mirror_ppl.communication import RoundSoFar
+
+    observation = recordings.observation()
+    for place in range(number):
+        index, step = ROUNDS + place % 10, place * 7 % recordings.actions.shape[-1]
+        yield RoundSoFar(
+            {name: value[0, index, : step + 1] for name, value in observation.items()},
+            recordings.actions[0, index, :step],
+            {name: mask[0, index, :step] for name, mask in recordings.told.items()},
         )
+
+
+def plan():
+    """Milliseconds of decisions with the default settings, in recorded moments of one driver."""
+    human, recordings = human_and_rounds("driving", "fog", 1)
+    communicator, seconds = planner(human, recordings), []
+    for past in moments(recordings, MOMENTS):
         began = perf_counter()
         communicator.plan(past)
         seconds.append(perf_counter() - began)
     return {"median_ms": 1e3 * median(seconds[1:]), "slowest_ms": 1e3 * max(seconds[1:])}
+
+
+def decide(people, each):
+    """Messages with the default settings, as flags of items, in recorded moments of drivers."""
+    human, recordings = human_and_rounds("driving", "fog", people)
+    found = []
+    for name in recordings.people:
+        own = recordings.select_people([name])
+        communicator = planner(human, own)
+        for past in moments(own, each):
+            found.append(communicator.plan(past).flags.int().tolist())
+    return {"flags": found}
 
 
 def add(domain, setting, network):
@@ -104,7 +127,12 @@ def main():
     """Measure what the command line names."""
     torch.set_num_threads(1)
     what, *arguments = sys.argv[1:]
-    found = plan() if what == "plan" else add(arguments[0], arguments[1], arguments[2] == "network")
+    if what == "plan":
+        found = plan()
+    elif what == "decide":
+        found = decide(*map(int, arguments))
+    else:
+        found = add(arguments[0], arguments[1], arguments[2] == "network")
     print(json.dumps(found))
 
 
