@@ -96,7 +96,10 @@ def main(options: Options) -> None:
     print(f"decisions: {gains.size}, of which {int(differ.sum())} differ")
     print(f"messages here: {int(here.any(-1).sum())}, there: {int(there.any(-1).sum())}")
     print(f"of those that differ, better here: {(gains > 0).sum()}, there: {(gains < 0).sum()}")
-    print(f"gain of a decision here: {gain.mean:.4f} [{gain.low:.4f}, {gain.high:.4f}] units of reward")
+    print(
+        f"gain of a decision here: {gain.mean:.4f} [{gain.low:.4f}, {gain.high:.4f}], "
+        "in units of reward"
+    )
 
 
 if __name__ == "__main__":
