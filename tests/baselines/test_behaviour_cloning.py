@@ -6,11 +6,14 @@ from example_rounds import alternate, anything, avoid, ragged, rounds_of
 
 from mirror_ppl.baselines import (
     BehaviourCloneOptions,
+    SoftQOptions,
     fit_behaviour_clone,
     held_out_nll,
     input_size,
 )
+from mirror_ppl.baselines.recurrent import initial_weights
 from mirror_ppl.data import concatenate
+from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.driving import FOG_REACH, ROAD_END, SWITCH, Driving
 from mirror_ppl.errors import DemonstrationsError, UnknownNameError
 
@@ -226,6 +229,7 @@ def test_refuses_people_that_it_does_not_know(random_clone, generator):
     [
         ({"epochs": 0}, "epochs must be at least 1"),
         ({"patience": 0}, "patience must be at least 1"),
+        ({"layers": (32, 0)}, r"layers must have at least 1 unit each, not \(32, 0\)"),
         ({"learning_rate": 0.0}, "learning_rate must be positive"),
         ({"weight_decay": -1.0}, "weight_decay must not be negative"),
         ({"weight_decay": float("nan")}, "weight_decay must not be negative"),
@@ -235,6 +239,24 @@ def test_refuses_people_that_it_does_not_know(random_clone, generator):
 def test_options_refuse_impossible_values(wrong, message):
     with pytest.raises(ValueError, match=message):
         BehaviourCloneOptions(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("domain", "options", "units"),
+    [
+        ("driving", BehaviourCloneOptions, [48, 32]),
+        ("driving", SoftQOptions, [48, 32, 32, 32]),
+        ("highway", BehaviourCloneOptions, [128, 128, 128, 128]),
+        ("highway", SoftQOptions, [128, 128, 128, 128]),
+    ],
+)
+def test_networks_have_the_sizes_of_the_supplement(domain, options, units, generator):
+    """Section D: the GRU's units, then those of each layer."""
+    chosen, world = options.of(domain), get_domain(domain)
+    weights = initial_weights(world, chosen.hidden, chosen.layers, [generator])
+    before = [weights[name].shape[1] for name in weights if name.startswith("layer_")][::2]
+    assert [*before, weights["output"].shape[1]] == units
+    assert weights["recurrent"].shape[1] == units[0]
 
 
 def test_options_refuse_unknown_sights():

@@ -2,8 +2,8 @@
 
 from mirror_ppl.domains.record import Record
 
-SUPPLEMENT = {"hidden": 128, "layers": (128, 128, 128)}
-"""Networks of baselines as in the supplement."""
+BASELINE_SIZES = {"hidden": 128, "layers": (128, 128, 128)}
+"""Networks of baselines, as in the supplement."""
 RECORD = Record(
     networks={
         "latent": 128,
@@ -43,5 +43,8 @@ RECORD = Record(
     people="mirror_ppl.domains.highway.participants:DRIVERS",
     pictures="mirror_ppl.domains.highway.sight:PICTURES",
     planning={"predict_with": "values", "items": 2},
-    baselines={"bc": SUPPLEMENT, "sqil": SUPPLEMENT},
+    baselines={
+        "bc": {**BASELINE_SIZES, "learning_rate": 0.01, "weight_decay": 1.0},
+        "sqil": BASELINE_SIZES,
+    },
 )
