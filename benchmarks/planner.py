@@ -1,17 +1,21 @@
 """How long a decision takes: this planner, and the settings of the released one.
 
     python -m benchmarks.planner
+    python -m benchmarks.planner --domain highway
 
-Both run on the same networks, in the same process, with two threads. The planner here: 64 posterior
-draws, every candidate message, horizon 6. The released settings: the cross-entropy method with 3
-iterations of 1,000 sequences of messages, each rolled 8 steps through transition, decoders, encoder
-and policy, with one fixed person. Decisions are those of rounds in fog, each made four times, of
-which the quickest counts.
+Both run on the same networks, in the same process, with two threads. The planner here has 64
+posterior draws: that of the domain, in single moments of rounds and step by step through rounds, as
+in the loop of a robot, and in driving some others. The released settings: the cross-entropy method
+with 3 iterations of 1,000 sequences of messages, each rolled 8 steps through transition, decoders,
+encoder and policy, with one fixed person. Decisions are those of rounds in fog of a driver whose
+sight was inferred from 20 other rounds. Those of single moments are made four times each, of which
+the quickest counts.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
 from time import perf_counter
@@ -19,6 +23,7 @@ from time import perf_counter
 import torch
 import tyro
 
+import mirror_ppl
 from mirror_ppl.communication import (
     Channels,
     Communicator,
@@ -31,20 +36,19 @@ from mirror_ppl.communication import (
     SelfModelWorld,
     SimulatorWorld,
 )
-from mirror_ppl.data import asset_path, load_demonstrations
-from mirror_ppl.inference.svi import SVIOptions, fit_implants
-from mirror_ppl.likelihood.compiled import compile
-from mirror_ppl.likelihood.screening import Screening
-from mirror_ppl.models import HumanModel, SelfModel
-from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.communication.planners import PlannerOptions, planner_of
+from mirror_ppl.data import Demonstrations
+from mirror_ppl.models import SelfModel
 
-RUNS = 4
+LEARNED, ROUNDS, RUNS = 20, 6, 4
 
 
 @dataclass(frozen=True)
 class Options:
     """What to time."""
 
+    domain: str = "driving"
+    """World, driving or highway; the setting is fog."""
     draws: int = 64
     """Posterior draws."""
     decisions: int = 30
@@ -54,36 +58,32 @@ class Options:
 
 
 def main(options: Options) -> None:
+    """Time decisions, and print the table."""
     torch.set_num_threads(options.threads)
-    recordings = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    recordings = recordings.select_people([recordings.people[0]])
-    self_model, _ = load_self_model(shipped_weights("driving"))
-    human = HumanModel(self_model)
-    learned = recordings.select_rounds(list(range(20)))
-    compiled = compile(human, learned, screening=Screening())
-    posterior = fit_implants(compiled, SVIOptions(), options.draws, 0)
-    person = Person(human, posterior.draws)
-    pasts = moments(recordings, options.decisions)
-    channels = Channels(human.domain)
-    counts = [2 ** int(channels.join(human.domain.communicable(past.now)).sum()) for past in pasts]
+    recordings = mirror_ppl.load_recordings(domain=options.domain, setting="fog").select_people([0])
+    fit = mirror_ppl.infer(recordings, draws=options.draws, train_rounds=LEARNED, explore=0)
+    person = Person(fit.human, fit.posterior.draws)
+    domain, self_model = fit.human.domain, fit.human.self_model
+    held_out = recordings.select_rounds(slice(LEARNED, None))
+    pasts = moments(held_out, options.decisions)
+    channels = Channels(domain)
+    counts = [2 ** int(channels.join(domain.communicable(past.now)).sum()) for past in pasts]
     print(
-        f"{options.draws} draws, {person.percept_count} distinct ways to see; candidates: median "
-        f"{median(counts):.0f}, largest {max(counts)}; {options.threads} threads",
+        f"{options.draws} draws, {person.percept_count} distinct ways to see; messages: median "
+        f"{median(counts):.0f}, most {max(counts)}; {options.threads} threads",
         file=sys.stderr,
     )
-    simulator = SimulatorWorld(human.domain)
-    planners = {
-        "every message, simulator": (simulator, Exhaustive(), 6),
-        "every message, self-model": (SelfModelWorld(self_model), Exhaustive(), 6),
-        "and plans of 3 steps": (simulator, Patient(), 6),
-        "and horizon 10 (the default)": (simulator, Patient(), 10),
-        "cross-entropy, plans of 3 steps": (simulator, CrossEntropy(3), 6),
-    }
     times = {}
-    for name, (world, search, horizon) in planners.items():
-        planner = Communicator(person, ExpectedUtility(world, horizon), search)
-        number = 3 if isinstance(search, CrossEntropy) else len(pasts)
+    for name, planner in planners(options.domain, person).items():
+        number = 3 if isinstance(planner.search, CrossEntropy) else len(pasts)
         times[name] = [timed(lambda p=planner, x=past: p.plan(x)) for past in pasts[:number]]
+    # Beliefs are kept from step to step, so that each decision is made once.
+    companion = mirror_ppl.Communicator(fit)
+    times["the default, step by step, with hearing inferred"] = [
+        timed(lambda x=past: companion.plan(x), runs=1)
+        for number in range(ROUNDS)
+        for past in steps(held_out, number)
+    ]
     times["released settings: 3 x 1,000 sequences, 8 steps"] = [
         timed(lambda: released(self_model)) for _ in range(3)
     ]
@@ -92,26 +92,42 @@ def main(options: Options) -> None:
         print(f"{name:<50} {1e3 * median(values):>10.1f} {1e3 * max(values):>11.1f}")
 
 
-def moments(recordings, number: int) -> list[RoundSoFar]:
-    """Moments of recorded rounds, steps 0 to 9 in turn, with nothing told so far."""
-    observation = recordings.observation()
-    pasts = []
+def planners(domain: str, person: Person) -> dict[str, Communicator]:
+    """Planners by what the table calls them, the default last."""
+    found = {}
+    if domain == "driving":
+        simulator = SimulatorWorld(person.human.domain)
+        for name, world, search in (
+            ("every message, simulator", simulator, Exhaustive()),
+            ("every message, self-model", SelfModelWorld(person.human.self_model), Exhaustive()),
+            ("and plans of 3 steps", simulator, Patient()),
+            ("cross-entropy, plans of 3 steps", simulator, CrossEntropy(3)),
+        ):
+            found[name] = Communicator(person, ExpectedUtility(world, 6), search)
+    options = PlannerOptions.of(domain, hears=1.0)
+    return found | {"the default": planner_of("mirror", person, options, 0)}
+
+
+def steps(recordings: Demonstrations, number: int) -> list[RoundSoFar]:
+    """Moments of a recorded round, one after another."""
+    last = int((recordings.actions[0, number] >= 0).sum())
+    person = recordings.people[0]
+    return [RoundSoFar.of(recordings, person, number, step) for step in range(last)]
+
+
+def moments(recordings: Demonstrations, number: int) -> list[RoundSoFar]:
+    """Moments of recorded rounds, spread over their first halves, with no messages so far."""
+    found, half = [], recordings.actions.shape[-1] // 2
     for index in range(number):
-        round_number, step = index, index % 10
-        pasts.append(
-            RoundSoFar(
-                {name: value[0, round_number, : step + 1] for name, value in observation.items()},
-                recordings.actions[0, round_number, :step],
-                {name: mask[0, round_number, :step] for name, mask in recordings.told.items()},
-            )
-        )
-    return pasts
+        step = index * 7 % half
+        found.append(RoundSoFar.of(recordings, recordings.people[0], index % ROUNDS, step))
+    return found
 
 
-def timed(work) -> float:
+def timed(work: Callable[[], object], runs: int = RUNS) -> float:
     """Seconds of the quickest of some runs, so that what else the machine does hardly counts."""
     times = []
-    for _ in range(RUNS):
+    for _ in range(runs):
         began = perf_counter()
         work()
         times.append(perf_counter() - began)
