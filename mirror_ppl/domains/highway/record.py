@@ -45,6 +45,11 @@ RECORD = Record(
     planning={"predict_with": "values", "items": 2},
     baselines={
         "bc": {**BASELINE_SIZES, "learning_rate": 0.01, "weight_decay": 1.0},
-        "sqil": BASELINE_SIZES,
+        "sqil": {
+            **BASELINE_SIZES,
+            "learning_rate": 0.003,
+            "discount": 0.0,
+            "weight_decay": 1.0,
+        },
     },
 )
