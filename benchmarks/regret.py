@@ -60,23 +60,24 @@ def main(options: Options) -> None:
             fit.main(
                 fit.Options(setting=options.setting, population=options.population, out=folder)
             )
+    people = tuple(f"person-{number:02d}" for number in options.people)
     print(f"{'planner':<24} {'lost':>6} {'silent':>6} {'spoken':>6}")
     for horizon in options.horizons:
         for patience in options.patience:
             pairing = Pairing(
-                posterior, None, None, 64, options.setting, options.population, 0, 10,
+                posterior, None, None, 64, options.setting, options.population, 0, people,
                 options.rounds, PlannerOptions.of("driving", horizon=horizon, patience=patience),
                 options.seed, False,
             )  # fmt: skip
-            parts = torch.stack([lost(pairing, number - 1) for number in options.people]).mean(0)
+            parts = torch.stack([lost(pairing, person) for person in people]).mean(0)
             columns = " ".join(f"{part:>6.3f}" for part in (parts.sum(), *parts))
             print(f"horizon {horizon:>2}, plans of {patience}   {columns}", flush=True)
 
 
-def lost(pairing: Pairing, number: int) -> Tensor:
+def lost(pairing: Pairing, person: str) -> Tensor:
     """Units of reward that one person loses in a round: by silence, by messages ``[2]``."""
-    (listener,) = pairing.listeners([number])
-    say = speaker("mirror", listener, pairing.planner, pairing.seed + number)
+    (listener,) = pairing.listeners([person])
+    say = speaker("mirror", listener, pairing.planner, pairing.seed + pairing.numbers[person])
     flags, actions = [], None
 
     def noted(rounds: Sequence[RoundSoFar], truth: Truth):

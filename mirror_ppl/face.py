@@ -40,9 +40,7 @@ from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import (
     checked_base,
-    human_models_of,
     load_human_model,
-    model_name,
 )
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -320,12 +318,10 @@ def _saved_person(
     self_model: SelfModel | str | Path | None,
 ) -> Person:
     """Make the person to plan messages for from a posterior file."""
-    path, number = saved.path, saved.people.index(person)
+    number = saved.people.index(person)
     domain = saved.attributes["domain"]
     if human is None:
-        human = model_name(saved.attributes.get("human_model", "unknown"))
-        if human not in human_models_of(get_domain(domain)):
-            raise InputError(f"{path}: is of your own human model {human}; give it as human=")
+        human = saved.own_model("human=")
     model = _human(human, self_model, domain)
     held = len(next(iter(saved.values.values())))
     chosen = saved.draws(model, min(whole_number(draws, "draws", *LIMITS["draws"]), held))

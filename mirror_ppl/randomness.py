@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 import torch
 
 NUMBERED = re.compile(r"person-(0[1-9]|[1-9][0-9]{1,8})")
+"""Ids that the package gives to people, in whose order they are counted from 1."""
 
 
 def derived_generator(
@@ -24,6 +25,12 @@ def derived_generator(
     return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
 
 
+def number_of(person: str) -> int | None:
+    """Return the number, from 0, of a person whose id the package gave, such as ``person-01``."""
+    found = NUMBERED.fullmatch(person)
+    return int(found[1]) - 1 if found else None
+
+
 def person_seed(seed: int, person: str) -> int:
     """Return the seed of a person's draws, given that of the whole and the person's id.
 
@@ -31,9 +38,8 @@ def person_seed(seed: int, person: str) -> int:
     together, as by `svi` and `nuts`. Ids that the package gives, such as ``person-01``, are counted
     from 0; others are hashed.
     """
-    if found := NUMBERED.fullmatch(person):
-        number = int(found[1]) - 1
-    else:
+    number = number_of(person)
+    if number is None:
         number = int.from_bytes(hashlib.blake2b(person.encode(), digest_size=4).digest())
     return seed * 1_000_003 + number
 

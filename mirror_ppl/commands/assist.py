@@ -58,8 +58,8 @@ class Options:
     They are described in docs/communicator.md."""
     rounds: int = 20
     """Rounds of each person."""
-    people: int | None = None
-    """How many of the people, from the first on; all unless given."""
+    people: tuple[str, ...] = ()
+    """Ids of the people to assist, or how many of them, from the first on; all unless given."""
     draws: int = 64
     """Posterior draws that are planned with."""
     horizon: int | None = None
@@ -108,7 +108,7 @@ class Options:
     """Address of a Dask cluster that does the work instead, such as tcp://host:8786."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, "rounds", "people", "draws", "horizon", "patience", jobs=1)
+        check_numbers(self, "rounds", "draws", "horizon", "patience", jobs=1)
         check_numbers(self, "seed", "people_seed")
         if self.discount is not None and not 0 < self.discount <= 1:
             raise OptionError(f"--discount must be above 0 and at most 1, not {self.discount}")
@@ -154,17 +154,13 @@ def main(options: Options) -> None:
     outputs = _outputs(options)
     kept = options.json or options.log or options.film
     posterior, source = _people(options)
-    number = len(posterior.people) if options.people is None else options.people
-    if number > len(posterior.people):
-        raise PosteriorError(
-            f"{options.posterior}: is of {len(posterior.people)} people, not {number}"
-        )
-    _warn_of_unexplained_people(posterior, number)
-    pairing = _pairing(options, posterior, source)
+    people = _chosen(options, posterior.people)
+    _warn_of_unexplained_people(posterior, people)
+    pairing = _pairing(options, posterior, source, people)
     pairing.check()
     chosen = _possible(options, chosen, pairing)
     parts = None if kept is None else kept.with_name(f".{kept.name}.parts")
-    cells = turns(chosen, number)
+    cells = turns(chosen, people)
     with ExitStack() as stack:
         for path in outputs:
             own = [parts.name] if parts is not None and path == kept else []
@@ -177,7 +173,7 @@ def main(options: Options) -> None:
         summary = summarize_assistance(played, options.seed)
         write_together(_contents(options, posterior, pairing, played, summary))
         runner.clean()
-    print_assistance(summary, posterior.attributes, number, options.rounds)
+    print_assistance(summary, posterior.attributes, len(people), options.rounds)
     for path, what in (
         (options.json, "the numbers above"),
         (options.log, "every decision"),
@@ -187,7 +183,29 @@ def main(options: Options) -> None:
             print(f"{path}: {what}")
 
 
-def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, Any]) -> Pairing:
+def _chosen(options: Options, known: Sequence[str]) -> tuple[str, ...]:
+    """Ids of the people to assist, in the order of the posterior."""
+    from mirror_ppl.domains import require_known
+
+    given = options.people
+    if len(given) == 1 and given[0] not in known and given[0].isdecimal():
+        number = int(given[0])
+        if number < 1:
+            raise OptionError(f"--people must be at least 1, not {number}")
+        if number > len(known):
+            raise PosteriorError(f"{options.posterior}: is of {len(known)} people, not {number}")
+        return tuple(known[:number])
+    for person in given:
+        require_known(person, "person", known)
+    return tuple(person for person in known if person in given) if given else tuple(known)
+
+
+def _pairing(
+    options: Options,
+    posterior: PosteriorFile,
+    source: Mapping[str, Any],
+    people: tuple[str, ...],
+) -> Pairing:
     """Who is paired in which rounds."""
     from mirror_ppl.evaluation.assistance import PlannerOptions
     from mirror_ppl.evaluation.assistance_cells import Pairing
@@ -211,7 +229,7 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
         setting=posterior.attributes["setting"],
         population=source["population"],
         people_seed=int(source["seed"]),
-        people=len(posterior.people),
+        people=people,
         rounds=options.rounds,
         planner=planner,
         seed=options.seed,
@@ -219,11 +237,10 @@ def _pairing(options: Options, posterior: PosteriorFile, source: Mapping[str, An
     )
 
 
-def _warn_of_unexplained_people(posterior: PosteriorFile, number: int) -> None:
-    """Print who of the first people is not explained by the human model."""
+def _warn_of_unexplained_people(posterior: PosteriorFile, people: Sequence[str]) -> None:
+    """Print who of the people is not explained by the human model."""
     from mirror_ppl.inference.results.criticism import UNEXPLAINED, warning_of
 
-    people = posterior.people[:number]
     some = [name for name in people if posterior.verdicts.get(name) == UNEXPLAINED]
     if some:
         print(warning_of(some), file=sys.stderr)
@@ -285,7 +302,7 @@ def _contents(
         contents[options.json] = json_text(results)
     if options.log is not None:
         lines = [
-            json.dumps(plain({"communicator": name, "person": posterior.people[person]} | entry))
+            json.dumps(plain({"communicator": name, "person": pairing.people[person]} | entry))
             + "\n"
             for name, people in played.items()
             for person, one in enumerate(people)
@@ -298,7 +315,7 @@ def _contents(
 
         shown = film(pairing, played, options.communicator)
         kind = options.film.suffix[1:].lower()
-        contents[options.film] = plot_film(shown, posterior.people).content(kind)
+        contents[options.film] = plot_film(shown, pairing.people).content(kind)
     return contents
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-
-import torch
 
 from mirror_ppl.communication.person import Person
 from mirror_ppl.communication.planners import PLANNERS
@@ -31,8 +30,9 @@ from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
-from mirror_ppl.people import simulated_people
+from mirror_ppl.people import SimulatedPeople, simulated_people
 from mirror_ppl.people.robot_like import SELF_MODEL
+from mirror_ppl.randomness import number_of
 from mirror_ppl.version import __version__
 
 TOGETHER, PLANNED_TOGETHER = 5, 2
@@ -48,7 +48,8 @@ class Pairing:
         posterior: file of the people's posterior.
         human_model, self_model: those of the fit; the package's own unless given.
         draws: posterior draws to plan with.
-        setting, population, people_seed, people: arguments that simulate the people.
+        setting, population, people_seed: arguments that simulate the people.
+        people: ids of the people who are assisted, some of the posterior's.
         rounds: number of rounds of each person.
         planner: settings of the planners.
         seed: of the rounds and of everything random.
@@ -62,7 +63,7 @@ class Pairing:
     setting: str
     population: str
     people_seed: int
-    people: int
+    people: tuple[str, ...]
     rounds: int
     planner: PlannerOptions
     seed: int
@@ -83,7 +84,39 @@ class Pairing:
         """The human model that the posterior is of."""
         weights = self.self_model or shipped_weights(self.domain.name)
         self_model, _ = load_self_model(weights, self.domain.name)
-        return load_human_model(self.human_model, self_model)
+        name = self.human_model or self.file.own_model("--human-model FILE.py:CLASS")
+        return load_human_model(name, self_model)
+
+    @property
+    def _until(self) -> int:
+        """Number of simulated people up to the last one who is assisted."""
+        return max(self.numbers.values()) + 1
+
+    def everybody(self) -> SimulatedPeople:
+        """Return the simulated people, up to the last one who is assisted."""
+        return simulated_people(
+            self.domain.name,
+            self.setting,
+            self.population,
+            self._until,
+            self.people_seed,
+            self_model=self.self_model,
+        )
+
+    @cached_property
+    def numbers(self) -> dict[str, int]:
+        """The number of each person among the simulated people, from 0, by id.
+
+        Raises:
+            PosteriorError: a person's id is none that simulated people have.
+        """
+        found = {person: number_of(person) for person in self.people}
+        if others := [person for person, number in found.items() if number is None]:
+            raise PosteriorError(
+                f"{self.posterior}: the id {others[0]} is none of simulated people (person-01, "
+                "person-02, ...), so that it is unknown who is to be played"
+            )
+        return {person: number for person, number in found.items() if number is not None}
 
     def check(self) -> None:
         """Check that posterior, human model and self-model match, before any work is done.
@@ -99,43 +132,47 @@ class Pairing:
                 f"{self.posterior}: its people were simulated with another self-model "
                 f"({simulated}); simulate and fit them anew with this one"
             )
+        truth = self.everybody().truth()
+        for site in truth.keys() & self.file.truth.keys():
+            for person, number in self.numbers.items():
+                recorded = float(self.file.truth[site][self.file.people.index(person)])
+                if not math.isclose(recorded, float(truth[site][number]), rel_tol=1e-4):
+                    raise PosteriorError(
+                        f"{self.posterior}: {person} is not that of the population "
+                        f"{self.population} with seed {self.people_seed}: {site} is "
+                        f"{recorded:.4g} in the recordings, not {float(truth[site][number]):.4g}"
+                    )
 
-    def listeners(self, numbers: Sequence[int], inferred: bool = True) -> list[Listener]:
-        """Return people by number, with their rounds and their posteriors."""
-        everybody = simulated_people(
-            self.domain.name,
-            self.setting,
-            self.population,
-            self.people,
-            self.people_seed,
-            self_model=self.self_model,
-        )
-        found = listeners(everybody, self.people, self.setting, self.rounds, self.seed)
-        chosen = [found[number] for number in numbers]
+    def listeners(self, people: Sequence[str], inferred: bool = True) -> list[Listener]:
+        """Return people by id, with their rounds and their posteriors."""
+        everybody = self.everybody()
+        found = listeners(everybody, self._until, self.setting, self.rounds, self.seed)
+        chosen = [found[self.numbers[person]] for person in people]
         if not inferred:
             return chosen
         draws = self.file.draws(self.human, self.draws)
+        columns = [self.file.people.index(person) for person in people]
         return [
             replace(one, person=Person(self.human, {site: v[:, [n]] for site, v in draws.items()}))
-            for n, one in zip(numbers, chosen, strict=True)
+            for n, one in zip(columns, chosen, strict=True)
         ]
 
     def play(
-        self, numbers: Sequence[int], name: str, rates: Sequence[dict[str, float]] | None = None
+        self, people: Sequence[str], name: str, rates: Sequence[dict[str, float]] | None = None
     ) -> list[Played]:
-        """Play the rounds of some people, by number, with one communicator.
+        """Play the rounds of some people with one communicator.
 
         Args:
-            numbers: of the people.
+            people: their ids.
             name: of the communicator.
             rates: for ``random``, of each of them.
         """
-        people = self.listeners(numbers, name.startswith("mirror"))
+        found = self.listeners(people, name.startswith("mirror"))
         says = [
-            speaker(name, one, self.planner, self.seed + number, own)
-            for one, number, own in zip(people, numbers, rates or [None] * len(people), strict=True)
+            speaker(name, one, self.planner, self.seed + self.numbers[person], own)
+            for one, person, own in zip(found, people, rates or [None] * len(found), strict=True)
         ]
-        return play_together(people, says, self.keep_log)
+        return play_together(found, says, self.keep_log)
 
     def identity(self) -> str:
         """Hash of everything that results depend on."""
@@ -157,27 +194,27 @@ class Turn:
     """Some people with one communicator, or with several of which one depends on another.
 
     Attributes:
-        people: numbers of the people, who play together.
+        people: ids of the people, who play together.
         communicators: by name; ``random`` comes after the communicator whose rates it has.
     """
 
-    people: tuple[int, ...]
+    people: tuple[str, ...]
     communicators: tuple[str, ...]
 
     @property
     def label(self) -> str:
         """Name in progress messages."""
-        first, last = self.people[0] + 1, self.people[-1] + 1
-        who = f"person {first}" if first == last else f"people {first} to {last}"
+        first, last = self.people[0], self.people[-1]
+        who = first if first == last else f"{first} to {last}"
         return f"{' and '.join(self.communicators)}, {who}"
 
 
-def turns(communicators: Sequence[str], people: int) -> list[Turn]:
+def turns(communicators: Sequence[str], people: Sequence[str]) -> list[Turn]:
     """List every communicator with every person, slowest first, so that processes end together.
 
     Args:
         communicators: by name.
-        people: number of people, from the first on.
+        people: ids of the people.
     """
     first: list[tuple[str, ...]] = [
         (name,) for name in communicators if name not in (RATES_FROM, "random")
@@ -190,8 +227,8 @@ def turns(communicators: Sequence[str], people: int) -> list[Turn]:
     found = []
     for names in first:
         size = PLANNED_TOGETHER if names[0] in PLANNERS else TOGETHER
-        groups = torch.arange(people).split(size)
-        found += [Turn(tuple(group.tolist()), names) for group in groups]
+        groups = [people[begin : begin + size] for begin in range(0, len(people), size)]
+        found += [Turn(tuple(group), names) for group in groups]
     return found
 
 

@@ -49,7 +49,7 @@ def film(
     first, second = ([one.net for one in played[name]] for name in pair)
     gain = np.stack(second) - np.stack(first)
     person, number = (int(index) for index in np.unravel_index(gain.argmax(), gain.shape))
-    (listener,) = pairing.listeners([person], inferred=False)
+    (listener,) = pairing.listeners([pairing.people[person]], inferred=False)
     begin = listener.start.round(number).state
     sees = listener.driver.sees
     a, b = (strip(pairing.domain, begin, name, played[name][person], number, sees) for name in pair)

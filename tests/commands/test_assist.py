@@ -29,7 +29,6 @@ def posterior(tmp_path_factory):
     """A posterior of two people in fog, after a few steps."""
     folder = tmp_path_factory.mktemp("assist")
     every = load_demonstrations(asset_path("driving_fog_paper.nc"))
-    # Of the people who were simulated first, so that their number tells who they are.
     save_demonstrations(folder / "some.nc", every.select_people([0, 1]).select_rounds(range(3)))
     small = ("--demos", folder / "some.nc", "--explore", "0", "--draws", "6")
     assert command(fit, *small, "--out", folder / "out") == 0
@@ -254,7 +253,10 @@ def quickly(monkeypatch):
         ({"domain": "chess"}, 'unknown domain "chess"; known: bomb_defusal, driving'),
         ({"domain_version": "99"}, "is of domain version 99, not"),
         ({"self_model": "0" * 16}, f"is of self model {'0' * 16}, not"),
-        ({"human_model": "LatePerson"}, "is of human model LatePerson, not mirror"),
+        (
+            {"human_model": "LatePerson"},
+            "is of your own human model LatePerson; give it as --human",
+        ),
         ({"recorded_population": None}, "is not of simulated people, as far as it says"),
         ({"recorded_population": "martians"}, 'unknown population "martians"'),
     ],
@@ -274,6 +276,8 @@ def test_posteriors_of_something_else_are_refused(posterior, tmp_path, capsys, a
         (("--domain", "chess"), "chess"),
         (("--communicator", "nobody"), 'unknown communicator "nobody"'),
         (("--people", "3"), "is of 2 people, not 3"),
+        (("--people", "0"), "--people must be at least 1, not 0"),
+        (("--people", "person-01", "ann"), 'unknown person "ann"; known: person-01, person-02'),
         (("--draws", "7"), "holds 6 draws, not 7: ask for 6 or fewer"),
         (("--draws", "0"), "--draws must be at least 1, not 0"),
         (("--horizon", "0"), "--horizon must be at least 1, not 0"),
@@ -342,16 +346,7 @@ def test_a_model_that_remembers_more_is_planned_with_but_has_no_divergence(
     some = load_demonstrations(posterior.parents[1] / "some.nc")
     one = some.select_people([0]).select_rounds([0])
     path = posterior_of(one, tmp_path, human=late[1], train_rounds=0, draws=6)
-    own = (
-        "--posterior",
-        path,
-        *late,
-        *SMALL,
-        "--people",
-        "1",
-        "--rounds",
-        "1",
-    )
+    own = ("--posterior", path, *late, *SMALL, "--people", "1", "--rounds", "1")
     assert command(assist, *own, "--communicator", "mirror-kl", "mirror") == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -371,7 +366,8 @@ def test_a_world_s_record_of_planning_holds_unless_options_say_otherwise(monkeyp
     posterior = SimpleNamespace(attributes=attributes, people=("person-01",))
     for given in ({}, {"hears": 0.8, "kl_measure": "kl"}):
         options = assist.Options(posterior="posterior.nc", **given)
-        planner = assist._pairing(options, posterior, {"population": "paper", "seed": 0}).planner
+        source = {"population": "paper", "seed": 0}
+        planner = assist._pairing(options, posterior, source, ("person-01",)).planner
         assert {name: getattr(planner, name) for name in planning} == {**planning, **given}
 
 

@@ -235,15 +235,15 @@ def test_rounds_of_people_who_play_together_may_end_at_different_steps(world, mo
 
 
 def test_people_are_divided_into_groups_that_play_together():
-    found = turns(["none", "mirror", "random", "oracle"], 7)
+    found = turns(["none", "mirror", "random", "oracle"], "abcdefg")
     numbers = {one.communicators: [] for one in found}
     for one in found:
         numbers[one.communicators].append(one.people)
     assert [*numbers] == [("oracle",), ("mirror", "random"), ("none",)]
-    assert numbers[("none",)] == numbers[("oracle",)] == [(0, 1, 2, 3, 4), (5, 6)]
-    assert numbers[("mirror", "random")] == [(0, 1), (2, 3), (4, 5), (6,)]
-    assert found[0].label == "oracle, people 1 to 5"
-    assert turns(["none"], 1)[0].label == "none, person 1"
+    assert numbers[("none",)] == numbers[("oracle",)] == [tuple("abcde"), tuple("fg")]
+    assert numbers[("mirror", "random")] == [tuple("ab"), tuple("cd"), tuple("ef"), ("g",)]
+    assert found[0].label == "oracle, a to e"
+    assert turns(["none"], "a")[0].label == "none, a"
 
 
 def test_all_say_everything_and_none_nothing():

@@ -35,7 +35,9 @@ def played(listener):
 
 
 def pairing(listener):
-    return SimpleNamespace(domain=listener.domain, listeners=lambda *_, **__: [listener])
+    return SimpleNamespace(
+        domain=listener.domain, people=["ann"], listeners=lambda *_, **__: [listener]
+    )
 
 
 def stacked(states, name):

@@ -13,11 +13,12 @@ import xarray as xr
 from torch import Tensor
 
 from mirror_ppl.checks import as_path, require_kind, whole_number
+from mirror_ppl.data.schema import TRUTH
 from mirror_ppl.domains import get_domain
-from mirror_ppl.errors import PosteriorError
+from mirror_ppl.errors import InputError, PosteriorError
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import is_reach
-from mirror_ppl.models.loading import model_name
+from mirror_ppl.models.loading import human_models_of, model_name
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.netcdf import read_netcdf
@@ -37,6 +38,7 @@ class PosteriorFile:
         people: ids of the people.
         values: draws ``[S, P, ...]`` by name, in the units of the file.
         verdicts: the model check's verdict on each person, by id; none if the file has none.
+        truth: true values ``[P]`` of sites, as recorded; none of people of whom they are unknown.
     """
 
     path: Path
@@ -44,6 +46,21 @@ class PosteriorFile:
     people: tuple[str, ...]
     values: Mapping[str, np.ndarray]
     verdicts: Mapping[str, str] = field(default_factory=dict)
+    truth: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def own_model(self, option: str) -> str:
+        """Return the name of the package's human model that the posterior is of.
+
+        Args:
+            option: how to give another one, for the message.
+
+        Raises:
+            InputError: it is of a human model that the package does not have.
+        """
+        name = model_name(self.attributes.get("human_model", "unknown"))
+        if name not in human_models_of(get_domain(self.attributes["domain"])):
+            raise InputError(f"{self.path}: is of your own human model {name}; give it as {option}")
+        return name
 
     def draws(self, human: HumanModel, number: int | None = None) -> dict[str, Tensor]:
         """Values ``[S, P, 1, ...]`` of all sites of a human model.
@@ -157,8 +174,9 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
     """
     path = as_path(path)
     path = posterior_at(path)
-    groups = read_results(path, "posterior", "model_check")
+    groups = read_results(path, "posterior", "model_check", "constant_data")
     group, checked = groups["posterior"], groups.get("model_check", {})
+    known = groups.get("constant_data", xr.Dataset())
     try:
         attributes = {str(name): str(value) for name, value in group.attrs.items()}
         people = tuple(map(str, group["person"].values))
@@ -169,6 +187,11 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
         verdicts = {}
         if "verdict" in checked:
             verdicts = dict(zip(people, map(str, checked["verdict"].values), strict=True))
+        truth = {
+            str(name).removeprefix(TRUTH): value.values
+            for name, value in known.data_vars.items()
+            if str(name).startswith(TRUTH)
+        }
     except Exception as error:
         raise PosteriorError(f"{path}: cannot be read as a posterior ({error})") from error
     own = attributes.get("domain", "unknown")
@@ -178,4 +201,4 @@ def load_posterior(path: Path, domain: str | None = None) -> PosteriorFile:
     values = {name: value.reshape(-1, *value.shape[2:]) for name, value in stacked.items()}
     if not values or min(len(value) for value in values.values()) == 0:
         raise PosteriorError(f"{path}: holds no draws")
-    return PosteriorFile(path, attributes, people, values, verdicts)
+    return PosteriorFile(path, attributes, people, values, verdicts, truth)

@@ -1,0 +1,98 @@
+"""`assist` plays the people of the posterior, whichever of a population they are."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from running import command
+
+import mirror_ppl
+from mirror_ppl.commands import assist
+from mirror_ppl.data import asset_path, load_demonstrations
+from mirror_ppl.inference.results.export import netcdf_content
+from mirror_ppl.people import populations_of, simulated_people
+
+SMALL = ("--rounds", "2", "--draws", "4", "--horizon", "2", "--jobs", "1")
+
+
+@pytest.fixture(scope="module")
+def some():
+    recordings = load_demonstrations(asset_path("driving_fog_diverse.nc"))
+    return recordings.select_people(["person-02", "person-07", "person-09"])
+
+
+@pytest.fixture(scope="module")
+def posterior_of(tmp_path_factory):
+    """Writes the file of a posterior, without the pictures of a fit."""
+
+    def write(recordings, **options):
+        options = {"train_rounds": 0, "draws": 4, "explore": 0} | options
+        path = tmp_path_factory.mktemp("fit") / "posterior.nc"
+        fit = mirror_ppl.infer(recordings, **options)
+        path.write_bytes(bytes(netcdf_content(fit.data)))
+        return path
+
+    return write
+
+
+def decisions(path, tmp_path, *arguments):
+    """The log's entries by person."""
+    log = tmp_path / "log.jsonl"
+    chosen = ("--communicator", "nearest", "oracle", "--log", log)
+    assert command(assist, "--posterior", path, *SMALL, *chosen, *arguments) == 0
+    found: dict[str, list] = {}
+    for line in log.read_text().splitlines():
+        found.setdefault((entry := json.loads(line)).pop("person"), []).append(entry)
+    return found
+
+
+def test_some_of_the_people_are_played_as_among_all(some, posterior_of, tmp_path, capsys):
+    """Also one of them alone; their choices are those of nobody else."""
+    every = posterior_of(load_demonstrations(asset_path("driving_fog_diverse.nc")))
+    expected = decisions(every, tmp_path)
+    among = decisions(posterior_of(some), tmp_path)
+    assert among == {person: expected[person] for person in some.people}
+    assert len({json.dumps(own) for own in among.values()}) == 3
+    alone = decisions(posterior_of(some.select_people(["person-09"])), tmp_path)
+    assert alone == {"person-09": expected["person-09"]}
+    chosen = decisions(every, tmp_path, "--people", "person-09", "person-02")
+    assert [*chosen.items()] == [(one, expected[one]) for one in ("person-02", "person-09")]
+    assert [*decisions(every, tmp_path, "--people", "2")] == ["person-01", "person-02"]
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("world", "setting"),
+    [("driving", "fog"), ("search_rescue", "smoke"), ("bomb_defusal", "unlabelled")],
+)
+def test_people_do_not_depend_on_how_many_follow(world, setting):
+    for population in populations_of(world):
+        few, many = (
+            simulated_people(world, setting, population, number, 3).truth() for number in (2, 4)
+        )
+        for site, value in few.items():
+            torch.testing.assert_close(value, many[site][:2], rtol=0, atol=0)
+
+
+def test_people_who_are_not_those_of_the_population_are_refused(
+    some, posterior_of, tmp_path, capsys
+):
+    swapped = replace(some, people=("person-09", "person-07", "person-02"))
+    named = replace(some, people=("ann", "bob", "cem"))
+    for recordings, message in (
+        (swapped, "is not that of the population diverse with seed 0: sight_"),
+        (named, "the id ann is none of simulated people (person-01, person-02, ...)"),
+    ):
+        path = posterior_of(recordings)
+        assert command(assist, "--posterior", path, *SMALL, "--communicator", "none") == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and message in error
+
+
+def test_the_human_model_is_that_of_the_file(some, posterior_of, tmp_path, capsys):
+    path = posterior_of(some.select_people([0]), human="late")
+    arguments = ("--posterior", path, *SMALL, "--communicator", "mirror")
+    assert command(assist, *arguments) == 0
+    assert command(assist, *arguments, "--human-model", "noticing") == 2
+    assert "is of human model late, not noticing" in capsys.readouterr().err
