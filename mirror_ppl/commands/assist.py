@@ -92,8 +92,8 @@ class Options:
     """Draw a filmstrip (png, pdf or svg) of the round in which messages gained most: without
     messages, if none is among the communicators, and with the first other one."""
     human_model: str | None = None
-    """The human model that the posterior is of, if it is another: one-radius and so on, or one of
-    your own, path/to/file.py:Class, whose code is run."""
+    """The human model that the posterior is of, if it is one of your own: path/to/file.py:Class,
+    whose code is run."""
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     population: str | None = None

@@ -55,7 +55,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
     if doubtful:
         print(
             f"Importance weights are not to be relied on for {', '.join(doubtful)} (Pareto k above "
-            f"{HIGH_PARETO_K}): another --guide may do better"
+            f"{HIGH_PARETO_K}): --guide svi or nuts may do better, or another --human-model"
         )
     few = [
         person["id"]
@@ -91,7 +91,7 @@ def _show_checks(people: Sequence[dict[str, Any]], model: str) -> None:
     doubted = [person for person in checked if person["check"]["verdict"] != OK]
     hint = ""
     if doubted and model == MIRROR:
-        hint = "; --human-model all weighs other models of them, which takes about 16 times as long"
+        hint = "; --human-model all weighs other models of them, which takes much longer"
     print(f"Model check: {len(checked) - len(doubted)} of {len(checked)} people ok{hint}")
     for person in doubted[:MOST_DOUBTED]:
         check = person["check"]

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
 from mirror_ppl.models.implants import NOTICES
-from mirror_ppl.plots.picture import Picture, SightPicture, label_of
-from mirror_ppl.plots.reading import draws, explain, of_person, people, truth
+from mirror_ppl.plots.picture import Picture, SightPicture
+from mirror_ppl.plots.reading import draws, explain, name_of, of_person, people, truth
 
 if TYPE_CHECKING:
     import arviz as az
@@ -58,7 +58,7 @@ def notices_picture(data: az.InferenceData) -> Picture:
         if all(value is not None for value in real):
             named = {"truth": np.array(real, dtype=float), **named}
         _draw(ax, named, [site.removeprefix(NOTICES) for site in sites], place < across)
-        ax.set_title(label_of(person), fontsize=9, loc="left")
+        ax.set_title(name_of(data, person), fontsize=9, loc="left")
     explain(
         figure,
         data,

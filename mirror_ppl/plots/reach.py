@@ -9,8 +9,8 @@ import numpy as np
 from mirror_ppl.domains import get_domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.models.implants import SIGHT
-from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import draws, edged, explain, of_person, people, truth
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import draws, edged, explain, name_of, of_person, people, truth
 
 if TYPE_CHECKING:
     import arviz as az
@@ -63,7 +63,7 @@ def reach_picture(data: az.InferenceData) -> Picture:
             if real is not None:
                 number = int((bins <= np.float32(real)).sum())
                 ax.add_patch(_frame(row, number))
-        names = [label_of(person) for person in shown] if place == 0 else [""] * len(shown)
+        names = [name_of(data, person) for person in shown] if place == 0 else [""] * len(shown)
         ax.set_yticks(range(len(shown)), names, fontsize=8)
         ax.set_xticks(range(len(bins)), [f"{edge:g}" for edge in bins], fontsize=8)
         ax.set_xlabel(f"distance ({domain.reach_unit})", fontsize=8)

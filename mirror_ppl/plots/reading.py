@@ -13,6 +13,8 @@ from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 
 from mirror_ppl.domains import require_known
 from mirror_ppl.errors import DemonstrationsError
+from mirror_ppl.inference.results.criticism import FINE
+from mirror_ppl.plots.picture import label_of
 
 if TYPE_CHECKING:
     import arviz as az
@@ -43,6 +45,19 @@ def of_person(data: az.InferenceData, group: str, person: str) -> xr.Dataset:
     """
     known = people(data)
     return data[group].isel(person=known.index(require_known(person, "person", known)))
+
+
+def name_of(data: az.InferenceData, person: str, apart: str = " ") -> str:
+    """Label of a person, with the model check's verdict if the model does not explain them.
+
+    Args:
+        data: the fit.
+        person: id.
+        apart: between the two.
+    """
+    name, checked = label_of(person), data["model_check"] if "model_check" in data.groups() else {}
+    verdict = "" if "verdict" not in checked else str(checked["verdict"].sel(person=person).item())
+    return name if verdict in ("", *FINE) else f"{name}{apart}({verdict})"
 
 
 def draws(values: xr.DataArray) -> np.ndarray:

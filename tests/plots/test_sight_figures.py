@@ -6,6 +6,7 @@ import pytest
 import xarray as xr
 from example_drivers import PEOPLE, SITES, draw, made_up
 from matplotlib.patches import FancyBboxPatch
+from matplotlib.text import Text
 
 from mirror_ppl.domains.driving import road
 from mirror_ppl.domains.driving.road import (
@@ -152,3 +153,13 @@ def test_any_number_of_people(rng, number, monkeypatch):
 def test_human_models_without_thresholds_have_no_road(data):
     assert has_sight(data)
     assert not has_sight(az.InferenceData(posterior=data.posterior.drop_vars(SITES[1])))
+
+
+def test_people_whom_the_model_does_not_explain_are_marked(data):
+    assert [ax.get_title("left") for ax in sight_picture(data).axes[:2]] == ["anna", "ben"]
+    verdicts = xr.Dataset({"verdict": ("person", ["suspect", "ok"])}, {"person": list(PEOPLE)})
+    data.add_groups({"model_check": verdicts})
+    titles = [ax.get_title("left") for ax in sight_picture(data).axes[:2]]
+    assert titles == ["anna (suspect)", "ben"]
+    labels = {text.get_text() for text in samples_picture(data).findobj(Text)}
+    assert {"anna\n(suspect)", "ben"} <= labels

@@ -19,8 +19,8 @@ from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
 
 from mirror_ppl.domains.driving.knowledge import ROAD_END
 from mirror_ppl.models.implants import SIGHT
-from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import BLUE, TRUE, draws, edged, of_person, people, truth
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import BLUE, TRUE, draws, edged, name_of, of_person, people, truth
 
 if TYPE_CHECKING:
     import arviz as az
@@ -129,7 +129,7 @@ def plot_sight(data: az.InferenceData, person: str, ax: Axes | None = None) -> A
     ax.set_yticks([0.5, 1.5], [f"{lane} lane" for lane in LANES])
     ax.tick_params(length=0)
     ax.set_xlabel("cells behind   \N{LEFTWARDS ARROW}   |   \N{RIGHTWARDS ARROW}   cells ahead")
-    ax.set_title(label_of(person), loc="left", fontweight="bold", fontsize=11)
+    ax.set_title(name_of(data, person), loc="left", fontweight="bold", fontsize=11)
     return ax
 
 

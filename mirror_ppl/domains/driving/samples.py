@@ -22,8 +22,8 @@ from mirror_ppl.domains.driving.road import (
     seen_of_draws,
     true_sight,
 )
-from mirror_ppl.plots.picture import Picture, label_of
-from mirror_ppl.plots.reading import explain, label_columns, people
+from mirror_ppl.plots.picture import Picture
+from mirror_ppl.plots.reading import explain, label_columns, name_of, people
 
 if TYPE_CHECKING:
     import arviz as az
@@ -68,7 +68,9 @@ def samples_picture(data: az.InferenceData) -> Picture:
         chosen = np.linspace(0, drawn.sizes["sample"] - 1, SAMPLES).round().astype(int)
         for ax, number in zip(panels, chosen, strict=True):
             _draw(ax, drawn[number])
-        row[0].set_ylabel(label_of(person), fontsize=9, rotation=0, ha="right", va="center")
+        row[0].set_ylabel(
+            name_of(data, person, "\n"), fontsize=9, rotation=0, ha="right", va="center"
+        )
     label_columns(grid[0], columns)
     explain(
         figure,

@@ -11,8 +11,18 @@ from matplotlib.projections.polar import PolarAxes
 from mirror_ppl.domains.highway.lidar import RANGE, SECTORS
 from mirror_ppl.domains.highway.world import DIRECTION_OF, KNOTS, Highway
 from mirror_ppl.models.implants import SIGHT
-from mirror_ppl.plots.picture import Picture, SightPicture, label_of
-from mirror_ppl.plots.reading import BLUE, TRUE, draws, edged, explain, of_person, people, truth
+from mirror_ppl.plots.picture import Picture, SightPicture
+from mirror_ppl.plots.reading import (
+    BLUE,
+    TRUE,
+    draws,
+    edged,
+    explain,
+    name_of,
+    of_person,
+    people,
+    truth,
+)
 
 if TYPE_CHECKING:
     import arviz as az
@@ -69,7 +79,7 @@ def sight_picture(data: az.InferenceData) -> Picture:
         real = [truth(data, site, person) for site in SITES]
         if all(value is not None for value in real):
             _outline(ax, [float(value) for value in real if value is not None])
-        ax.set_title(label_of(person), fontsize=10)
+        ax.set_title(name_of(data, person), fontsize=10)
     for ax in grid[len(shown) :]:
         ax.set_axis_off()
     explain(

@@ -13,12 +13,13 @@ from mirror_ppl.domains.search_rescue.house import PORTION, SIDE, as_image
 from mirror_ppl.domains.search_rescue.moves import RescueState
 from mirror_ppl.domains.search_rescue.world import SearchRescue
 from mirror_ppl.models.implants import SIGHT
-from mirror_ppl.plots.picture import Picture, SightPicture, label_of
+from mirror_ppl.plots.picture import Picture, SightPicture
 from mirror_ppl.plots.reading import (
     BLUE,
     draws,
     explain,
     label_columns,
+    name_of,
     of_person,
     people,
     truth,
@@ -88,7 +89,7 @@ def sight_picture(data: az.InferenceData) -> Picture:
         chosen = np.linspace(0, len(drawn) - 1, SAMPLES).round().astype(int)
         for ax, value in zip(panels, drawn[chosen], strict=True):
             _draw(ax, _seen(np.array([value]))[0], _cells(value))
-        row[0].set_ylabel(label_of(person), fontsize=10)
+        row[0].set_ylabel(name_of(data, person, "\n"), fontsize=10)
     label_columns(grid[0], columns)
     explain(
         figure,

@@ -105,7 +105,8 @@ def warning_of(people: Sequence[str]) -> str:
     """Return what to say to those who plan messages for people who are not explained."""
     return (
         f"the actions of {', '.join(people)} are not explained by the human model (verdict "
-        f"{UNEXPLAINED}): messages that are planned with it may do harm"
+        f"{UNEXPLAINED}): messages that are planned with it may do harm; another one, such as all, "
+        "may explain them"
     )
 
 
