@@ -95,7 +95,7 @@ def describe(error: BaseException, path: Path | None = None) -> str:
         text = f"{type(error).__name__}: {text}" if text else type(error).__name__
     if not frames:
         return text
-    if len(frames) == 1 and _PACKAGE in Path(frames[0].filename).resolve().parents:
+    if not own and _PACKAGE in Path(frames[-1].filename).resolve().parents:
         return text  # the user's function could not be called, which the message says
     line = (own or frames)[-1]
     return f"{text} ({Path(line.filename).name}, line {line.lineno})"

@@ -160,6 +160,11 @@ def test_what_is_not_a_human_model_is_refused(tmp_path, monkeypatch, human, spec
             "return torch.zeros(2) + torch.zeros(3)",
             r"Mine\.perceive fails: RuntimeError.*mine\.py, line 9",
         ),
+        (  # no line, as it is the package's
+            "act(self, implants, belief, values, step)",
+            "return values",
+            r"Mine\.act fails: TypeError: [^(]*act\(\) missing 1 required [^(]*'step'$",
+        ),
         ("perceive(self, implants)", "return None", r"Mine\.perceive fails: TypeError"),
         (
             "perceive(self, *now)",
