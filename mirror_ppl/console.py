@@ -24,6 +24,11 @@ EXIT_INTERRUPTED = 128 + 2
 EXIT_BROKEN_PIPE = 128 + 13
 EXIT_TERMINATED = 128 + 15
 NO_EXAMPLES: Mapping[str, str] = {}
+NUMBERS = {
+    "a whole number": r"invalid literal for int\(\) with base 10",
+    "a number": "could not convert string to float",
+}
+"""What Python says of texts that are none."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 """Errors of writing that are not the code's."""
 NO_MEMORY = ("can't allocate memory", "CUDA out of memory")
@@ -137,6 +142,9 @@ def _argument_error(box: str, prog: str) -> str:
     # Of an option that may be left out, tyro lists every type that the value was tried as.
     tried = re.match(r"(Error parsing \S+: ).* - <class '\w+'>: (?!\[)(.*)", parts[0])
     message = ("".join(tried.groups()) if tried else parts[0]).rstrip(".")
+    for kind, said in NUMBERS.items():
+        if found := re.fullmatch(rf"Error parsing (\S+): {said}: '(.*)'", message):
+            message = f"{found[1]} must be {kind}, not {found[2]}"
     if options:
         message += f"; perhaps you meant {' or '.join(options)}"
     return f"{message}; see {prog} --help"

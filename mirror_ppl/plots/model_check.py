@@ -104,7 +104,8 @@ def _p_values(ax, group: xr.Dataset) -> None:
     sided = f" (one-sided: {', '.join(named)})" if named else ""
     title = (
         f"Two-sided p-values{sided};\n"
-        "\N{UPWARDS ARROW} more, \N{DOWNWARDS ARROW} less than predicted; framed (suspect): below .05 / number"
+        "\N{UPWARDS ARROW} more, \N{DOWNWARDS ARROW} less than predicted; "
+        f"framed (suspect): below {LEVEL} / their number"
     )
     ax.set_title(title, fontsize=11, pad=22 if several else None)
     if several:

@@ -101,8 +101,9 @@ def test_what_is_no_share(text):
     ("module", "args", "line"),
     [
         (fit, ("--drws", "3"), "Unrecognized options: --drws, 3; perhaps you meant --draws"),
-        (fit, ("--draws", "x"), "Error parsing --draws: invalid literal for int()"),
-        (fit, ("--train-rounds", "20x"), "Error parsing --train-rounds: invalid literal for int()"),
+        (fit, ("--draws", "x"), "--draws must be a whole number, not x"),
+        (fit, ("--train-rounds", "2.5"), "--train-rounds must be a whole number, not 2.5"),
+        (assist, ("--posterior", "a.nc", "--discount", "1/2"), "--discount must be a number, not"),
         (fit, ("more",), "Unrecognized options: more"),
         (fit, ("--demos",), "Missing value for argument '--demos'"),
         (compare, (), "give at least two posteriors to compare, not 0"),
