@@ -25,6 +25,11 @@ def derived_generator(
     return torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
 
 
+def person_id(number: int) -> str:
+    """Return the id that the package gives to a person by number, from 0, such as ``person-01``."""
+    return f"person-{number + 1:02d}"
+
+
 def number_of(person: str) -> int | None:
     """Return the number, from 0, of a person whose id the package gave, such as ``person-01``."""
     found = NUMBERED.fullmatch(person)

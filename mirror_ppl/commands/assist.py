@@ -375,10 +375,6 @@ def _people(options: Options):
         raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")
     from mirror_ppl.models.simulation import PRIOR_OF
 
-    if str(source["population"]).startswith(PRIOR_OF):
-        raise PosteriorError(
-            f"{options.posterior}: is of people drawn from the {source['population']}, who cannot "
-            "be played further; plan messages for them with mirror_ppl.Communicator"
-        )
-    require_known(source["population"], "population", populations_of(domain))
+    if not str(source["population"]).startswith(PRIOR_OF):
+        require_known(source["population"], "population", populations_of(domain))
     return posterior, source

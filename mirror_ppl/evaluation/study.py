@@ -36,6 +36,7 @@ from mirror_ppl.likelihood.contract import check_contract
 from mirror_ppl.models.loading import file_of, load_human_model
 from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
 from mirror_ppl.people import has_oracle
+from mirror_ppl.randomness import person_id
 from mirror_ppl.training.guide_file import shipped_guide
 
 CODE = (
@@ -147,7 +148,7 @@ def assist(cell: Assistance) -> Rows:
         ]
         for number, played in enumerate(play_together(people, says)):
             rows.append(
-                _row(group, who, cell.rounds, f"person-{number + 1:02d}")
+                _row(group, who, cell.rounds, person_id(number))
                 | {
                     "task": sum(played.task) / cell.played,
                     "cost": sum(played.cost) / cell.played,

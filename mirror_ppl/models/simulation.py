@@ -24,8 +24,8 @@ from mirror_ppl.domains.base import (
 from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.implants import in_units
-from mirror_ppl.models.prior import draw_prior
-from mirror_ppl.randomness import forked, seed_everything
+from mirror_ppl.models.prior import draw_prior_of_each
+from mirror_ppl.randomness import forked, person_id, seed_everything
 from mirror_ppl.version import __version__
 
 PRIOR_OF = "prior of "
@@ -127,7 +127,7 @@ def play_rounds(
     return Demonstrations(
         domain=domain.name,
         setting=setting,
-        people=tuple(f"person-{number:02d}" for number in range(1, people + 1)),
+        people=tuple(map(person_id, range(people))),
         ego=observation.pop("ego"),
         observations=observation,
         actions=actions,
@@ -191,22 +191,32 @@ def simulate_from_prior(
     setting = require_known(setting or domain.settings[-1], "setting", domain.settings, domain.name)
     people, rounds = whole_number(people, "people", 1), whole_number(rounds, "rounds", 1)
     seed, told = seed_number(seed), real_number(told, "told", 0, 1)
-    drawn = draw_prior(human, people, 1, seed)
+    # Each person by themselves, so that they do not depend on how many they are.
+    drawn = draw_prior_of_each(human, [person_id(place) for place in range(people)], 1, seed)
     generator = torch.Generator(device).manual_seed(seed)
     implants = {name: value[0] for name, value in drawn.items()}
     recorded = play_rounds(human, implants, rounds, setting, generator, told=told)
-    truth = {
-        name: value[0].float()
-        for name, value in in_units(domain, drawn).items()
-        if value.dim() == 2  # noqa: PLR2004
-    }
     provenance = {
         "population": f"{PRIOR_OF}{type(human).__name__}",
         "seed": seed,
         "version": __version__,
         **({"told": told} if told else {}),
     }
-    return replace(recorded, truth=truth, provenance=provenance)
+    return replace(recorded, truth=true_values(human, drawn), provenance=provenance)
+
+
+def true_values(human: HumanModel, drawn: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return values ``[P]`` of sites that are one number, thresholds in the domain's unit.
+
+    Args:
+        human: the model of people.
+        drawn: one draw of all sites, ``[1, P, 1, ...]``.
+    """
+    return {
+        name: value[0].float()
+        for name, value in in_units(human.domain, drawn).items()
+        if value.dim() == 2  # noqa: PLR2004
+    }
 
 
 def _round_latents(

@@ -13,10 +13,14 @@ import torch
 from mirror_ppl.checks import real_number, seed_number, whole_number
 from mirror_ppl.data.demonstrations import Demonstrations
 from mirror_ppl.devices import usable_device
-from mirror_ppl.domains import get_domain
+from mirror_ppl.domains import Domain, get_domain
 from mirror_ppl.domains.base import require_known
+from mirror_ppl.errors import InputError
+from mirror_ppl.models.loading import human_models_of, load_human_model, model_name
+from mirror_ppl.models.simulation import PRIOR_OF
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people.base import DomainPeople, SimulatedPeople, act
+from mirror_ppl.people.of_human_model import PeopleOfHumanModel, people_from_prior
 from mirror_ppl.people.recordings import Start, draw_starts, record, recorded
 from mirror_ppl.people.robot_like import POPULATIONS as ROBOT_LIKE
 from mirror_ppl.people.robot_like import RobotLike, simulated_robot_like
@@ -43,20 +47,39 @@ def simulated_people(
 ) -> SimulatedPeople:
     """Return the simulated people of a population, to be stepped by the caller.
 
-    A seed gives the people that `simulate` records with it; see there for arguments.
+    A seed gives the people that `simulate` records with it; see there for arguments. The population
+    may also be the prior of one of the package's human models, as recordings name it.
 
     Raises:
         UnknownNameError: there is no such domain, setting or population.
         AssetError: the self-model that people of a user's world need is missing.
-        InputError: fewer than one person, or no seed.
+        InputError: fewer than one person, no seed, or the prior of another human model.
+        HumanModelError: people of the human model cannot be played step by step.
     """
     world = get_domain(domain)
-    require_known(population, "population", populations_of(domain), domain)
+    model = _model_of(world, population)
+    if model is None:
+        require_known(population, "population", populations_of(domain), domain)
     people, seed = whole_number(people, "people", 1), seed_number(seed)
-    if (own := people_of(world.name)) is not None:
+    if model is None and (own := people_of(world.name)) is not None:
         return own.simulated(setting, population, people, seed, device)
     robot, _ = load_self_model(self_model or shipped_weights(world.name), world.name)
+    if model is not None:
+        return people_from_prior(load_human_model(model, robot.to(device)), people, seed)
     return simulated_robot_like(robot.to(device), setting, population, people, seed)
+
+
+def _model_of(world: Domain, population: str) -> str | None:
+    """Name of the human model whose prior a population is; None if it is of another kind."""
+    if not population.startswith(PRIOR_OF):
+        return None
+    model = model_name(population.removeprefix(PRIOR_OF))
+    if model not in human_models_of(world):
+        raise InputError(
+            f"people of your own human model {model} cannot be played further; plan messages for "
+            "them with mirror_ppl.Communicator"
+        )
+    return model
 
 
 def populations_of(domain: str) -> tuple[str, ...]:
@@ -73,8 +96,10 @@ def has_oracle(domain: str, population: str) -> bool:
     """True if the oracle can compute the best messages to such people.
 
     It can for a world's own people, unless they need all of a random world's states to be listed,
-    and for others unless a setting limits their sight.
+    for people who follow a human model, and for others unless a setting limits their sight.
     """
+    if population.startswith(PRIOR_OF):
+        return True
     own = people_of(domain)
     if own is None:
         return population == "diverse"
@@ -136,12 +161,14 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
 
 __all__ = [
     "DomainPeople",
+    "PeopleOfHumanModel",
     "RobotLike",
     "SimulatedPeople",
     "Start",
     "act",
     "draw_starts",
     "has_oracle",
+    "people_from_prior",
     "people_of",
     "populations_of",
     "record",

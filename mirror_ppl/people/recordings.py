@@ -14,7 +14,7 @@ from mirror_ppl.domains.base import Domain, Observation, Visibility, map_state, 
 from mirror_ppl.domains.registry import get_domain
 from mirror_ppl.people.base import SimulatedPeople, act
 from mirror_ppl.progress import Progress
-from mirror_ppl.randomness import derived_generator
+from mirror_ppl.randomness import derived_generator, person_id
 from mirror_ppl.version import __version__
 
 
@@ -241,7 +241,7 @@ def recorded(
     return Demonstrations(
         domain=domain.name,
         setting=setting,
-        people=tuple(f"person-{place:02d}" for place in range(1, number + 1)),
+        people=tuple(map(person_id, range(number))),
         ego=recording.observation["ego"],
         observations={part.name: recording.observation[part.name] for part in domain.modalities},
         actions=recording.actions,

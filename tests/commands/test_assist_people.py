@@ -11,6 +11,9 @@ import mirror_ppl
 from mirror_ppl.commands import assist
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results.export import netcdf_content
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.simulation import simulate_from_prior
+from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import populations_of, simulated_people
 
 SMALL = ("--rounds", "2", "--draws", "4", "--horizon", "2", "--jobs", "1")
@@ -37,13 +40,14 @@ def posterior_of(tmp_path_factory):
 
 
 def decisions(path, tmp_path, *arguments):
-    """The log's entries by person."""
+    """The log's entries by person; numbers are rounded, as others play beside them."""
     log = tmp_path / "log.jsonl"
     chosen = ("--communicator", "nearest", "oracle", "--log", log)
     assert command(assist, "--posterior", path, *SMALL, *chosen, *arguments) == 0
     found: dict[str, list] = {}
     for line in log.read_text().splitlines():
-        found.setdefault((entry := json.loads(line)).pop("person"), []).append(entry)
+        entry = json.loads(line, parse_float=lambda text: round(float(text), 3))
+        found.setdefault(entry.pop("person"), []).append(entry)
     return found
 
 
@@ -96,3 +100,13 @@ def test_the_human_model_is_that_of_the_file(some, posterior_of, tmp_path, capsy
     assert command(assist, *arguments) == 0
     assert command(assist, *arguments, "--human-model", "noticing") == 2
     assert "is of human model late, not noticing" in capsys.readouterr().err
+
+
+def test_people_drawn_from_a_human_model_play_further_rounds(posterior_of, tmp_path, capsys):
+    human = load_human_model("late", load_self_model(shipped_weights("driving"))[0])
+    recorded = simulate_from_prior(human, 3, 2, "fog", seed=4)
+    expected = decisions(posterior_of(recorded), tmp_path)
+    one = posterior_of(recorded.select_people(["person-03"]))
+    assert decisions(one, tmp_path) == {"person-03": expected["person-03"]}
+    assert len({json.dumps(own) for own in expected.values()}) == 3
+    capsys.readouterr()

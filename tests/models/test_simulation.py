@@ -11,7 +11,7 @@ from mirror_ppl.errors import InputError, UnknownNameError
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.implants import RESIDUAL_HIDDEN, sight_sites
 from mirror_ppl.models.loading import load_human_model
-from mirror_ppl.models.prior import draw_prior
+from mirror_ppl.models.prior import draw_prior_of_each
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.simulation import play_rounds, simulate_from_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -81,7 +81,7 @@ def test_people_of_the_prior_come_with_their_truth(world):
     human = load_human_model("all", load_self_model(shipped_weights(world), world)[0])
     domain = human.domain
     found = simulate_from_prior(human, 3, 2, seed=5, told=0.5)
-    drawn = draw_prior(human, 3, 1, 5)
+    drawn = draw_prior_of_each(human, ["person-01", "person-02", "person-03"], 1, 5)
     scalars = {name for name, value in drawn.items() if value.dim() == 3}
     assert set(found.truth) == scalars and found.shape[:2] == (3, 2)
     assert found.setting == domain.settings[-1]
