@@ -117,10 +117,10 @@ def steps(recordings: Demonstrations, number: int) -> list[RoundSoFar]:
 
 def moments(recordings: Demonstrations, number: int) -> list[RoundSoFar]:
     """Moments of recorded rounds, spread over their first halves, with no messages so far."""
-    found, half = [], recordings.actions.shape[-1] // 2
+    found = []
     for index in range(number):
-        step = index * 7 % half
-        found.append(RoundSoFar.of(recordings, recordings.people[0], index % ROUNDS, step))
+        round_steps = steps(recordings, index % ROUNDS)
+        found.append(round_steps[index * 7 % (len(round_steps) // 2)])
     return found
 
 
@@ -138,14 +138,13 @@ def timed(work: Callable[[], object], runs: int = RUNS) -> float:
 def released(self_model: SelfModel, iterations: int = 3, samples: int = 1000, steps: int = 8):
     """The arithmetic of the released planner's settings on these networks."""
     domain = self_model.domain
-    items = sum(len(modality.items) for modality in domain.modalities)
     channels = Channels(domain)
     for _ in range(iterations):
         robot = torch.zeros(samples, self_model.latent)
         person = torch.zeros(samples, self_model.latent)
         action = torch.zeros(samples, dtype=torch.long)
         total = torch.zeros(samples)
-        told = torch.rand(samples, steps // 2, items) < 0.35
+        told = torch.rand(samples, steps // 2, len(channels)) < 0.35
         for step in range(steps):
             robot = self_model.transition(robot, action).mean
             observation = domain.nearest(self_model.decode(robot))
