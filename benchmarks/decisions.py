@@ -44,7 +44,7 @@ class Options:
 
 @torch.no_grad()
 def values(judge: Communicator, past: RoundSoFar, flags: torch.Tensor) -> torch.Tensor:
-    """Expected utility over silence of messages for now ``[M, N]``, with the best later ones."""
+    """Expected utility of messages for now ``[M, N]``, with the best later ones."""
     domain = judge.person.human.domain
     context = PlanningContext.of(judge.person, past)
     value = judge.objective.at(context, domain.horizon - past.time, seed=1)
@@ -58,7 +58,7 @@ def values(judge: Communicator, past: RoundSoFar, flags: torch.Tensor) -> torch.
     found, _ = joined(found, now, value)
     mean = found.valued.utility.mean(-1)
     same = (found.candidates[:, None, 0] == flags).all(-1)  # [C, M]
-    return torch.where(same, mean[:, None], -torch.inf).amax(0) - mean[0]
+    return torch.where(same, mean[:, None], -torch.inf).amax(0)
 
 
 def main(options: Options) -> None:

@@ -38,6 +38,7 @@ from mirror_ppl.communication.rounds import RoundSoFar
 from mirror_ppl.domains.base import map_state
 from mirror_ppl.domains.highway import Highway, expert
 from mirror_ppl.people import simulated_people
+from mirror_ppl.randomness import person_id
 
 ROWS = Path(__file__).parents[1] / "docs/results/highway_gap.csv"
 EVERY = 6
@@ -104,7 +105,7 @@ def measured(path: Path, people: int, rounds: int, seed: int, receive: str) -> l
         lambda part: part.view(people, rounds, *part.shape[1:]),
         world.initial(people * rounds, generator),
     )
-    names = [f"person-{number:02d}" for number in range(1, people + 1)]
+    names = [person_id(number) for number in range(people)]
     planners = [mirror_ppl.Communicator(path, name) for name in names]
     memory, observation = drivers.start(rounds), world.observe(state)
     past = [

@@ -78,9 +78,9 @@ def main(options: Options) -> None:
         number = 3 if isinstance(planner.search, CrossEntropy) else len(pasts)
         times[name] = [timed(lambda p=planner, x=past: p.plan(x)) for past in pasts[:number]]
     # Beliefs are kept from step to step, so that each decision is made once.
-    companion = mirror_ppl.Communicator(fit)
+    looping = mirror_ppl.Communicator(fit)
     times["the default, step by step, with hearing inferred"] = [
-        timed(lambda x=past: companion.plan(x), runs=1)
+        timed(lambda x=past: looping.plan(x), runs=1)
         for number in range(ROUNDS)
         for past in steps(held_out, number)
     ]

@@ -24,6 +24,7 @@ from mirror_ppl.domains.driving.oracle import Oracle
 from mirror_ppl.domains.driving.people import SimulatedDrivers
 from mirror_ppl.evaluation.assistance import PlannerOptions, Truth, play, speaker
 from mirror_ppl.evaluation.assistance_cells import Pairing
+from mirror_ppl.randomness import person_id
 from mirror_ppl.training.experience import map_state
 
 
@@ -60,7 +61,7 @@ def main(options: Options) -> None:
             fit.main(
                 fit.Options(setting=options.setting, population=options.population, out=folder)
             )
-    people = tuple(f"person-{number:02d}" for number in options.people)
+    people = tuple(person_id(number - 1) for number in options.people)
     print(f"{'planner':<24} {'lost':>6} {'silent':>6} {'spoken':>6}")
     for horizon in options.horizons:
         for patience in options.patience:

@@ -28,7 +28,7 @@ NUMBERS = {
     "a whole number": r"invalid literal for int\(\) with base 10",
     "a number": "could not convert string to float",
 }
-"""What Python says of texts that are none."""
+"""What a text must be, of which Python says this where it is none."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 """Errors of writing that are not the code's."""
 NO_MEMORY = ("can't allocate memory", "CUDA out of memory")

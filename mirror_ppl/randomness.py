@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 import torch
 
 NUMBERED = re.compile(r"person-(0[1-9]|[1-9][0-9]{1,8})")
-"""Ids that the package gives to people, in whose order they are counted from 1."""
+"""Ids that the package gives to people, who are counted from 1."""
 
 
 def derived_generator(

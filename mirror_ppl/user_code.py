@@ -95,7 +95,8 @@ def describe(error: BaseException, path: Path | None = None) -> str:
         text = f"{type(error).__name__}: {text}" if text else type(error).__name__
     if not frames:
         return text
-    if not own and _PACKAGE in Path(frames[-1].filename).resolve().parents:
+    called = isinstance(error, TypeError) and not own
+    if called and _PACKAGE in Path(frames[-1].filename).resolve().parents:
         return text  # the user's function could not be called, which the message says
     line = (own or frames)[-1]
     return f"{text} ({Path(line.filename).name}, line {line.lineno})"

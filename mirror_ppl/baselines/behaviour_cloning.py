@@ -5,6 +5,8 @@ Implements the baseline BC of MIRROR (Chen, Fong and Soh, RSS 2022; supplement, 
     h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])     48 units
     a_t ~ Categorical(softmax(output(relu(layer(h_t)))))          one layer of 32
 
+On the highway the GRU has 128 units and is followed by three layers of 128.
+
 Each person has a separate network, fitted to that person's rounds by maximum likelihood. ``x_t``
 are the domain's symbols of all items of all modalities. The mask ``v_t`` marks items that the
 setting shows to an unaided person or that were communicated; ``m_t`` marks the latter alone.

@@ -6,7 +6,7 @@ Reddy, Dragan and Levine, *SQIL: Imitation Learning via Reinforcement Learning w
 
     h_t = GRU(h_{t-1}, [ego_t, v_t * x_t, v_t, m_t, a_{t-1}])               48 units
     Q(h_t, .) = output(relu(layer_3(relu(layer_2(relu(layer_1(h_t)))))))    three layers of 32
-    a_t ~ Categorical(softmax(Q(h_t, .)))
+    a_t ~ Categorical(softmax(Q(h_t, .)))                                   on the highway 128 each
 
     delta^2(D, r) = mean over D of (Q(h_t, a_t) - r - discount * log sum_a exp Q(h_{t+1}, a))^2
     loss          = delta^2(recorded, reward) + sampled_weight * delta^2(sampled, 0)

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 KL, LEARNED = "mirror-kl", "mirror-self-model"
 PROGRAM = "python -m mirror_ppl.assist"
+DIGITS = 9
+"""Digits of a number of people that are read; more are too many people anyway."""
 DESCRIPTION = """Let communicators send messages to the simulated people of a posterior in their
 rounds, and print for each the people's returns, the cost of messages and what they were about. All
 play the same rounds with the same random numbers. With --json, --log or --film, the same
@@ -97,7 +99,8 @@ class Options:
     self_model: Path | None = None
     """Weights of the robot's self-model; those that ship unless given."""
     population: str | None = None
-    """Who the people are, where the posterior does not say: paper or diverse."""
+    """Who the people are, where the posterior does not say: paper, diverse, or the prior of a human
+    model of the package, such as "prior of Late"."""
     people_seed: int | None = None
     """The seed that the people were simulated with, where the posterior does not say."""
     seed: int = 0
@@ -189,11 +192,11 @@ def _chosen(options: Options, known: Sequence[str]) -> tuple[str, ...]:
 
     given = options.people
     if len(given) == 1 and given[0] not in known and given[0].isdecimal():
-        number = int(given[0])
+        number = int(given[0][:DIGITS])
         if number < 1:
             raise OptionError(f"--people must be at least 1, not {number}")
         if number > len(known):
-            raise PosteriorError(f"{options.posterior}: is of {len(known)} people, not {number}")
+            raise PosteriorError(f"{options.posterior}: is of {len(known)} people, not {given[0]}")
         return tuple(known[:number])
     for person in given:
         require_known(person, "person", known)
@@ -338,6 +341,7 @@ def _people(options: Options):
     """The posterior, and what its people were simulated with."""
     from mirror_ppl.domains import get_domain, require_known
     from mirror_ppl.inference.results.posterior_file import load_posterior
+    from mirror_ppl.models.simulation import OWN_HUMAN_MODEL, PRIOR_OF
     from mirror_ppl.people import populations_of
 
     given = None if options.domain is None else get_domain(options.domain).name
@@ -373,8 +377,12 @@ def _people(options: Options):
         )
     if not str(source["seed"]).isdecimal():
         raise PosteriorError(f"{options.posterior}: its people's seed is {source['seed']}")
-    from mirror_ppl.models.simulation import PRIOR_OF
-
     if not str(source["population"]).startswith(PRIOR_OF):
         require_known(source["population"], "population", populations_of(domain))
+    elif f"recorded_{OWN_HUMAN_MODEL}" in posterior.attributes:
+        raise PosteriorError(
+            f"{options.posterior}: is of people drawn from the {source['population']}, your own "
+            "human model, who cannot be played further; plan messages for them with "
+            "mirror_ppl.Communicator"
+        )
     return posterior, source

@@ -41,7 +41,8 @@ COMMUNICATORS = (
 )
 """Communicators that can be paired with people, in the order in which they are shown."""
 NO_ORACLE = (
-    "there is an oracle only of people with thresholds of sight of their own (population diverse)"
+    "there is an oracle only of people with thresholds of sight of their own (population diverse) "
+    "and of people who follow a human model"
 )
 REFERENCES = ("none", "all", "nearest", "oracle")
 """Communicators that learn nothing of people, as references for those that do."""

@@ -27,11 +27,12 @@ from mirror_ppl.evaluation.played import Played
 from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
 from mirror_ppl.jobs import JsonFormat, Runner
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.limits import LIMITS
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.loading import file_of, load_human_model
-from mirror_ppl.models.weights import fingerprint, load_self_model, shipped_weights
+from mirror_ppl.models.simulation import PRIOR_OF
+from mirror_ppl.models.weights import SELF_MODEL, fingerprint, load_self_model, shipped_weights
 from mirror_ppl.people import SimulatedPeople, simulated_people
-from mirror_ppl.people.robot_like import SELF_MODEL
 from mirror_ppl.randomness import number_of
 from mirror_ppl.version import __version__
 
@@ -46,7 +47,8 @@ class Pairing:
 
     Attributes:
         posterior: file of the people's posterior.
-        human_model, self_model: those of the fit; the package's own unless given.
+        human_model: of the fit, if it is none of the package's.
+        self_model: of the fit; that which ships unless given.
         draws: posterior draws to plan with.
         setting, population, people_seed: arguments that simulate the people.
         people: ids of the people who are assisted, some of the posterior's.
@@ -88,7 +90,7 @@ class Pairing:
         return load_human_model(name, self_model)
 
     @property
-    def _until(self) -> int:
+    def _simulated(self) -> int:
         """Number of simulated people up to the last one who is assisted."""
         return max(self.numbers.values()) + 1
 
@@ -98,7 +100,7 @@ class Pairing:
             self.domain.name,
             self.setting,
             self.population,
-            self._until,
+            self._simulated,
             self.people_seed,
             self_model=self.self_model,
         )
@@ -116,7 +118,11 @@ class Pairing:
                 f"{self.posterior}: the id {others[0]} is none of simulated people (person-01, "
                 "person-02, ...), so that it is unknown who is to be played"
             )
-        return {person: number for person, number in found.items() if number is not None}
+        numbers = {person: number for person, number in found.items() if number is not None}
+        _, most = LIMITS["people"]
+        if max(numbers.values()) >= most:
+            raise PosteriorError(f"{self.posterior}: ids are above {most}, the most people")
+        return numbers
 
     def check(self) -> None:
         """Check that posterior, human model and self-model match, before any work is done.
@@ -132,21 +138,28 @@ class Pairing:
                 f"{self.posterior}: its people were simulated with another self-model "
                 f"({simulated}); simulate and fit them anew with this one"
             )
-        truth = self.everybody().truth()
-        for site in truth.keys() & self.file.truth.keys():
+        for site, value in self.everybody().truth().items():
             for person, number in self.numbers.items():
-                recorded = float(self.file.truth[site][self.file.people.index(person)])
-                if not math.isclose(recorded, float(truth[site][number]), rel_tol=1e-4):
-                    raise PosteriorError(
-                        f"{self.posterior}: {person} is not that of the population "
-                        f"{self.population} with seed {self.people_seed}: {site} is "
-                        f"{recorded:.4g} in the recordings, not {float(truth[site][number]):.4g}"
-                    )
+                self._check_truth(person, site, float(value[number]))
+
+    def _check_truth(self, person: str, site: str, expected: float) -> None:
+        """Refuse a person who is recorded with another true value of a site."""
+        if site not in self.file.truth:
+            return
+        recorded = float(self.file.truth[site][self.file.people.index(person)])
+        if math.isnan(recorded) or math.isclose(recorded, expected, rel_tol=1e-4):
+            return
+        version = ", or was drawn by another version of this package"
+        raise PosteriorError(
+            f"{self.posterior}: {person} is not that of the population {self.population} with seed "
+            f"{self.people_seed}{version if self.population.startswith(PRIOR_OF) else ''}: {site} "
+            f"is {recorded:.4g} in the recordings, not {expected:.4g}"
+        )
 
     def listeners(self, people: Sequence[str], inferred: bool = True) -> list[Listener]:
         """Return people by id, with their rounds and their posteriors."""
         everybody = self.everybody()
-        found = listeners(everybody, self._until, self.setting, self.rounds, self.seed)
+        found = listeners(everybody, self._simulated, self.setting, self.rounds, self.seed)
         chosen = [found[self.numbers[person]] for person in people]
         if not inferred:
             return chosen
@@ -204,8 +217,7 @@ class Turn:
     @property
     def label(self) -> str:
         """Name in progress messages."""
-        first, last = self.people[0], self.people[-1]
-        who = first if first == last else f"{first} to {last}"
+        who = ", ".join(self.people)
         return f"{' and '.join(self.communicators)}, {who}"
 
 

@@ -25,11 +25,15 @@ from mirror_ppl.models.belief_tracking import BeliefState, Transition
 from mirror_ppl.models.human import HumanModel, require_standard_program
 from mirror_ppl.models.implants import in_units
 from mirror_ppl.models.prior import draw_prior_of_each
+from mirror_ppl.models.weights import SELF_MODEL, fingerprint
 from mirror_ppl.randomness import forked, person_id, seed_everything
+from mirror_ppl.user_code import is_of_package
 from mirror_ppl.version import __version__
 
 PRIOR_OF = "prior of "
 """Prefix of the population's name in recordings of people drawn from a human model's prior."""
+OWN_HUMAN_MODEL = "own_human_model"
+"""Attribute that marks human models which do not come with this package, whatever their names."""
 
 
 @torch.no_grad()
@@ -200,7 +204,9 @@ def simulate_from_prior(
         "population": f"{PRIOR_OF}{type(human).__name__}",
         "seed": seed,
         "version": __version__,
+        SELF_MODEL: fingerprint(human.self_model),
         **({"told": told} if told else {}),
+        **({} if is_of_package(human) else {OWN_HUMAN_MODEL: 1}),
     }
     return replace(recorded, truth=true_values(human, drawn), provenance=provenance)
 

@@ -65,6 +65,7 @@ def simulated_people(
         return own.simulated(setting, population, people, seed, device)
     robot, _ = load_self_model(self_model or shipped_weights(world.name), world.name)
     if model is not None:
+        require_known(setting, "setting", world.settings, world.name)
         return people_from_prior(load_human_model(model, robot.to(device)), people, seed)
     return simulated_robot_like(robot.to(device), setting, population, people, seed)
 
@@ -151,6 +152,7 @@ def simulate(  # noqa: PLR0913 - everything recordings can depend on
         InputError: fewer than one person or round, no seed, or ``told`` is no probability.
     """
     world = get_domain(domain)
+    require_known(population, "population", populations_of(domain), domain)
     setting = world.settings[-1] if setting is None else setting
     people, rounds = whole_number(people, "people", 1), whole_number(rounds, "rounds", 1)
     seed, told = seed_number(seed), real_number(told, "told", 0, 1)

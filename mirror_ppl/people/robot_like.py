@@ -29,12 +29,10 @@ from mirror_ppl.models.implants import (
 )
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.weights import fingerprint
+from mirror_ppl.models.weights import SELF_MODEL, fingerprint
 from mirror_ppl.people.base import SimulatedPeople
 from mirror_ppl.randomness import derived_generator
 
-SELF_MODEL = "self_model"
-"""Key in recordings' provenance of the fingerprint of the people's self-model."""
 POPULATIONS = ("diverse", "paper")
 
 

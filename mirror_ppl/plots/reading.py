@@ -48,7 +48,7 @@ def of_person(data: az.InferenceData, group: str, person: str) -> xr.Dataset:
 
 
 def name_of(data: az.InferenceData, person: str, apart: str = " ") -> str:
-    """Label of a person, with the model check's verdict if the model does not explain them.
+    """Label of a person, with the model check's verdict if that is suspect or unexplained.
 
     Args:
         data: the fit.

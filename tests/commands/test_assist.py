@@ -277,6 +277,7 @@ def test_posteriors_of_something_else_are_refused(posterior, tmp_path, capsys, a
         (("--communicator", "nobody"), 'unknown communicator "nobody"'),
         (("--people", "3"), "is of 2 people, not 3"),
         (("--people", "0"), "--people must be at least 1, not 0"),
+        (("--people", "9" * 5000), "is of 2 people, not 999"),
         (("--people", "person-01", "ann"), 'unknown person "ann"; known: person-01, person-02'),
         (("--draws", "7"), "holds 6 draws, not 7: ask for 6 or fewer"),
         (("--draws", "0"), "--draws must be at least 1, not 0"),

@@ -1,5 +1,6 @@
 """`assist` plays the people of the posterior, whichever of a population they are."""
 
+import copy
 import json
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ import mirror_ppl
 from mirror_ppl.commands import assist
 from mirror_ppl.data import asset_path, load_demonstrations
 from mirror_ppl.inference.results.export import netcdf_content
+from mirror_ppl.models import family
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.simulation import simulate_from_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -79,13 +81,34 @@ def test_people_do_not_depend_on_how_many_follow(world, setting):
             torch.testing.assert_close(value, many[site][:2], rtol=0, atol=0)
 
 
+def test_people_are_planned_for_with_their_own_posteriors(some, posterior_of):
+    """Whichever of them are chosen, and in whichever order."""
+    path = posterior_of(some, train_rounds=3)
+    chosen = ("person-09", "person-02")
+    options = assist.Options(posterior=path, people=chosen, draws=4)
+    posterior, source = assist._people(options)
+    pairing = assist._pairing(options, posterior, source, chosen)
+    draws = posterior.draws(pairing.human, 4)
+    for place, listener in zip((2, 0), pairing.listeners(chosen), strict=True):
+        for site, value in listener.person.draws.items():
+            torch.testing.assert_close(value, draws[site][:, [place]], rtol=0, atol=0)
+    assert not torch.equal(draws["consistency"][:, 0], draws["consistency"][:, 2])
+
+
+def test_unknown_truths_are_not_compared(some, posterior_of, tmp_path, capsys):
+    unknown = {site: torch.full_like(value, torch.nan) for site, value in some.truth.items()}
+    path = posterior_of(replace(some, truth=unknown))
+    assert [*decisions(path, tmp_path)] == list(some.people)
+    capsys.readouterr()
+
+
 def test_people_who_are_not_those_of_the_population_are_refused(
     some, posterior_of, tmp_path, capsys
 ):
     swapped = replace(some, people=("person-09", "person-07", "person-02"))
     named = replace(some, people=("ann", "bob", "cem"))
     for recordings, message in (
-        (swapped, "is not that of the population diverse with seed 0: sight_"),
+        (swapped, "is not that of the population diverse with seed 0: sight_front_own is "),
         (named, "the id ann is none of simulated people (person-01, person-02, ...)"),
     ):
         path = posterior_of(recordings)
@@ -102,6 +125,13 @@ def test_the_human_model_is_that_of_the_file(some, posterior_of, tmp_path, capsy
     assert "is of human model late, not noticing" in capsys.readouterr().err
 
 
+class Late(family.Late):
+    """A user's model with the name of one of the package's."""
+
+    def sees(self, implants, observation, step):
+        return super().sees(implants, observation, step)
+
+
 def test_people_drawn_from_a_human_model_play_further_rounds(posterior_of, tmp_path, capsys):
     human = load_human_model("late", load_self_model(shipped_weights("driving"))[0])
     recorded = simulate_from_prior(human, 3, 2, "fog", seed=4)
@@ -110,3 +140,23 @@ def test_people_drawn_from_a_human_model_play_further_rounds(posterior_of, tmp_p
     assert decisions(one, tmp_path) == {"person-03": expected["person-03"]}
     assert len({json.dumps(own) for own in expected.values()}) == 3
     capsys.readouterr()
+
+
+def test_people_of_another_self_model_or_of_a_user_s_model_are_refused(
+    posterior_of, tmp_path, capsys
+):
+    robot, _ = load_self_model(shipped_weights("driving"))
+    other = copy.deepcopy(robot)
+    with torch.no_grad():
+        next(other.parameters()).add_(0.1)
+    someone = simulate_from_prior(family.Late(other), 1, 1, "fog", seed=4)
+    own = simulate_from_prior(Late(robot), 1, 1, "fog", seed=4)
+    shipped = simulate_from_prior(family.Late(robot), 1, 1, "fog", seed=4)
+    for path, message in (
+        (posterior_of(someone), "its people were simulated with another self-model"),
+        (posterior_of(own), "drawn from the prior of Late, your own human model, who cannot be"),
+        (posterior_of(shipped, human=Late(robot)), "is of your own human model Late; give it as"),
+    ):
+        assert command(assist, "--posterior", path, *SMALL, "--communicator", "none") == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and message in error

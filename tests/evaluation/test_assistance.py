@@ -242,7 +242,7 @@ def test_people_are_divided_into_groups_that_play_together():
     assert [*numbers] == [("oracle",), ("mirror", "random"), ("none",)]
     assert numbers[("none",)] == numbers[("oracle",)] == [tuple("abcde"), tuple("fg")]
     assert numbers[("mirror", "random")] == [tuple("ab"), tuple("cd"), tuple("ef"), ("g",)]
-    assert found[0].label == "oracle, a to e"
+    assert found[0].label == "oracle, a, b, c, d, e"
     assert turns(["none"], "a")[0].label == "none, a"
 
 

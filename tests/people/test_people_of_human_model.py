@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from mirror_ppl.domains import get_domain
-from mirror_ppl.errors import HumanModelError, InputError
+from mirror_ppl.errors import HumanModelError, InputError, UnknownNameError
 from mirror_ppl.models import SelfModel
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.simulation import simulate_from_prior
 from mirror_ppl.models.sizes import Sizes
-from mirror_ppl.people import has_oracle, people_from_prior, simulated_people
+from mirror_ppl.people import has_oracle, people_from_prior, simulate, simulated_people
 
 
 def human_of(world, name):
@@ -73,6 +73,11 @@ def test_a_population_may_be_the_prior_of_a_human_model():
     people = simulated_people("driving", "fog", "prior of Late", 2, 3)
     assert type(people.modelled()[0]).__name__ == "Late"
     assert "late" in people.truth() and has_oracle("driving", "prior of Late")
+    for population in ("prior of Late", "martians"):
+        with pytest.raises(UnknownNameError, match=f'unknown population "{population}"'):
+            simulate("driving", "fog", population, 2, 1)
+    with pytest.raises(UnknownNameError, match='unknown setting "rain"'):
+        simulated_people("driving", "rain", "prior of Late", 2, 3)
     with pytest.raises(InputError, match="people of your own human model Mine cannot be played"):
         simulated_people("driving", "fog", "prior of Mine", 2, 3)
     with pytest.raises(HumanModelError, match="has round_latents, which are drawn anew in each"):

@@ -20,6 +20,7 @@ from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import is_reach
 from mirror_ppl.models.loading import human_models_of, model_name
 from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.models.simulation import OWN_HUMAN_MODEL
 from mirror_ppl.models.weights import fingerprint
 from mirror_ppl.netcdf import read_netcdf
 from mirror_ppl.randomness import forked
@@ -38,7 +39,7 @@ class PosteriorFile:
         people: ids of the people.
         values: draws ``[S, P, ...]`` by name, in the units of the file.
         verdicts: the model check's verdict on each person, by id; none if the file has none.
-        truth: true values ``[P]`` of sites, as recorded; none of people of whom they are unknown.
+        truth: true values ``[P]`` of sites, as recorded; NaN where they are unknown.
     """
 
     path: Path
@@ -58,8 +59,10 @@ class PosteriorFile:
             InputError: it is of a human model that the package does not have.
         """
         name = model_name(self.attributes.get("human_model", "unknown"))
-        if name not in human_models_of(get_domain(self.attributes["domain"])):
-            raise InputError(f"{self.path}: is of your own human model {name}; give it as {option}")
+        known = human_models_of(get_domain(self.attributes["domain"]))
+        if name not in known or OWN_HUMAN_MODEL in self.attributes:
+            own = self.attributes.get("human_model", "unknown")
+            raise InputError(f"{self.path}: is of your own human model {own}; give it as {option}")
         return name
 
     def draws(self, human: HumanModel, number: int | None = None) -> dict[str, Tensor]:
