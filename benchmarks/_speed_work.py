@@ -123,6 +123,23 @@ def add(domain, setting, network):
     return {"first_ms": 1e3 * median(first), "median_ms": 1e3 * median(others)}
 
 
+def arrive(domain, setting):
+    """Milliseconds to the posterior of a new person with 20 rounds, by the network, of five."""
+    from mirror_ppl.inference.online import OnlinePosterior
+
+    human, recordings = human_and_rounds(domain, setting, 6)
+    guide = named("load_guide")(named("shipped_guide")(domain), human)[0]
+    seconds = []
+    for name in recordings.people:
+        own = recordings.select_people([name]).select_rounds(list(range(ROUNDS)))
+        began = perf_counter()
+        online = OnlinePosterior(human, guide)
+        online.add(own)
+        online.draws(200)
+        seconds.append(perf_counter() - began)
+    return {"median_ms": 1e3 * median(seconds[1:])}
+
+
 def main():
     """Measure what the command line names."""
     torch.set_num_threads(1)
@@ -131,6 +148,8 @@ def main():
         found = plan()
     elif what == "decide":
         found = decide(*map(int, arguments))
+    elif what == "arrive":
+        found = arrive(*arguments)
     else:
         found = add(arguments[0], arguments[1], arguments[2] == "network")
     print(json.dumps(found))

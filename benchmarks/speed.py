@@ -7,8 +7,8 @@ turn, in processes of their own, so that whatever else the machine does weighs o
 holds the median of each and their ratio, with the smallest and the largest ratio of a turn; below 1
 this version is the quicker one. Measured are `fit` of the recordings that ship and of 40 simulated
 people (all of the command, by importance, as it shares the cores; with its largest memory, of all
-its processes together), a decision of the communicator with default settings, and a round that is
-added to a person's posterior. Threads are one but in fits.
+its processes together), a decision of the communicator with default settings, the posterior of a
+new person with 20 rounds, and a round that is added to one. Threads are one but in fits.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ def all_measurements() -> dict[str, Measure]:
     found["plan driving"] = lambda tree: work(tree, "plan")
     for domain, setting in WORLDS:
         found[f"add {domain}"] = lambda tree, d=domain, s=setting: work(tree, "add", d, s, "none")
+    found["new person driving"] = lambda tree: work(tree, "arrive", "driving", "fog")
     found["add driving, network"] = lambda tree: work(tree, "add", "driving", "fog", "network")
     return found
 
