@@ -61,7 +61,7 @@ def test_the_picture_shows_where_cars_are_seen(fit):
     assert (np.diff(seen, axis=1) <= 0).all()
     assert (seen[1] == seen[-1]).all() and (seen[6] == seen[-6]).all()  # left as right
     (axes,) = fit.plot.sight().axes
-    assert axes.name == "polar" and axes.get_title() == "person-01"
+    assert axes.name == "polar" and axes.get_title().startswith("person-01")
 
 
 @torch.no_grad()
