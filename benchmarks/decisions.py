@@ -39,7 +39,7 @@ class Options:
     people: int = 10
     """Drivers."""
     moments: int = 50
-    """Of each driver."""
+    """Number of moments for each driver."""
 
 
 @torch.no_grad()

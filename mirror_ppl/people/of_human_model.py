@@ -108,7 +108,9 @@ class PeopleOfHumanModel(SimulatedPeople):
         seen = {name: flat(value) for name, value in observation.items()}
         if told is None:
             told = {
-                m.name: torch.zeros(*shape, len(m.items), dtype=torch.bool)
+                m.name: torch.zeros(
+                    *shape, len(m.items), dtype=torch.bool, device=memory.action.device
+                )
                 for m in self.domain.modalities
             }
         every = torch.arange(number, device=memory.action.device)

@@ -70,7 +70,12 @@ def test_some_of_the_people_are_played_as_among_all(some, posterior_of, tmp_path
 
 @pytest.mark.parametrize(
     ("world", "setting"),
-    [("driving", "fog"), ("search_rescue", "smoke"), ("bomb_defusal", "unlabelled")],
+    [
+        ("driving", "fog"),
+        ("search_rescue", "smoke"),
+        ("bomb_defusal", "unlabelled"),
+        ("highway", "fog"),
+    ],
 )
 def test_people_do_not_depend_on_how_many_follow(world, setting):
     for population in populations_of(world):
