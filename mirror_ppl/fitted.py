@@ -113,8 +113,9 @@ class Fit(fitting.Fit):
         folder = Path(folder)
         with clocked() as seconds:
             with stage("draw"):
-                pictures = self.plot.files()
-                drawn = {name: picture.content() for name, (picture, _) in pictures.items()}
+                pictures, drawn = {}, {}
+                for name, picture, shows in self.plot.files():  # one at a time, to save memory
+                    pictures[name], drawn[name] = shows, picture.content()
             with stage("write"):
                 posterior = netcdf_content(self.data)
         spent = {name: round(each, 2) for name, each in (self.seconds | seconds).items()}
@@ -127,7 +128,7 @@ class Fit(fitting.Fit):
         # Files of an older fit go first: it may have drawn pictures that this one does not, and
         # without a summary the results of a fit that is killed here do not look complete.
         write_together(contents, remove=[folder / name for name in RESULTS])
-        return {name: shows for name, (_, shows) in pictures.items()}
+        return pictures
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from types import CodeType
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mirror_ppl.checks import as_path, real_number, require_kind, seed_number, whole_number
 from mirror_ppl.data import Demonstrations
@@ -250,11 +251,8 @@ def _in_parts(engine: Engine, job: Job) -> Inferred:
         "infer", job.rounds.num_people, partial(_infer_part, engine), job.part, identity
     )
     like = next(job.human.parameters())
-    # Widened site by site, since draws of many people only just fit into memory.
-    draws = {
-        name: widened(torch.cat([part["draws"].pop(name) for part in parts], 1), like)
-        for name in list(parts[0]["draws"])
-    }
+    drawn = [part["draws"] for part in parts]
+    draws = {name: _joined(drawn, name, like) for name in list(drawn[0])}
     seconds: dict[str, float] = {}
     for part in parts:
         add_seconds(seconds, part["seconds"])
@@ -270,6 +268,19 @@ def _in_parts(engine: Engine, job: Job) -> Inferred:
         engines=tuple(name for part in parts for name in part["engines"]),
         seconds=seconds,
     )
+
+
+def _joined(parts: Sequence[dict[str, Tensor]], name: str, like: Tensor) -> Tensor:
+    """Join and widen the draws of a site, which the parts give up one by one to save memory."""
+    first, people = parts[0][name], sum(part[name].shape[1] for part in parts)
+    dtype = widened(first[:0], like).dtype
+    whole = first.new_empty(len(first), people, *first.shape[2:], dtype=dtype)
+    begin = 0
+    for part in parts:
+        own = part.pop(name)
+        whole[:, begin : begin + own.shape[1]] = own
+        begin += own.shape[1]
+    return whole
 
 
 def _infer_part(engine: Engine, part: Job) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from mirror_ppl.errors import InputError
@@ -92,17 +92,17 @@ class FitPlots:
         """
         return self._of_rounds("round")(self.data, person, number, held_out=held_out)
 
-    def files(self) -> dict[str, tuple[Picture, str]]:
-        """Draw all pictures that a fit writes; each with its description, by file name."""
-        pictures = dict(sight.sight_pictures(self.data))
+    def files(self) -> Iterator[tuple[str, Picture, str]]:
+        """Draw the pictures that a fit writes, each with its file name and description."""
+        for name, picture in sight.sight_pictures(self.data).items():
+            yield name, picture.draw(self.data), picture.shows
         if self.data["model_check"].sizes["check"]:
-            pictures[CHECK] = self.check(), "whether the model explains each person"
+            yield CHECK, self.check(), "whether the model explains each person"
         if self._has_identifiability():
             shows = "posterior entropy of what they see"
             if self.data["identifiability"].sizes.get("scenario"):
                 shows += ", and the most informative scenarios"
-            pictures[IDENTIFIABILITY] = plot_identifiability(self.data), shows
-        return pictures
+            yield IDENTIFIABILITY, plot_identifiability(self.data), shows
 
     def _has_identifiability(self) -> bool:
         if "identifiability" not in self.data.groups():

@@ -9,7 +9,7 @@ from mirror_ppl.domains import Record, get_domain
 from mirror_ppl.errors import UnknownNameError
 from mirror_ppl.plots import reach
 from mirror_ppl.plots.notices import NOTICES_PICTURE
-from mirror_ppl.plots.picture import Picture, SightPicture
+from mirror_ppl.plots.picture import SightPicture
 
 if TYPE_CHECKING:
     import arviz as az
@@ -24,13 +24,9 @@ OF_ANY_WORLD: Mapping[str, SightPicture] = {
 """Pictures by file name, for worlds that have none of their own."""
 
 
-def sight_pictures(data: az.InferenceData) -> dict[str, tuple[Picture, str]]:
-    """Draw what each person sees; with descriptions, by file name, empty if none is possible."""
-    return {
-        name: (picture.draw(data), picture.shows)
-        for name, picture in pictures_of(data).items()
-        if picture.possible(data)
-    }
+def sight_pictures(data: az.InferenceData) -> dict[str, SightPicture]:
+    """Pictures of what each person sees that can be drawn, by file name."""
+    return {name: picture for name, picture in pictures_of(data).items() if picture.possible(data)}
 
 
 def pictures_of(data: az.InferenceData) -> Mapping[str, SightPicture]:

@@ -30,8 +30,10 @@ def texts(ax):
 
 @pytest.mark.parametrize("truth", [True, False])
 def test_each_person_has_samples_beneath_the_truth(truth, tmp_path):
-    figure, words = sight_pictures(made_up(2, truth=truth))["notices.png"]
-    assert words == "how probably each person notices what is there"
+    data = made_up(2, truth=truth)
+    picture = sight_pictures(data)["notices.png"]
+    figure = picture.draw(data)
+    assert picture.shows == "how probably each person notices what is there"
     assert [ax.get_title(loc="left") for ax in figure.axes] == ["person-0", "person-1"]
     rows = [label.get_text() for label in figure.axes[0].get_yticklabels()]
     assert rows == ["truth"] * truth + [f"sample {number}" for number in range(1, 6)]
@@ -43,7 +45,7 @@ def test_each_person_has_samples_beneath_the_truth(truth, tmp_path):
 
 
 def test_only_so_many_people_fit():
-    figure, _ = sight_pictures(made_up(14))["notices.png"]
+    figure = sight_pictures(made_up(14))["notices.png"].draw(made_up(14))
     assert len(figure.axes) == 12
     assert "the first 12 of 14 people" in figure.get_suptitle()
     # Three beside each other; items are named above the first ones alone.

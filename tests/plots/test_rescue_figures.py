@@ -33,10 +33,11 @@ def test_probabilities_are_shares_of_draws_that_see_a_portion():
 
 
 def test_pictures_show_truth_probability_and_samples(tmp_path):
-    made = sight_pictures(made_up([1.5, 1.5, 2.0, 10.0]))
+    data = made_up([1.5, 1.5, 2.0, 10.0])
+    made = sight_pictures(data)
     assert set(made) == {"sight.png"}
-    figure, words = made["sight.png"]
-    assert words == "the house as each person sees it"
+    figure = made["sight.png"].draw(data)
+    assert made["sight.png"].shows == "the house as each person sees it"
     titles = [ax.get_title(loc="left") for ax in figure.axes]
     samples = [f"sample {n}" for n in range(1, 5)]
     assert titles[:7] == ["all there is", "what they see", "probability", *samples]
