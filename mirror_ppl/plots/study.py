@@ -58,6 +58,8 @@ NO_ROUNDS = 0.4
 """Position of 0 rounds on the logarithmic scale."""
 WIDTH, HEIGHT, LEGEND = 4.6, 3.8, 1.7
 """Inches: of a panel, and of the legend."""
+ACROSS = 3
+"""Panels beside each other."""
 
 
 class Look(NamedTuple):
@@ -107,7 +109,7 @@ def plot_curves(
             _logarithmic(ax)
         ax.set_xlabel("rounds learned from")
         _title(ax, place)
-    panels[0].set_ylabel(label)
+    _name_measure(panels, label)
     _legend(figure, panels)
     return figure
 
@@ -117,10 +119,23 @@ def _by_place(table: pd.DataFrame) -> list[tuple[Place, pd.DataFrame]]:
 
 
 def _panels(table: pd.DataFrame) -> tuple[Picture, Sequence[Axes]]:
-    """A figure with a panel for each place."""
+    """A figure with a panel for each place, at most ``ACROSS`` beside each other."""
     number = len(table[PLACE].drop_duplicates())
-    figure = Picture(figsize=(WIDTH * number + LEGEND, HEIGHT), layout="constrained")
-    return figure, figure.subplots(1, number, squeeze=False)[0]
+    down = math.ceil(number / ACROSS)
+    across = math.ceil(number / down)
+    figure = Picture(figsize=(WIDTH * across + LEGEND, HEIGHT * down), layout="constrained")
+    grid = list(figure.subplots(down, across, squeeze=False).flat)
+    for ax in grid[number:]:
+        ax.remove()
+    return figure, grid[:number]
+
+
+def _name_measure(panels: Sequence[Axes], label: str) -> None:
+    """Label the vertical axis of the first panel of each row."""
+    for ax in panels:
+        place = ax.get_subplotspec()
+        if place is not None and place.is_first_col():
+            ax.set_ylabel(label)
 
 
 def _is_level(here: pd.DataFrame) -> np.ndarray:
@@ -184,9 +199,10 @@ def plot_relevance(shares: pd.DataFrame) -> Picture:
             ax.bar(x, 100 * one["mean"], 0.9 * width, label=label, **look)
             ax.plot([x, x], [100 * one["low"], 100 * one["high"]], color=BLACK, lw=1)
         ax.set_xticks(range(len(names)), names)
+        ax.set_xlim(-0.5, len(names) - 0.5)
         ax.set_ylim(0, 105)
         _title(ax, place)
-    panels[0].set_ylabel("relevant, % of the communicated items")
+    _name_measure(panels, "relevant, % of the communicated items")
     _legend(figure, panels)
     return figure
 

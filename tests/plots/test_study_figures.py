@@ -42,6 +42,16 @@ def test_relevance_has_a_panel_for_each_place(monkeypatch):
     assert [len(ax.patches) for ax in picture.axes] == [2, 2]
 
 
+def test_five_places_are_in_two_rows_and_each_row_names_the_measure():
+    places = [Place("driving", "fog", name) for name in "abcde"]
+    results = [result("mirror", 1, 0.2, place) for place in places]
+    axes = plot_curves(means_table(results), "NLL").axes
+    assert [ax.get_title()[-1] for ax in axes] == list("abcde")
+    rows = [ax.get_subplotspec().rowspan.start for ax in axes]
+    assert rows == [0, 0, 0, 1, 1]
+    assert [ax.get_ylabel() for ax in axes] == ["NLL", "", "", "NLL", ""]
+
+
 def test_curves_by_ratio_are_numbered_as_they_are_read():
     results = [result("mirror", 1, 0.2), result("mirror", 20, 0.18), result("bc", 1, 1.1)]
     picture = plot_curves(means_table(results), "NLL", by_ratio=True)
