@@ -43,6 +43,9 @@ class Record:
         likelihood_power: power of the likelihood of recorded actions in posteriors. Below 1 it
             takes account of errors of the robot's values that are alike in successive decisions,
             which the model would otherwise take for evidence on a person.
+        value_error: size of the errors of the robot's action values, in units of reward. People do
+            not choose by differences far below it
+            (:func:`mirror_ppl.models.value_errors.beyond_errors`); 0 if they choose by all.
         sight_scale: bins by which the prior ties how far people see in the directions of a group
             (``direction_groups``); None if it does not
             (:func:`mirror_ppl.models.implants.alike`).
@@ -62,6 +65,7 @@ class Record:
     planning: Mapping[str, Any] = field(default_factory=dict)
     baselines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     likelihood_power: float = 1.0
+    value_error: float = 0.0
     sight_scale: float | None = None
     measured: int = 4000
     slow: tuple[str, ...] = ("mirror-svi", "sqil-everything", "sqil-pooled")
@@ -72,6 +76,7 @@ class Record:
 
     def __post_init__(self) -> None:
         require_power(self.likelihood_power, "likelihood_power")
+        real_number(self.value_error, "value_error", 0.0)
         if self.sight_scale is not None:
             real_number(self.sight_scale, "sight_scale", LEAST_SIGHT_SCALE)
 

@@ -129,7 +129,7 @@ def self_model_quality(
     if offers(domain, "reference_values"):
         best = float(returns(domain, start, planner_actions(domain, start, steps, 1.0)).mean())
         report = {"return_exact": best} | report
-    views = _views(domain, rounds, generator)
+    views = views_of(domain, rounds, generator)
     for done, (name, plan) in enumerate(views.items()):
         progress(done, len(views))
         whole = name in ("full", "clear")
@@ -146,14 +146,14 @@ def self_model_quality(
                 report["return_exact_as_it_is"] = float(returns(real, start, planned).mean())
         if best is not None and (whole or domain.settled):
             actions = drive(self_model, start, plan, steps, generator, epsilon=0.2)
-            exact = _exact_values(domain, start, actions, plan, discount)
+            exact = exact_values(domain, start, actions, plan, discount)
             agree, clear = _agreement(self_model, exact, start, actions, plan)
             report |= {f"agreement_{name}": agree, f"clear_agreement_{name}": clear}
     progress(len(views), len(views))
     return report
 
 
-def _views(domain: Domain, rounds: int, generator: torch.Generator) -> dict[str, ViewPlan]:
+def views_of(domain: Domain, rounds: int, generator: torch.Generator) -> dict[str, ViewPlan]:
     """Full view, clear view where there is one, and the domain's partial views."""
     views = {"full": fixed_views(domain, rounds, generator, speech=True)}
     if "clear" in domain.settings:
@@ -167,18 +167,23 @@ def _agreement(
     self_model: SelfModel, exact: Tensor, start: Any, actions: Tensor, plan: ViewPlan
 ) -> tuple[float, float]:
     """Share of decisions that are best by exact values ``[B, T, A]``: of all, and of clear ones."""
-    domain = self_model.domain.as_believed
-    lived = experience(domain, Course.of(domain, start, actions), plan).rounds
-    belief = self_model.believe(
-        self_model.evidence(lived.observation, lived.visible, lived.actions)
-    )
-    best = self_model.action_values(belief[:, :-1]).argmax(-1, keepdim=True)
+    best = robot_values(self_model, start, actions, plan).argmax(-1, keepdim=True)
     agree = exact.gather(-1, best).squeeze(-1) >= exact.amax(-1) - TIE
     stake = exact.amax(-1) - exact.amin(-1)
     return float(agree.float().mean()), float(agree[stake > CLEAR_DECISION].float().mean())
 
 
-def _exact_values(
+def robot_values(self_model: SelfModel, start: Any, actions: Tensor, plan: ViewPlan) -> Tensor:
+    """The robot's action values ``[B, T, A]`` of the world as an observer perceives it."""
+    domain = self_model.domain.as_believed
+    lived = experience(domain, Course.of(domain, start, actions), plan).rounds
+    belief = self_model.believe(
+        self_model.evidence(lived.observation, lived.visible, lived.actions)
+    )
+    return self_model.action_values(belief[:, :-1])
+
+
+def exact_values(
     domain: Domain, start: Any, actions: Tensor, plan: ViewPlan, discount: float
 ) -> Tensor:
     """Exact action values ``[B, T, A]`` of the world as the observer believes it to be."""

@@ -10,6 +10,7 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
     u_t        = what psi_p takes for granted about the rest
     zH_t       = mean of q(. | zH_{t-1}, v_t * x_t + u_t, v_t, a_{t-1})   social projection
     a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
+                 Q without differences that may be errors of the network (search and rescue)
     z_t, x_t, r_t ~ the self-model's transition, observation and reward likelihoods
 
 To change the model, derive from :class:`HumanModel` and override one of ``prior``,
@@ -44,6 +45,7 @@ from mirror_ppl.models.networks import Gaussian, log_softmax_with_lapse
 from mirror_ppl.models.perception import perceived_by
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
+from mirror_ppl.models.value_errors import beyond_errors
 from mirror_ppl.models.view import View
 from mirror_ppl.models.world_program import first_state, next_state, reward
 from mirror_ppl.randomness import forked
@@ -118,8 +120,11 @@ class HumanModel(nn.Module):
         return self.domain.record.likelihood_power
 
     def action_values(self, belief: Tensor) -> Tensor:
-        """Return action values ``[..., A]`` at beliefs ``[..., Z]``, an argument of :meth:`act`."""
-        return self.self_model.action_values(belief)
+        """Return action values ``[..., A]`` at beliefs ``[..., Z]``, an argument of :meth:`act`.
+
+        They are the robot's, without differences that may be errors of its network.
+        """
+        return beyond_errors(self.self_model.action_values(belief), self.domain.record.value_error)
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person; runs inside ``pyro.plate("person", P, dim=-2)``.

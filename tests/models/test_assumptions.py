@@ -14,7 +14,7 @@ from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import map_state, roll_out
 from mirror_ppl.domains.driving import CAR_LANES, CARS, ROAD_END, DrivingState
 from mirror_ppl.domains.driving.people import Memory, remember
-from mirror_ppl.evaluation.self_model import _exact_values, fixed_views
+from mirror_ppl.evaluation.self_model import exact_values, fixed_views
 from mirror_ppl.training.experience import Course, experience, follow, supposed
 from mirror_ppl.training.views import ASSUMPTION_PROBABILITY, KIND_PROBABILITIES, draw_views
 
@@ -298,7 +298,7 @@ def test_the_believed_world_is_the_one_that_drivers_remember(generator):
 @pytest.mark.parametrize(("clear", "closing"), BOTH)
 def test_the_exact_planner_of_a_view_plans_in_the_believed_world(clear, closing):
     plan, _ = lived_by(clear, closing)
-    found = _exact_values(DRIVING, four_cars(), STAY4, plan, 0.9)
+    found = exact_values(DRIVING, four_cars(), STAY4, plan, 0.9)
     # Cars that are known are as they are; those that are not are known from some step on.
     position, speed = torch.tensor([5, 0, -3, -8]), torch.tensor([1, -1, -1, 1])
     for step, known_ahead in enumerate((False, False, False, True)):
