@@ -1,13 +1,14 @@
-"""How far a robot's values separate actions that are equally good, in units of choices.
+"""How far values of a robot and of its human model separate actions that are equally good.
 
     python -m benchmarks.ties
 
 Rounds are played with one random action in five. At each decision with several actions that are
 exactly the best for an observer with some view, the robot's values of these actions differ by
-errors of its network; choices multiply this by the person's consistency. A model of a person takes
-a difference of .05 or more for evidence about sight and choices. Consistency is the mean over the
-posterior of ten simulated people (20 rounds, seed 0, the setting in which they see most), of whom
-the median is taken. The table of docs/self_model.md is printed.
+errors of its network. Choices multiply what the human model leaves of these differences
+(`Record.value_error`) by the person's consistency: a product of .05 or more is evidence where there
+is none. Consistency is the mean over the posterior of ten simulated people (20 rounds, seed 0, the
+setting in which they see most), of whom the median is taken. The table of docs/self_model.md is
+printed.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ import mirror_ppl
 from mirror_ppl.domains import get_domain
 from mirror_ppl.domains.base import roll_out
 from mirror_ppl.evaluation.self_model import TIE, exact_values, robot_values, views_of
+from mirror_ppl.models.value_errors import beyond_errors
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.training.experience import drive
+from mirror_ppl.training.self_model_options import SelfModelOptions
 
 WORLDS = "driving", "search_rescue", "bomb_defusal"
-ROUNDS, DISCOUNT, EPSILON = 400, 0.9, 0.2
+ROUNDS, EPSILON = 400, 0.2
 AIM = 0.05
 
 
@@ -58,19 +61,21 @@ def lines(world: str, seed: int) -> list[str]:
     generator = torch.Generator().manual_seed(seed)
     start = domain.initial(ROUNDS, generator)
     factor, found = consistency(world), []
+    discount = domain.record.training.get("discount", SelfModelOptions.discount)
     for name, plan in views_of(domain, ROUNDS, generator).items():
         if not domain.settled and name not in ("full", "clear"):
             continue
         actions = drive(self_model, start, plan, domain.horizon, generator, epsilon=EPSILON)
         under_way = ~domain.over(roll_out(domain, start, actions))[:, :-1]
-        exact = exact_values(domain, start, actions, plan, DISCOUNT)[under_way]
-        apart = separations(exact, robot_values(self_model, start, actions, plan)[under_way])
-        share, times = len(apart) / len(exact), factor * apart
-        cells = ["", "", "", ""]
+        exact = exact_values(domain, start, actions, plan, discount)[under_way]
+        values = robot_values(self_model, start, actions, plan)[under_way]
+        apart = separations(exact, values)
+        left = factor * separations(exact, beyond_errors(values, domain.record.value_error))
+        cells = [f"{100 * len(apart) / len(exact):.0f}%", "", "", ""]
         if len(apart):
-            numbers = apart.mean(), times.mean(), np.quantile(times, 0.9)
-            cells = [f"{number:.3f}" for number in numbers] + [f"{100 * (times < AIM).mean():.0f}%"]
-        found.append(f"| {world}, {name} | {factor:.1f} | {100 * share:.0f}% | {' | '.join(cells)} |")
+            cells[1:] = (f"{number:.3f}" for number in (apart.mean(), left.mean()))
+            cells.append(f"{100 * (left < AIM).mean():.0f}%")
+        found.append(f"| {world}, {name} | {factor:.1f} | {' | '.join(cells)} |")
     return found
 
 
@@ -82,9 +87,10 @@ def main() -> None:
     given = parser.parse_args()
     print(
         "| World, view | Consistency | Decisions with equally good actions | Difference of the "
-        f"robot's values, mean | times consistency, mean | 90% below | below {AIM} |"
+        "robot's values, mean | Of the human model's, times consistency, mean | of these below "
+        f"{AIM} |"
     )
-    print(f"|{'---|' * 7}")
+    print(f"|{'---|' * 6}")
     for world in given.worlds:
         print(*lines(world, given.seed), sep="\n", flush=True)
 
