@@ -16,6 +16,7 @@ from benchmarks import (
     planner_settings,
     pooling,
     sbc,
+    value_errors,
 )
 from benchmarks._rows import rows_in
 from benchmarks.reach import ROWS, table
@@ -65,6 +66,12 @@ def test_the_table_of_planner_settings_is_what_its_rows_say():
     found = page.partition("<!-- planner settings -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == planner_settings.table(rows)
     assert all(int(row["seed"]) >= 100 for row in rows)
+
+
+def test_the_table_of_value_errors_is_what_its_rows_say():
+    page = (DOCS / "decisions.md").read_text()
+    found = page.partition("<!-- value errors -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == value_errors.table(rows_in(value_errors.ROWS))
 
 
 def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
