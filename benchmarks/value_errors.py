@@ -94,7 +94,8 @@ def table(rows: list[dict[str, str]]) -> str:
                     float(row["log_evidence"]) - none[row["seed"], row["person"]] for row in own
                 ]
                 seeds = sorted({int(row["seed"]) for row in own})
-                where = f"{setting}, {len(own)} of seeds {', '.join(map(str, seeds))}"
+                named = ("seed " if len(seeds) == 1 else "seeds ") + ", ".join(map(str, seeds))
+                where = f"{setting}, {len(own)} of {named}"
                 nll = np.mean([float(row["nll"]) for row in own])
                 radius, lapse = (
                     sum(int(row[name]) for row in own) for name in ("radius_held", "lapse_held")
