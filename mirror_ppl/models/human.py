@@ -306,7 +306,7 @@ class HumanModel(nn.Module):
         Args:
             implants: as :meth:`prior` returned them, ``[..., P, 1]``.
             belief: ``[..., P, B, Z]``.
-            values: the self-model's action values at the belief, ``[..., P, B, A]``.
+            values: the belief's :meth:`action_values`, ``[..., P, B, A]``.
         """
         # The sum has the residual's layout in memory, with which softmax_of_few is fast.
         residual = implant_priors.residual(implants, belief)
