@@ -182,6 +182,8 @@ class Stages:
         if self.progress is None or self.progress.name != name:
             self.__exit__(None, None, None)
             self.progress = Progress(name, total).__enter__()
+            if done:
+                self.progress.resume(done)
         self.progress.update(done, message)
 
 

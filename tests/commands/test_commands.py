@@ -17,7 +17,7 @@ from mirror_ppl import errors
 from mirror_ppl.commands import COMMANDS
 from mirror_ppl.console import run
 from mirror_ppl.errors import MirrorError, UnknownNameError
-from mirror_ppl.progress import Progress
+from mirror_ppl.progress import Progress, Stages
 
 
 def python(*args, **kwargs):
@@ -250,6 +250,20 @@ def test_progress_ends_with_the_last_state_once(clock):
         progress.advance("loss 1.5")
         clock[0] += 125
     assert stream.getvalue() == "fit: 2/2 loss 1.5, 2 min 5 s\n"
+
+
+def test_a_stage_that_is_resumed_says_so_and_reckons_by_what_this_run_did(clock, capsys):
+    """Of two stages the first is resumed."""
+    with Stages() as stages:
+        stages.report("infer", 4, 6, "people")
+        clock[0] += 600
+        stages.report("infer", 5, 6, "people")
+        stages.report("describe", 0, 6, "people")
+    assert capsys.readouterr().err.splitlines() == [
+        "infer: 4/6 4 were done before, 0 s",
+        "infer: 5/6 people, 10 min 0 s, 10 min 0 s left",
+        "describe: 0/6 people, 0 s",
+    ]
 
 
 def test_progress_of_resumed_work_reckons_by_what_this_run_did(clock):
