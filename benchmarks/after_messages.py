@@ -161,7 +161,7 @@ def divergence(person: Person, rounds: Told) -> Tensor:
         ]
     )
     belief = torch.stack([state.believed for state in states], 1).flatten(0, 1)[None]
-    predicted = person.act(belief, human.self_model.action_values(belief))[0]
+    predicted = person.act(belief, human.action_values(belief))[0]
     true = rounds.probabilities.flatten(0, 1)
     return (true * (true.clamp(min=1e-9).log() - predicted)).sum(-1).mean()
 

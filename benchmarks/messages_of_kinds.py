@@ -1,16 +1,17 @@
-r"""What messages of `mirror` are worth to drivers whom its human model does not describe.
+r"""What messages are worth to drivers whom the human model `mirror` does not describe.
 
     python -m benchmarks.messages_of_kinds --seeds 0 1 2 3
     python -m benchmarks.messages_of_kinds --seeds 0 1 --human-model all \
-        --kinds "another goal" "a step late"
+        --kinds "a step late" "another goal" "two steps late" "notices half" "mostly forgets" \
+        "as modelled" "dislikes switching"
 
 Drivers of the kinds of benchmarks/model_check.py, and drivers whom no message reaches, play 20
 rounds in fog, without messages. Posteriors of the human model are inferred from these. Then each
 driver plays further rounds twice: in silence, and with messages planned with that posterior, which
 learns from round to round only whether messages reach them. Both have the same initial states and
 the same random numbers. This writes a row for each driver to
-docs/results/driving_messages_of_kinds.csv; seeds that are there are not done again. The table of
-docs/communicator.md is printed.
+docs/results/driving_messages_of_kinds.csv; seeds that are there are not done again. The tables of
+docs/communicator.md are printed.
 """
 
 from __future__ import annotations
@@ -156,6 +157,20 @@ def table(rows: Sequence[dict[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def ahead(rows: Sequence[dict[str, str]]) -> str:
+    """Return how much more net return `all` gains than `mirror`, of drivers who had both."""
+    found = {}
+    for row in rows:
+        driver = row["kind"], row["seed"], row["person"]
+        found[driver, row["human_model"]] = float(row["reward"]) - float(row["cost"])
+    lines = ["| Kind of driver | `all` ahead of `mirror` |", "|---|---|"]
+    for kind in dict.fromkeys(row["kind"] for row in rows if row["human_model"] == "all"):
+        drivers = [driver for driver, model in found if driver[0] == kind and model == "all"]
+        more = interval(np.array([found[one, "all"] - found[one, "mirror"] for one in drivers]))
+        lines.append(f"| {kind} | {more.mean:.2f} [{more.low:.2f}, {more.high:.2f}] |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Measure the seeds and kinds that are missing, and print the table."""
     parser = argparse.ArgumentParser(
@@ -176,7 +191,7 @@ def main() -> None:
                 new = measured(name, human, known, seed, given.human_model)
                 rows = rows_in(ROWS, rows + new)
                 print(f"seed {seed}: {name}", flush=True)
-    print(table(rows))
+    print(table(rows), ahead(rows), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -140,7 +140,7 @@ def _assistance(rows: Rows) -> str:
     ways, parts = ways_to_oracle(rows), []
     for place in dict.fromkeys(one.place for one in ways):
         here = [one for one in ways if one.place == place]
-        if all(one.share is None for one in here):  # the oracle gains too little
+        if all(one.share is None for one in here):  # the oracle's gain is uncertain
             continue
         numbers = sorted({one.rounds for one in here})
         by = {(one.model, one.rounds): one for one in here}

@@ -114,7 +114,8 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     rows = rows_in(ROWS) if ROWS.exists() else []
-    for seed, setting, error in product(given.seeds, SETTINGS, given.errors):
+    errors = sorted({0.0, *given.errors})  # others are compared with none
+    for seed, setting, error in product(given.seeds, SETTINGS, errors):
         cell = str(seed), setting, f"{error:g}"
         if cell not in {(row["seed"], row["setting"], row["error"]) for row in rows}:
             rows = rows_in(ROWS, rows + list(measured(setting, seed, error)))

@@ -113,9 +113,10 @@ class Fit(fitting.Fit):
         folder = Path(folder)
         with clocked() as seconds:
             with stage("draw"):
-                pictures, drawn = {}, {}
-                for name, picture, shows in self.plot.files():  # one at a time, to save memory
-                    pictures[name], drawn[name] = shows, picture.content()
+                descriptions, drawn = {}, {}
+                for name, picture, shows in self.plot.files():
+                    descriptions[name], drawn[name] = shows, picture.content()
+                    del picture  # one at a time is in memory
             with stage("write"):
                 posterior = netcdf_content(self.data)
         spent = {name: round(each, 2) for name, each in (self.seconds | seconds).items()}
@@ -128,7 +129,7 @@ class Fit(fitting.Fit):
         # Files of an older fit go first: it may have drawn pictures that this one does not, and
         # without a summary the results of a fit that is killed here do not look complete.
         write_together(contents, remove=[folder / name for name in RESULTS])
-        return pictures
+        return descriptions
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ SQIL_IN_LONG_ROUNDS: Mapping[str, Any] = {
 """Settings of SQIL for long rounds: it takes many steps until it imitates what people do."""
 LEAST_POWER = 0.001
 """Least power of the likelihood; at 0 recordings would say nothing."""
+LARGEST_ERROR = 1e6
+"""Largest ``value_error``."""
 LEAST_SIGHT_SCALE = 0.1
 """Least ``sight_scale``; below that, directions would be equal."""
 PARTS = ("people", "human_models", "pictures", "rounds")
@@ -44,7 +46,7 @@ class Record:
             takes account of errors of the robot's values that are alike in successive decisions,
             which the model would otherwise take for evidence on a person.
         value_error: size of the errors of the robot's action values, in units of reward. People do
-            not choose by differences far below it
+            not choose by differences to the best value that are far below it
             (:func:`mirror_ppl.models.value_errors.beyond_errors`); 0 if they choose by all.
         sight_scale: bins by which the prior ties how far people see in the directions of a group
             (``direction_groups``); None if it does not
@@ -76,7 +78,7 @@ class Record:
 
     def __post_init__(self) -> None:
         require_power(self.likelihood_power, "likelihood_power")
-        real_number(self.value_error, "value_error", 0.0)
+        real_number(self.value_error, "value_error", 0.0, LARGEST_ERROR)
         if self.sight_scale is not None:
             real_number(self.sight_scale, "sight_scale", LEAST_SIGHT_SCALE)
 

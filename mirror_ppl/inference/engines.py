@@ -272,9 +272,9 @@ def _in_parts(engine: Engine, job: Job) -> Inferred:
 
 def _joined(parts: Sequence[dict[str, Tensor]], name: str, like: Tensor) -> Tensor:
     """Join and widen the draws of a site, which the parts give up one by one to save memory."""
-    first, people = parts[0][name], sum(part[name].shape[1] for part in parts)
-    dtype = widened(first[:0], like).dtype
-    whole = first.new_empty(len(first), people, *first.shape[2:], dtype=dtype)
+    number, _, *rest = parts[0][name].shape
+    people = sum(part[name].shape[1] for part in parts)
+    whole = widened(parts[0][name][:0], like).new_empty(number, people, *rest)
     begin = 0
     for part in parts:
         own = part.pop(name)

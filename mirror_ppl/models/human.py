@@ -10,7 +10,7 @@ Implements the generative process of MIRROR (Chen, Fong and Soh, RSS 2022) for a
     u_t        = what psi_p takes for granted about the rest
     zH_t       = mean of q(. | zH_{t-1}, v_t * x_t + u_t, v_t, a_{t-1})   social projection
     a_t        ~ (1 - lapse) softmax(consistency * Q(zH_t) + delta(zH_t)) + lapse / A
-                 Q without differences that may be errors of the network (search and rescue)
+                 Q without small differences to its maximum in search and rescue (value_errors)
     z_t, x_t, r_t ~ the self-model's transition, observation and reward likelihoods
 
 To change the model, derive from :class:`HumanModel` and override one of ``prior``,
@@ -122,7 +122,7 @@ class HumanModel(nn.Module):
     def action_values(self, belief: Tensor) -> Tensor:
         """Return action values ``[..., A]`` at beliefs ``[..., Z]``, an argument of :meth:`act`.
 
-        They are the robot's, without differences that may be errors of its network.
+        They are the robot's, without small differences to the best one where these may be errors.
         """
         return beyond_errors(self.self_model.action_values(belief), self.domain.record.value_error)
 

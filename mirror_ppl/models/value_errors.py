@@ -1,4 +1,4 @@
-"""Differences of action values that may be errors of the robot's network."""
+"""Small differences to the best action's value, which may be errors of the robot's network."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from torch import Tensor
 def beyond_errors(values: Tensor, error: float) -> Tensor:
     """Shrink differences to the best action's value, the more the smaller they are.
 
-    With ``A = max Q - Q``, values become ``max Q - A (1 - exp(-(A / error)^2))``. Equally good
-    actions, whose values the network separates by its errors, are nearly equal again, so that
+    With ``d = max Q - Q``, values become ``max Q - d (1 - exp(-(d / error)^2))``. Actions that are
+    all the best, whose values the network separates by its errors, are nearly equal again, so that
     consistency does not multiply the errors, and choices among such actions are no evidence. A
     third of a difference as large as the error is lost, and 2% of one that is twice as large.
+    Differences between two worse actions are not made smaller.
 
     Args:
         values: action values ``[..., A]``, in units of reward.

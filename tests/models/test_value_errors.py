@@ -50,6 +50,7 @@ def test_people_choose_by_values_without_errors_of_their_world(domain):
     assert torch.equal(found, values) == (error == 0)
 
 
-def test_a_negative_error_is_refused():
-    with pytest.raises(InputError, match="value_error must be at least 0, not -0.1"):
-        Record(value_error=-0.1)
+@pytest.mark.parametrize("error", [-0.1, math.inf])
+def test_an_impossible_error_is_refused(error):
+    with pytest.raises(InputError, match=r"value_error must be from 0 to 1e\+06, not"):
+        Record(value_error=error)

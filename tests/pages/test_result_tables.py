@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 import xarray as xr
 
 from benchmarks import (
@@ -16,6 +17,7 @@ from benchmarks import (
     planner_settings,
     pooling,
     sbc,
+    ties,
     value_errors,
 )
 from benchmarks._rows import rows_in
@@ -72,6 +74,18 @@ def test_the_table_of_value_errors_is_what_its_rows_say():
     page = (DOCS / "decisions.md").read_text()
     found = page.partition("<!-- value errors -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == value_errors.table(rows_in(value_errors.ROWS))
+
+
+def test_the_table_of_equally_good_actions_is_what_its_rows_say():
+    page = (DOCS / "self_model.md").read_text()
+    found = page.partition("<!-- ties -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == ties.table(rows_in(ties.ROWS))
+
+
+def test_separations_are_of_the_best_actions_alone():
+    exact = torch.tensor([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [2.0, 2.0, 2.0]])
+    values = torch.tensor([[0.9, 1.1, 5.0], [1.0, 0.0, 0.5], [1.0, 2.0, 4.0]])
+    assert ties.separations(exact, values).tolist() == pytest.approx([0.2, 3.0])
 
 
 def test_the_table_of_messages_to_drivers_is_what_its_rows_say():
@@ -230,6 +244,8 @@ def test_messages_to_drivers_of_other_kinds_are_what_their_rows_say():
     page, rows = (DOCS / "communicator.md").read_text(), rows_in(messages_of_kinds.ROWS)
     found = page.partition("<!-- kinds -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == messages_of_kinds.table(rows)
+    found = page.partition("<!-- all ahead -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == messages_of_kinds.ahead(rows)
     assert all(int(row["seed"]) < 100 for row in rows)
 
 

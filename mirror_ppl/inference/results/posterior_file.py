@@ -27,6 +27,8 @@ from mirror_ppl.randomness import forked
 
 POSTERIOR = "posterior.nc"
 """Name of the file in the folder of a fit."""
+BEFORE = {"value_error": "0"}
+"""Attributes that files from before they were kept do not have."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,9 @@ def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -
         ("domain_version", human.domain.version),
         ("human_model", type(human).__name__),
         ("self_model", fingerprint(human.self_model)),
+        ("value_error", f"{human.domain.record.value_error:g}"),
     ):
-        own = attributes.get(name)
+        own = attributes.get(name, BEFORE.get(name))
         if own != mine:
             given = "what it was fitted with"
             if name == "human_model":
