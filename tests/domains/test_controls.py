@@ -240,8 +240,13 @@ def test_companions_are_told_what_was_executed(human):
         companion.observe(first, [3.0])
 
 
-def test_simulated_people_are_the_human_model(human):
+@pytest.mark.parametrize("error", [0.0, 0.5])
+def test_simulated_people_are_the_human_model(human, error, monkeypatch):
     """What they do has the probabilities that the program gives it, noise of controls included."""
+    record = replace(human.domain.record, value_error=error)
+    monkeypatch.setattr(human.domain, "record", record, raising=False)
+    with torch.no_grad():  # values that differ by about the error
+        human.self_model.q_network.value.weight *= 5
     people = simulated_robot_like(human.self_model, "everyday", "diverse", 3, 0)
     rounds = recorded(people, "everyday", "diverse", 4, 0)
     model, known = people.modelled()
