@@ -23,6 +23,7 @@ from torch import Tensor
 
 import mirror_ppl
 from benchmarks._rows import rows_in
+from benchmarks.tables import TITLES
 from benchmarks.value_errors import WithError
 from mirror_ppl.domains.base import roll_out
 from mirror_ppl.evaluation.self_model import TIE, exact_values, robot_values, views_of
@@ -102,7 +103,7 @@ def table(rows: Sequence[dict[str, str]]) -> str:
         f"|{'---|' * 7}",
     ]
     for row in rows:
-        name = f"{row['world'].replace('_', ' ')}, "
+        name = TITLES.get(row["world"], row["world"].replace("_", " ").capitalize())
         view = VIEWS.get(row["view"], row["view"].replace("_", " "))
         cells = ["", "", ""]
         if row["difference"]:
@@ -110,7 +111,7 @@ def table(rows: Sequence[dict[str, str]]) -> str:
             product = difference * float(row["consistency"])
             cells = [f"{difference:.3f}", f"{product:.2f}", f"{100 * float(row['below']):.0f}%"]
         lines.append(
-            f"| {name}{view} | {row['error']} | {float(row['consistency']):.1f} "
+            f"| {name}, {view} | {row['error']} | {float(row['consistency']):.1f} "
             f"| {100 * float(row['share']):.0f}% | {' | '.join(cells)} |"
         )
     return "\n".join(lines)
