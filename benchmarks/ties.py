@@ -1,6 +1,6 @@
 """How far values separate actions that are equally good, by which people would choose.
 
-    python -m benchmarks.ties
+    python -m benchmarks.ties --worlds driving search_rescue bomb_defusal
 
 Rounds are played with one random action in five. At each decision with several actions that are
 exactly the best for an observer with some view, the robot's values of these actions differ by
@@ -118,13 +118,18 @@ def table(rows: Sequence[dict[str, str]]) -> str:
 
 
 def main() -> None:
-    """Measure if asked to, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--worlds", nargs="*", default=WORLDS, help="worlds with exact values")
+    """Measure some worlds anew, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--worlds", nargs="*", default=[], choices=WORLDS, help="to measure anew")
     parser.add_argument("--seed", type=int, default=3, help="of the rounds")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [row for world in given.worlds for row in measured(world, given.seed)]
+    kept = rows_in(ROWS) if ROWS.exists() else []
+    rows = [row for row in kept if row["world"] not in given.worlds]
+    rows += [row for world in given.worlds for row in measured(world, given.seed)]
+    rows.sort(key=lambda row: WORLDS.index(row["world"]))
     print(table(rows_in(ROWS, rows)))
 
 

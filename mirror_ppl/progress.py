@@ -84,7 +84,7 @@ class Progress:
         self._resume(done)
         self.done = done
         if self._display is not None:
-            self.message = f"{done} were done before" if done else ""
+            self.message = "done before" if done else ""
             self._shown = (done, self.message)
             self._show()
 

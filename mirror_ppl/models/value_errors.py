@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+NEGLIGIBLE = 1e-6
+"""Size of errors below which values stay as they are."""
+
 
 def beyond_errors(values: Tensor, error: float) -> Tensor:
     """Shrink differences to the best action's value, the more the smaller they are.
@@ -13,13 +16,14 @@ def beyond_errors(values: Tensor, error: float) -> Tensor:
     all the best, whose values the network separates by its errors, are nearly equal again, so that
     consistency does not multiply the errors, and choices among such actions are no evidence. A
     third of a difference as large as the error is lost, and 2% of one that is twice as large.
-    Differences between two worse actions are not made smaller.
+    Differences between two actions that are both more than .7 errors behind the best are not made
+    smaller.
 
     Args:
         values: action values ``[..., A]``, in units of reward.
         error: size of the errors; 0 leaves the values as they are.
     """
-    if not error:
+    if error < NEGLIGIBLE:
         return values
     best = values.amax(-1, keepdim=True)
     behind = best - values

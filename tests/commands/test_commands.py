@@ -260,7 +260,7 @@ def test_a_stage_that_is_resumed_says_so_and_reckons_by_what_this_run_did(clock,
         stages.report("infer", 5, 6, "people")
         stages.report("describe", 0, 6, "people")
     assert capsys.readouterr().err.splitlines() == [
-        "infer: 4/6 4 were done before, 0 s",
+        "infer: 4/6 done before, 0 s",
         "infer: 5/6 people, 10 min 0 s, 10 min 0 s left",
         "describe: 0/6 people, 0 s",
     ]
@@ -281,7 +281,7 @@ def test_progress_of_resumed_work_reckons_by_what_this_run_did(clock):
         assert progress.left == 0
         progress.update(6, "bc")
     assert stream.getvalue().splitlines() == [
-        "evaluate: 4/6 4 were done before, 0 s",
+        "evaluate: 4/6 done before, 0 s",
         "evaluate: 5/6 mirror, 10 min 0 s, 10 min 0 s left",
         "evaluate: 6/6 bc, 27 min 40 s",
     ]

@@ -50,7 +50,7 @@ def test_prediction_writes_a_table_numbers_and_a_picture(tmp_path, capsys):
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
     # Again it does nothing, and says so; of more models it does the others.
     assert command(evaluate, *args) == 0
-    assert "6/6 6 were done before" in capsys.readouterr().err
+    assert "6/6 done before" in capsys.readouterr().err
     args[args.index("logistic")] = "policy-only"
     assert command(evaluate, *args) == 0
     assert len(list((tmp_path / "parts").iterdir())) == 2 * (len(QUICK) + 1)
@@ -80,7 +80,7 @@ def test_relevance_uses_what_assistance_played(tmp_path, capsys):
     assert "net return per round" in capsys.readouterr().out
     assert command(evaluate, "relevance", *args) == 0
     out, err = capsys.readouterr()
-    assert "3 were done before" in err
+    assert "3/3 done before" in err
     assert "driving, fog, paper: items about collision course" in out
     assert "no messages" in out  # by none
     content = json.loads((tmp_path / "relevance.json").read_text())["relevance"]

@@ -264,8 +264,9 @@ def test_draws_of_another_version_or_model(tmp_path, draws, name, other, told):
     with pytest.raises(PosteriorError) as error:
         file.draws(human())
     assert str(error.value).startswith(f"{path}: {told}")
-    hint = " (--human-model; in Python human=)" if name == "human_model" else ""
-    assert str(error.value).endswith(f"; fit again, or give what it was fitted with{hint}")
+    hint = ", or give what it was fitted with" if name != "value_error" else ""
+    hint += " (--human-model; in Python human=)" if name == "human_model" else ""
+    assert str(error.value).endswith(f"; fit again{hint}")
 
 
 def test_draws_for_another_domain_than_theirs(tmp_path, draws):

@@ -22,6 +22,7 @@ def test_differences_are_shrunk_as_the_docstring_says():
 def test_without_errors_values_stay():
     values = torch.randn(3, 4, generator=torch.Generator().manual_seed(0))
     assert beyond_errors(values, 0.0) is values
+    assert beyond_errors(values, 1e-50) is values
 
 
 def test_the_order_of_actions_and_the_best_value_stay():
@@ -29,6 +30,12 @@ def test_the_order_of_actions_and_the_best_value_stay():
     found = beyond_errors(values, 0.5)
     assert torch.equal(found.argsort(-1), values.argsort(-1))
     assert torch.equal(found.amax(-1), values.amax(-1))
+
+
+def test_differences_between_two_worse_actions_are_not_made_smaller():
+    behind = torch.linspace(0.0708, 2, 1000).double()
+    found = -beyond_errors(torch.cat([torch.zeros(1).double(), -behind]), 0.1)[1:]
+    assert (found.diff() >= behind.diff() - 1e-12).all()
 
 
 def test_gradients_are_finite_where_actions_are_equally_good():

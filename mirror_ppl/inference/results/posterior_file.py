@@ -155,9 +155,9 @@ def check_origin(path: Path, attributes: Mapping[str, str], human: HumanModel) -
             if name == "human_model":
                 own, mine = (model_name(str(one)) for one in (own, mine))
                 given += " (--human-model; in Python human=)"
+            mend = "fit again" if name == "value_error" else f"fit again, or give {given}"
             raise PosteriorError(
-                f"{path}: is of {name.replace('_', ' ')} {own}, not {mine}; fit again, or "
-                f"give {given}"
+                f"{path}: is of {name.replace('_', ' ')} {own}, not {mine}; {mend}"
             )
 
 
