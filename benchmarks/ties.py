@@ -56,10 +56,7 @@ def separations(exact: Tensor, values: Tensor) -> np.ndarray:
 def consistency(self_model: SelfModel, error: float) -> float:
     """Median over ten people of the posterior mean of consistency, with errors of a size."""
     world = self_model.domain
-    human = None
-    if error != world.record.value_error:
-        human = WithError(self_model)
-        human.error = error
+    human = None if error == world.record.value_error else WithError(self_model, error)
     recordings = mirror_ppl.load_recordings(domain=world.name, setting=world.settings[0])
     fit = mirror_ppl.infer(recordings, human=human, train_rounds=20, explore=0)
     return float(fit.posterior.draws["consistency"].mean(0).median())
@@ -126,11 +123,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=3, help="of the rounds")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    kept = rows_in(ROWS) if ROWS.exists() else []
-    rows = [row for row in kept if row["world"] not in given.worlds]
-    rows += [row for world in given.worlds for row in measured(world, given.seed)]
-    rows.sort(key=lambda row: WORLDS.index(row["world"]))
-    print(table(rows_in(ROWS, rows)))
+    rows = rows_in(ROWS) if ROWS.exists() else []
+    for world in given.worlds:
+        others = [row for row in rows if row["world"] != world]
+        rows = others + list(measured(world, given.seed))
+        rows = rows_in(ROWS, sorted(rows, key=lambda row: WORLDS.index(row["world"])))
+    print(table(rows))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from torch import Tensor
 
 import mirror_ppl
 from benchmarks._rows import rows_in
-from mirror_ppl.models import HumanModel
+from mirror_ppl.models import HumanModel, SelfModel
 from mirror_ppl.models.value_errors import beyond_errors
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people import simulate
@@ -37,7 +37,9 @@ FIRST_TO_CHOOSE = 100
 class WithError(HumanModel):
     """The package's own human model with another size of errors."""
 
-    error = 0.0
+    def __init__(self, self_model: SelfModel, error: float) -> None:
+        super().__init__(self_model)
+        self.error = error
 
     def action_values(self, belief: Tensor) -> Tensor:
         """Return the robot's action values without differences that may be errors."""
@@ -46,8 +48,7 @@ class WithError(HumanModel):
 
 def measured(setting: str, seed: int, error: float) -> Iterator[dict[str, str]]:
     """Yield a row for each person of a seed."""
-    human = WithError(load_self_model(shipped_weights(WORLD), WORLD)[0])
-    human.error = error
+    human = WithError(load_self_model(shipped_weights(WORLD), WORLD)[0], error)
     recordings = simulate(WORLD, setting, "paper", PEOPLE, ROUNDS, seed)
     fit = mirror_ppl.infer(recordings, human=human, train_rounds=LEARNED, explore=0, seed=seed)
     for person in fit.summary["people"]:

@@ -45,7 +45,7 @@ from mirror_ppl.models.networks import Gaussian, log_softmax_with_lapse
 from mirror_ppl.models.perception import perceived_by
 from mirror_ppl.models.self_model import SelfModel
 from mirror_ppl.models.spans import Span
-from mirror_ppl.models.value_errors import beyond_errors
+from mirror_ppl.models.value_errors import choice_values
 from mirror_ppl.models.view import View
 from mirror_ppl.models.world_program import first_state, next_state, reward
 from mirror_ppl.randomness import forked
@@ -124,7 +124,7 @@ class HumanModel(nn.Module):
 
         They are the robot's, without small differences to the best one where these may be errors.
         """
-        return beyond_errors(self.self_model.action_values(belief), self.domain.record.value_error)
+        return choice_values(self.self_model, belief)
 
     def prior(self) -> dict[str, Tensor]:
         """Sample the implants of every person; runs inside ``pyro.plate("person", P, dim=-2)``.

@@ -5,8 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from mirror_ppl.models.self_model import SelfModel
+
 NEGLIGIBLE = 1e-6
 """Size of errors below which values stay as they are."""
+
+
+def choice_values(self_model: SelfModel, belief: Tensor) -> Tensor:
+    """Values ``[..., A]`` by which people choose at beliefs ``[..., Z]``.
+
+    They are the robot's, beyond errors of the size in the world's record.
+    """
+    return beyond_errors(self_model.action_values(belief), self_model.domain.record.value_error)
 
 
 def beyond_errors(values: Tensor, error: float) -> Tensor:

@@ -25,9 +25,9 @@ from mirror_ppl.randomness import forked
 
 FORMAT = "mirror_ppl self-model 1"
 CHECKSUM = "checksum"
+"""Key in a file's metadata of the checksum of everything else in the file."""
 SELF_MODEL = "self_model"
 """Key in recordings' provenance of the fingerprint of the people's self-model."""
-"""Key in a file's metadata of the checksum of everything else in the file."""
 HEADER = 8
 """Bytes at the beginning of a safetensors file that hold the length of its header."""
 

@@ -29,7 +29,7 @@ from mirror_ppl.models.implants import (
 )
 from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.self_model import SelfModel
-from mirror_ppl.models.value_errors import beyond_errors
+from mirror_ppl.models.value_errors import choice_values
 from mirror_ppl.models.weights import SELF_MODEL, fingerprint
 from mirror_ppl.people.base import SimulatedPeople
 from mirror_ppl.randomness import derived_generator
@@ -111,8 +111,7 @@ class RobotLike(SimulatedPeople):
         evidence = encoder.combine(encoder.embed(domain.symbols(observation)), visible)
         evidence = evidence + encoder.action(memory.action)
         belief = encoder(memory.belief, evidence).mean
-        error = domain.record.value_error
-        values = beyond_errors(self.self_model.action_values(belief), error)
+        values = choice_values(self.self_model, belief)
         scale = self.consistency.view(-1, *(1,) * (values.dim() - 1))
         mind = Mind(belief, memory.action, _flat(knowledge, len(shape)))
         chosen = torch.softmax(scale * values, -1)

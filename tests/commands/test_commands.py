@@ -253,7 +253,7 @@ def test_progress_ends_with_the_last_state_once(clock):
 
 
 def test_a_stage_that_is_resumed_says_so_and_reckons_by_what_this_run_did(clock, capsys):
-    """Of two stages the first is resumed."""
+    """The first of two stages is resumed."""
     with Stages() as stages:
         stages.report("infer", 4, 6, "people")
         clock[0] += 600
