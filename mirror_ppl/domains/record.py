@@ -21,6 +21,10 @@ SQIL_IN_LONG_ROUNDS: Mapping[str, Any] = {
 """Settings of SQIL for long rounds: it takes many steps until it imitates what people do."""
 LEAST_POWER = 0.001
 """Least power of the likelihood; at 0 recordings would say nothing."""
+CONSISTENCY = 3.0
+"""Prior median of consistency per unit of reward, unless a world has its own."""
+CONSISTENCIES = 1e-6, 1e6
+"""Least and largest prior median of consistency."""
 LARGEST_ERROR = 1e6
 """Largest ``value_error``."""
 LEAST_SIGHT_SCALE = 0.1
@@ -45,6 +49,8 @@ class Record:
         likelihood_power: power of the likelihood of recorded actions in posteriors. Below 1 it
             takes account of errors of the robot's values that are alike in successive decisions,
             which the model would otherwise take for evidence on a person.
+        consistency: prior median of people's consistency, the inverse temperature of their choices
+            per unit of reward (:func:`mirror_ppl.models.implants.choice_implants`).
         value_error: size of the errors of the robot's action values, in units of reward. People do
             not choose by differences to the best value that are far below it
             (:func:`mirror_ppl.models.value_errors.beyond_errors`); 0 if they choose by all.
@@ -67,6 +73,7 @@ class Record:
     planning: Mapping[str, Any] = field(default_factory=dict)
     baselines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     likelihood_power: float = 1.0
+    consistency: float = CONSISTENCY
     value_error: float = 0.0
     sight_scale: float | None = None
     measured: int = 4000
@@ -78,6 +85,7 @@ class Record:
 
     def __post_init__(self) -> None:
         require_power(self.likelihood_power, "likelihood_power")
+        real_number(self.consistency, "consistency", *CONSISTENCIES)
         real_number(self.value_error, "value_error", 0.0, LARGEST_ERROR)
         if self.sight_scale is not None:
             real_number(self.sight_scale, "sight_scale", LEAST_SIGHT_SCALE)

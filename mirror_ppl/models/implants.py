@@ -25,8 +25,8 @@ NOTICES, NOTICED = "notices_", "noticed_"
 """Prefixes of the sites of each item's probability of being noticed at a step, and of the step."""
 LEAST_PROBABILITY = 1e-6
 """Probabilities are clamped to at least this distance from 0 and 1, so logarithms are finite."""
-CONSISTENCY_MEDIAN, CONSISTENCY_SPREAD = 3.0, 0.5
-"""Prior median of the inverse temperature per unit of reward; prior SD of its logarithm."""
+CONSISTENCY_SPREAD = 0.5
+"""Prior SD of the logarithm of consistency."""
 RESIDUAL = ("residual_in", "residual_out")
 """Sites of the residual's weights."""
 RESIDUAL_HIDDEN = 8
@@ -175,6 +175,7 @@ def choice_implants(domain: Domain, like: Tensor, lapse: float = 1 / 31) -> dict
     """Sample the parameters of a person's choices.
 
     - ``consistency``: inverse temperature of the choice between action values, per unit of reward;
+      the world's record has its prior median;
     - ``lapse``: probability that an action is independent of the belief; the argument ``lapse``
       is its prior mean;
     - ``motor_noise``, only where actions are continuous: standard deviation of what a person
@@ -188,7 +189,7 @@ def choice_implants(domain: Domain, like: Tensor, lapse: float = 1 / 31) -> dict
     sampled = {
         "consistency": pyro.sample(
             "consistency",
-            dist.LogNormal(number(math.log(CONSISTENCY_MEDIAN)), number(CONSISTENCY_SPREAD)),
+            dist.LogNormal(number(math.log(domain.record.consistency)), number(CONSISTENCY_SPREAD)),
         ),
         "lapse": pyro.sample("lapse", dist.Beta(number(1.0), number(1 / lapse - 1))),
     }

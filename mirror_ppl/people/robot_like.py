@@ -17,7 +17,6 @@ from mirror_ppl.domains.base import (
 )
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import (
-    CONSISTENCY_MEDIAN,
     CONSISTENCY_SPREAD,
     LEAST_PROBABILITY,
     MOTOR_NOISE,
@@ -180,7 +179,7 @@ def simulated_robot_like(
         self_model,
         setting,
         torch.stack(reach) if population == "diverse" else None,
-        CONSISTENCY_MEDIAN * torch.stack(consistency).exp(),
+        domain.record.consistency * torch.stack(consistency).exp(),
         MOTOR_NOISE_MEDIAN * torch.stack(noise).exp() if domain.controls else None,
     )
 

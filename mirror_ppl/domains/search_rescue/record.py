@@ -36,6 +36,7 @@ RECORD = Record(
             "weight_decay": 0.1,
         },
     },
+    consistency=13.0,
     value_error=0.15,
     slow=("sqil-everything", "sqil-pooled"),
     people="mirror_ppl.domains.search_rescue.participants:FIREFIGHTERS",

@@ -1,0 +1,60 @@
+"""The prior of consistency: its median is the world's, for people who are inferred and simulated."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mirror_ppl.domains.driving import Driving
+from mirror_ppl.domains.record import Record
+from mirror_ppl.errors import InputError
+from mirror_ppl.models.implants import CONSISTENCY_SPREAD
+from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import sample_sites
+from mirror_ppl.models.weights import load_self_model, shipped_weights
+from mirror_ppl.people.robot_like import simulated_robot_like
+
+
+@pytest.fixture
+def self_model():
+    return load_self_model(shipped_weights("driving"), "driving")[0]
+
+
+def with_median(self_model, monkeypatch, median):
+    record = replace(Driving.record, consistency=median)
+    monkeypatch.setattr(self_model.domain, "record", record, raising=False)
+
+
+@pytest.mark.parametrize("median", [0.5, 3.0, 20.0])
+@pytest.mark.parametrize("name", ["mirror", "no-implants", "policy-only", "preferring"])
+def test_the_prior_median_is_the_worlds(self_model, monkeypatch, name, median):
+    with_median(self_model, monkeypatch, median)
+    human = load_human_model(name, self_model)
+    with torch.random.fork_rng():
+        prior = sample_sites(human, 1)["consistency"]["fn"]
+    while not hasattr(prior, "loc"):
+        prior = prior.base_dist
+    assert prior.loc.exp().unique().item() == pytest.approx(median)
+    assert prior.scale.unique().item() == pytest.approx(CONSISTENCY_SPREAD)
+
+
+def test_people_like_the_robot_come_from_it(self_model, monkeypatch):
+    people, median = 400, 20.0
+    usual = simulated_robot_like(self_model, "fog", "paper", people, 0)
+    with_median(self_model, monkeypatch, median)
+    own = simulated_robot_like(self_model, "fog", "paper", people, 0)
+    torch.testing.assert_close(own.consistency, usual.consistency * median / 3)
+    # Four standard errors of the mean of a logarithm.
+    error = 4 * CONSISTENCY_SPREAD / people**0.5
+    assert abs(own.consistency.log().mean() - math.log(median)) < error
+
+
+def test_all_people_have_a_median_of_3_unless_their_world_has_another():
+    assert Record().consistency == Driving.record.consistency == 3.0
+
+
+@pytest.mark.parametrize("value", [0, -1, "1", float("nan"), float("inf")])
+def test_a_median_is_a_positive_number(value):
+    with pytest.raises(InputError, match="consistency must be"):
+        Record(consistency=value)
