@@ -87,23 +87,24 @@ def table(rows: Sequence[dict[str, str]]) -> str:
 
     for (world, setting, _, median), some in groupby(sorted(rows, key=place), place):
         own = list(some)
-
-        def mean(name: str, rounds: int) -> float:
-            values = [row[name] for row in own if row["rounds"] == str(rounds)]
-            return math.nan if "" in values else float(np.mean([float(one) for one in values]))
-
         seeds = sorted({int(row["seed"]) for row in own})
         name = TITLES.get(world, world.replace("_", " ").capitalize())
-        evidence = mean("log_evidence", max(LEARNED))
+        evidence = _mean(own, "log_evidence", max(LEARNED))
         cells = [
             f"{name}, {setting}, {', '.join(map(str, seeds))}",
             f"{median:g}",
-            f"{mean('consistency', max(LEARNED)):.1f}",
+            f"{_mean(own, 'consistency', max(LEARNED)):.1f}",
             "" if math.isnan(evidence) else f"{evidence:.1f}",
-            *(f"{mean('nll', rounds):.4f}" for rounds in LEARNED),
+            *(f"{_mean(own, 'nll', rounds):.4f}" for rounds in LEARNED),
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _mean(rows: Sequence[dict[str, str]], name: str, rounds: int) -> float:
+    """Mean of a column after a number of rounds; not a number if some are missing."""
+    values = [row[name] for row in rows if row["rounds"] == str(rounds)]
+    return math.nan if "" in values else float(np.mean([float(value) for value in values]))
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The prior of consistency: its median is the world's, for people who are inferred and simulated."""
+"""The prior of consistency: its median is the world's, of people inferred and simulated."""
 
 import math
 from dataclasses import replace
