@@ -157,5 +157,9 @@ class UnexplainedPerson(UserWarning):
     """Warns that messages are planned for a person whose actions the model does not explain."""
 
 
+class PriorConflict(UserWarning):
+    """Warns that a prior is at odds with most of the people."""
+
+
 class UnreliableWeights(UserWarning):
     """Warns that a person's importance weights are not reliable."""

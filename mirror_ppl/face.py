@@ -25,7 +25,7 @@ from mirror_ppl.data.recorder import Recorder
 from mirror_ppl.devices import usable_device
 from mirror_ppl.domains import DOMAINS as worlds
 from mirror_ppl.domains import World, add_domain, domain_of, get_domain, require_known
-from mirror_ppl.errors import InputError, UnexplainedPerson, UnreliableWeights
+from mirror_ppl.errors import InputError, PriorConflict, UnexplainedPerson, UnreliableWeights
 from mirror_ppl.fitted import Fit, doubtful_people, one_of
 from mirror_ppl.inference.engines import ENGINES, InferenceOptions, engine_name
 from mirror_ppl.inference.population.pooling import Pooling
@@ -33,6 +33,7 @@ from mirror_ppl.inference.results import fitting
 from mirror_ppl.inference.results.criticism import UNEXPLAINED, warning_of
 from mirror_ppl.inference.results.population_file import load_population
 from mirror_ppl.inference.results.posterior_file import PosteriorFile, load_posterior
+from mirror_ppl.inference.results.prior_conflict import conflict_line
 from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.inference.workers import Workers
 from mirror_ppl.likelihood.contract import check_contract
@@ -233,6 +234,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         checkpoint: file to continue from; written on the way, and kept.
 
     Warns:
+        PriorConflict: the prior of a site is at odds with at least half of the people.
         UnreliableWeights: importance weights of a person are not reliable.
 
     Raises:
@@ -300,6 +302,14 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         )
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)
+    for site, conflict in found.summary["prior_conflicts"].items():
+        warnings.warn(
+            f"{conflict_line(site, conflict, recordings.num_people)}; what is inferred from few "
+            'rounds is not to be relied on: try pooling="partial", or give the human model another '
+            "prior",
+            PriorConflict,
+            stacklevel=2,
+        )
     if doubtful := doubtful_people(found.summary):
         warnings.warn(
             f"importance weights of {', '.join(doubtful)} are not to be relied on (Pareto k above "

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
 
-from mirror_ppl.errors import OptionError, UnreliableWeights
+from mirror_ppl.errors import OptionError, PriorConflict, UnreliableWeights
 from mirror_ppl.inference.names import told_engine
 from mirror_ppl.limits import check_numbers, require_memory, share
 from mirror_ppl.progress import Stages
@@ -140,7 +140,8 @@ def main(options: Options) -> None:
     _require_memory(recordings, options)
     results = output_folder(options.out, (*RESULTS, CHECKPOINT), parts=[f"{CHECKPOINT}.parts"])
     with results as folder, Stages() as stages, warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnreliableWeights)  # the report says it
+        for reported in (PriorConflict, UnreliableWeights):
+            warnings.simplefilter("ignore", reported)
         fit = infer(
             recordings,
             human=options.human_model,

@@ -10,6 +10,7 @@ from rich.table import Table
 from mirror_ppl.console import console_for_tables
 from mirror_ppl.inference.results.criticism import OK, UNCHECKED
 from mirror_ppl.inference.results.identifiability import NEGLIGIBLE
+from mirror_ppl.inference.results.prior_conflict import conflict_line
 from mirror_ppl.inference.weighted import HIGH_PARETO_K
 from mirror_ppl.models.family import KIND, model_of
 from mirror_ppl.models.implants import NOTICES
@@ -66,6 +67,12 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
         print(
             f"Fewer than {FEW} effective draws under the population for {', '.join(few)}: it is at "
             "odds with what they did, or far from the prior; their posterior is coarse"
+        )
+    for site, conflict in summary["prior_conflicts"].items():
+        print(
+            f"{conflict_line(site, conflict, len(people))}; what is inferred from few rounds is "
+            "not to be relied on: --pooling partial estimates the population, or give a human "
+            "model another prior"
         )
     _show_checks(people, model_name(summary.get("human_model", "")))
     identified = [person["identifiability"] for person in people if "identifiability" in person]

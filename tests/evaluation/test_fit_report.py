@@ -33,6 +33,7 @@ def person(number):
 def shown(capsys, **changes):
     summary = {"domain": "driving", "setting": "fog", "people": [person(1), person(2)]}
     summary["contradictions"] = {"steps": 10, "contradicting": 0}
+    summary["prior_conflicts"] = {}
     show_fit(summary | changes, "cells")
     return capsys.readouterr().out
 
@@ -64,6 +65,10 @@ def test_unreliable_results_are_reported(capsys):
     assert "not to be relied on for person-01 (Pareto k above 0.7)" in shown(
         capsys, people=doubtful
     )
+    conflict = {"consistency": {"people": 2, "median": 13.0, "prior": [0.9, 10.3]}}
+    assert "prior of consistency is at odds with 2 of 2 people (99% interval 0.9 to 10.3" in shown(
+        capsys, prior_conflicts=conflict
+    )
     few = [person(1) | {"effective_draws": 30}, person(2) | {"effective_draws": 19}]
     assert "Fewer than 20 effective draws under the population for person-02" in shown(
         capsys, people=few
@@ -71,6 +76,7 @@ def test_unreliable_results_are_reported(capsys):
     few[1]["rounds"] = 0  # who did nothing is not at odds with it
     assert "effective draws" not in shown(capsys, people=few)
     assert "relied on" not in shown(capsys)
+    assert "at odds" not in shown(capsys)
 
 
 def test_people_whom_the_model_does_not_explain_are_reported_with_reasons(capsys):

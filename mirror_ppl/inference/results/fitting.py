@@ -18,6 +18,7 @@ from mirror_ppl.inference.engines import InferenceOptions, Inferred, infer, run_
 from mirror_ppl.inference.population.pooling import Pooling, Population
 from mirror_ppl.inference.results.criticism import models_of
 from mirror_ppl.inference.results.description import Description, describe
+from mirror_ppl.inference.results.prior_conflict import prior_conflicts
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.likelihood.contract import check_contract
@@ -208,8 +209,11 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     summary = attributes | {
         "options": asdict(options),
         "contradictions": contradictions.as_data(),
+        "prior_conflicts": {},
         "people": found,
     }
+    if pooling == "none":  # otherwise a population is the prior
+        summary["prior_conflicts"] = prior_conflicts(posterior.draws, described.prior)
     summary |= newcomer
     return Fit(human, learned, posterior, data, summary, seconds)
 
