@@ -1,13 +1,13 @@
 """Prior medians of consistency, compared by the marginal likelihood of recorded people.
 
-    python -m benchmarks.consistency_prior --seeds 104 --medians 3 6 9 13 18
+    python -m benchmarks.consistency_prior --seeds 104 --medians 3 6 9 13 20
     python -m benchmarks.consistency_prior --seeds 1 2 3 --medians 3 13
 
 Ten `paper` people of each seed are fitted with 1, 5 and 20 of 26 rounds in each setting of a world
 (search and rescue unless `--world` names another one), with several prior medians of their
 consistency (`Record.consistency`). The last six rounds are held out. This writes a row for each
 person and number of rounds to docs/results/consistency_prior.csv; what is there is not measured
-again. The table of docs/decisions.md is printed; medians are chosen on seeds from 100 on.
+again. The table of docs/decisions.md is printed; medians are compared on seeds from 100 on.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import torch
 import mirror_ppl
 from benchmarks._rows import rows_in
 from benchmarks.tables import TITLES
+from benchmarks.value_errors import FIRST_TO_CHOOSE
 from mirror_ppl.domains import DOMAINS
 from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.weights import load_self_model, shipped_weights
@@ -41,7 +42,7 @@ def measured(
     self_model, _ = load_self_model(shipped_weights(world), world)
     domain = self_model.domain
     human = load_human_model("mirror", self_model)
-    domain.record = replace(domain.record, consistency=median)
+    domain.record = replace(domain.record, consistency=median)  # in this process
     recordings = simulate(world, setting, "paper", PEOPLE, ROUNDS, seed)
     recordings = recordings.select_rounds([*range(rounds), *range(max(LEARNED), ROUNDS)])
     fit = mirror_ppl.infer(
@@ -82,8 +83,8 @@ def table(rows: Sequence[dict[str, str]]) -> str:
     ]
 
     def place(row: dict[str, str]) -> tuple:
-        chosen = int(row["seed"]) < 100
-        return row["world"], row["setting"], chosen, float(row["median"])
+        reported = int(row["seed"]) < FIRST_TO_CHOOSE
+        return row["world"], row["setting"], reported, float(row["median"])
 
     for (world, setting, _, median), some in groupby(sorted(rows, key=place), place):
         own = list(some)
@@ -102,7 +103,7 @@ def table(rows: Sequence[dict[str, str]]) -> str:
 
 
 def _mean(rows: Sequence[dict[str, str]], name: str, rounds: int) -> float:
-    """Mean of a column after a number of rounds; not a number if some are missing."""
+    """Mean of a column; not a number where some values are missing, as on the highway."""
     values = [row[name] for row in rows if row["rounds"] == str(rounds)]
     return math.nan if "" in values else float(np.mean([float(value) for value in values]))
 

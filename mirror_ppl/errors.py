@@ -126,6 +126,10 @@ class AssetError(MirrorError):
     """
 
 
+class OtherPriorError(AssetError):
+    """Raised for a network that was trained with another prior."""
+
+
 class OutputError(MirrorError):
     """Raised for a file or folder that cannot be created or written."""
 

@@ -234,7 +234,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         checkpoint: file to continue from; written on the way, and kept.
 
     Warns:
-        PriorConflict: the prior of a site is at odds with at least half of the people.
+        PriorConflict: the prior of a site is at odds with most of the people.
         UnreliableWeights: importance weights of a person are not reliable.
 
     Raises:
@@ -303,13 +303,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)
     for site, conflict in found.summary["prior_conflicts"].items():
-        warnings.warn(
-            f"{conflict_line(site, conflict, recordings.num_people)}; what is inferred from few "
-            'rounds is not to be relied on: try pooling="partial", or give the human model another '
-            "prior",
-            PriorConflict,
-            stacklevel=2,
-        )
+        warnings.warn(conflict_line(site, conflict), PriorConflict, stacklevel=2)
     if doubtful := doubtful_people(found.summary):
         warnings.warn(
             f"importance weights of {', '.join(doubtful)} are not to be relied on (Pareto k above "

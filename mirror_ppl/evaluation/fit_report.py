@@ -69,11 +69,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
             "odds with what they did, or far from the prior; their posterior is coarse"
         )
     for site, conflict in summary["prior_conflicts"].items():
-        print(
-            f"{conflict_line(site, conflict, len(people))}; what is inferred from few rounds is "
-            "not to be relied on: --pooling partial estimates the population, or give a human "
-            "model another prior"
-        )
+        print(conflict_line(site, conflict))
     _show_checks(people, model_name(summary.get("human_model", "")))
     identified = [person["identifiability"] for person in people if "identifiability" in person]
     _show_entropy(identified, sites)

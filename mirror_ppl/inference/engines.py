@@ -310,7 +310,8 @@ def run_identity(human: HumanModel, network: AmortizedGuide | None, what: Sequen
         if not has_own_program(human):
             raise
         said = []  # a custom program may need more than made-up rounds have
-    own = [human.likelihood_power, *map(str, what)]
+    record = human.domain.record
+    own = [human.likelihood_power, record.consistency, record.value_error, *map(str, what)]
     description = [weights, source, said, __version__, FORMAT, own]
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 

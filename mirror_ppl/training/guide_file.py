@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from mirror_ppl.checks import require_kind
 from mirror_ppl.data import asset_path
-from mirror_ppl.errors import AssetError
+from mirror_ppl.errors import AssetError, OtherPriorError
 from mirror_ppl.files import json_text
 from mirror_ppl.inference.amortized_guide import AmortizedGuide, reference_places
 from mirror_ppl.inference.engines import ENGINES
@@ -92,7 +93,10 @@ def load_guide(path: Path, human: HumanModel) -> tuple[AmortizedGuide, dict[str,
     except (KeyError, RuntimeError, ValueError) as error:
         raise AssetError(f"{path}: does not fit this program ({error})") from error
     if not guide.reads(places):
-        raise AssetError(f"{path}: is for another prior; train a guide for this one")
+        raise OtherPriorError(
+            f"{path}: is for another prior; train a guide for this one, or use the engine "
+            "importance"
+        )
     return guide.eval().to(next(human.parameters()).device), card
 
 
@@ -133,5 +137,6 @@ def _shipped_network(human: HumanModel, names: Sequence[str]) -> AmortizedGuide 
         return None
     metadata, _ = read_tensors(path, {FORMAT: "guide"})
     if _belongs_to(human).items() <= {**BEFORE, **metadata}.items():
-        return load_guide(path, human)[0]
+        with suppress(OtherPriorError):
+            return load_guide(path, human)[0]
     return None

@@ -65,9 +65,10 @@ def test_unreliable_results_are_reported(capsys):
     assert "not to be relied on for person-01 (Pareto k above 0.7)" in shown(
         capsys, people=doubtful
     )
-    conflict = {"consistency": {"people": 2, "median": 13.0, "prior": [0.9, 10.3]}}
-    assert "prior of consistency is at odds with 2 of 2 people (99% interval 0.9 to 10.3" in shown(
-        capsys, prior_conflicts=conflict
+    conflict = {"consistency": {"people": 2, "of": 2, "median": 13.0, "prior": [0.9, 10.3]}}
+    assert (
+        "prior of consistency is at odds with 2 of 2 people: 99% of it is from 0.9 to 10.3"
+        in shown(capsys, prior_conflicts=conflict)
     )
     few = [person(1) | {"effective_draws": 30}, person(2) | {"effective_draws": 19}]
     assert "Fewer than 20 effective draws under the population for person-02" in shown(

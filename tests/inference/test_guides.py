@@ -286,6 +286,17 @@ def test_a_guide_is_read_as_it_was_written(toy, network, tmp_path):
     assert isinstance(network_for("amortized", path, toy), AmortizedGuide)
 
 
+def test_auto_takes_importance_where_the_network_is_for_another_prior(monkeypatch):
+    self_model, _ = load_self_model(shipped_weights("driving"), "driving")
+    human = HumanModel(self_model)
+    assert isinstance(network_for("auto", None, human), AmortizedGuide)
+    record = replace(self_model.domain.record, consistency=4.0)
+    monkeypatch.setattr(self_model.domain, "record", record, raising=False)
+    assert network_for("auto", None, human) is None
+    with pytest.raises(AssetError, match="is for another prior; .* or use the engine importance"):
+        network_for("amortized", None, human)
+
+
 def test_guides_of_something_else_are_refused(toy, network, tmp_path):
     path = tmp_path / "toy.safetensors"
     save_guide(network, toy, path, {})

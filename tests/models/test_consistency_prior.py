@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+from mirror_ppl.domains import DOMAINS, get_domain
 from mirror_ppl.domains.driving import Driving
 from mirror_ppl.domains.record import Record
 from mirror_ppl.errors import InputError
@@ -14,6 +16,8 @@ from mirror_ppl.models.loading import load_human_model
 from mirror_ppl.models.prior import sample_sites
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 from mirror_ppl.people.robot_like import simulated_robot_like
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -50,8 +54,15 @@ def test_people_like_the_robot_come_from_it(self_model, monkeypatch):
     assert abs(own.consistency.log().mean() - math.log(median)) < error
 
 
-def test_all_people_have_a_median_of_3_unless_their_world_has_another():
-    assert Record().consistency == Driving.record.consistency == 3.0
+def test_medians_of_the_worlds_that_ship():
+    assert Record().consistency == 3.0
+    medians = {name: get_domain(name).record.consistency for name in DOMAINS}
+    assert {name for name, median in medians.items() if median != 3.0} == {"search_rescue"}
+    page = (ROOT / "docs/human_model.md").read_text()
+    median, factor = medians["search_rescue"], math.exp(1.645 * CONSISTENCY_SPREAD)
+    rescue = f"in search and rescue [{median:g}](decisions.md#the-human-model) "
+    assert f"{rescue}({median / factor:.1f} to {median * factor:.1f})" in page
+    assert f"3 per unit of reward (90% between {3 / factor:.1f} and {3 * factor:.1f})" in page
 
 
 @pytest.mark.parametrize("value", [0, -1, "1", float("nan"), float("inf")])

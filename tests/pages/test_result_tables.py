@@ -7,6 +7,7 @@ import torch
 import xarray as xr
 
 from benchmarks import (
+    consistency_prior,
     driving_messages,
     example_world,
     hearing,
@@ -74,6 +75,12 @@ def test_the_table_of_value_errors_is_what_its_rows_say():
     page = (DOCS / "decisions.md").read_text()
     found = page.partition("<!-- value errors -->\n")[2].partition("\n<!-- end -->")[0]
     assert found == value_errors.table(rows_in(value_errors.ROWS))
+
+
+def test_the_table_of_prior_medians_is_what_its_rows_say():
+    page = (DOCS / "decisions.md").read_text()
+    found = page.partition("<!-- consistency prior -->\n")[2].partition("\n<!-- end -->")[0]
+    assert found == consistency_prior.table(rows_in(consistency_prior.ROWS))
 
 
 def test_the_table_of_equally_good_actions_is_what_its_rows_say():

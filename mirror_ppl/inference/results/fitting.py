@@ -212,8 +212,9 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         "prior_conflicts": {},
         "people": found,
     }
-    if pooling == "none":  # otherwise a population is the prior
-        summary["prior_conflicts"] = prior_conflicts(posterior.draws, described.prior)
+    if pooling == "none":  # otherwise a population is the prior of most sites
+        counts = learned.round_counts
+        summary["prior_conflicts"] = prior_conflicts(human, posterior.draws, counts, seed)
     summary |= newcomer
     return Fit(human, learned, posterior, data, summary, seconds)
 
@@ -230,6 +231,7 @@ def _attributes(
         "human_model": type(human).__name__,
         "likelihood_power": human.likelihood_power,
         "value_error": f"{human.domain.record.value_error:g}",
+        "consistency_prior_median": human.domain.record.consistency,
         "self_model": fingerprint(human.self_model),
         "guide": options.engine,
         "refined": options.refine,
