@@ -106,4 +106,9 @@ def _show(world: World, remark: str) -> None:
     print(
         f"settings: {', '.join(world.settings)}; thresholds of sight ({world.reach_unit}): {reach}"
     )
+    record = world.record
+    print(
+        f"record: consistency {record.consistency:g}, value_error {record.value_error:g}, "
+        f"likelihood_power {record.likelihood_power:g}, sight_scale {record.sight_scale}"
+    )
     print(remark)

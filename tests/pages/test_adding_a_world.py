@@ -385,6 +385,11 @@ def test_a_world_with_an_impossible_record_is_refused_in_a_line(tmp_path, capsys
     error = capsys.readouterr().err
     assert "likelihood_power must be from 0.001 to 1, not 0.0" in error
     assert error.count("\n") == 1
+    own = file.read_text().replace("likelihood_power=0.0", "consistency=8, value_error=0.1")
+    file.write_text(own)
+    assert command(check_domain, f"{file}:RoundTable") == 0
+    said = "record: consistency 8, value_error 0.1, likelihood_power 1, sight_scale None"
+    assert said in capsys.readouterr().out
 
 
 def test_settings_are_looked_over(tmp_path, capsys):
