@@ -302,7 +302,7 @@ def infer(  # noqa: PLR0913 - everything a fit can depend on
         )
     if prior_from is not None:
         found.summary["prior_from"] = str(prior_from)
-    for site, conflict in found.summary["prior_conflicts"].items():
+    for site, conflict in (found.summary["prior_conflicts"] or {}).items():
         warnings.warn(conflict_line(site, conflict), PriorConflict, stacklevel=2)
     if doubtful := doubtful_people(found.summary):
         warnings.warn(

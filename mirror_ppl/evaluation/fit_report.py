@@ -68,7 +68,7 @@ def show_fit(summary: dict[str, Any], unit: str) -> None:
             f"Fewer than {FEW} effective draws under the population for {', '.join(few)}: it is at "
             "odds with what they did, or far from the prior; their posterior is coarse"
         )
-    for site, conflict in summary["prior_conflicts"].items():
+    for site, conflict in (summary["prior_conflicts"] or {}).items():
         print(conflict_line(site, conflict))
     _show_checks(people, model_name(summary.get("human_model", "")))
     identified = [person["identifiability"] for person in people if "identifiability" in person]

@@ -209,7 +209,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     summary = attributes | {
         "options": asdict(options),
         "contradictions": contradictions.as_data(),
-        "prior_conflicts": {},
+        "prior_conflicts": None,
         "people": found,
     }
     if pooling == "none":  # otherwise a population is the prior of most sites
@@ -231,7 +231,6 @@ def _attributes(
         "human_model": type(human).__name__,
         "likelihood_power": human.likelihood_power,
         "value_error": f"{human.domain.record.value_error:g}",
-        "consistency_prior_median": human.domain.record.consistency,
         "self_model": fingerprint(human.self_model),
         "guide": options.engine,
         "refined": options.refine,

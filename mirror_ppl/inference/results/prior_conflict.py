@@ -29,7 +29,7 @@ SHARE = 0.5
 def prior_conflicts(
     human: HumanModel, draws: Mapping[str, Tensor], rounds: Tensor, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the priors beyond whose shortest 99% interval most of the people lie.
+    """Return the priors beyond whose shortest 99% interval more than half of the people lie.
 
     A person lies beyond an end if the posterior median does. Of a person from the prior that has a
     probability of at most 2%, as half of the posterior is then in 1% of the prior; of six of ten
@@ -77,6 +77,7 @@ def conflict_line(site: str, conflict: Mapping[str, Any]) -> str:
     low, high = conflict["prior"]
     return (
         f"The prior of {site} is at odds with {conflict['people']} of {conflict['of']} people: 99% "
-        f"of it is from {low:.3g} to {high:.3g}, their median is {conflict['median']:.3g}. "
-        'Posteriors from few rounds are then biased (docs/trust.md, "Prior and data")'
+        f"of it is from {low:.3g} to {high:.3g}, and their posterior medians are about "
+        f"{conflict['median']:.3g}. Posteriors are pulled towards it, most of all after few "
+        'rounds: fit with another prior (docs/trust.md, "Prior and data")'
     )
