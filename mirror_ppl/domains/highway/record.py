@@ -37,6 +37,7 @@ RECORD = Record(
         "kinds": (0.5, 0.1, 0.4),
         "assumed": 0.5,
     },
+    consistency=1.0,
     likelihood_power=0.25,
     sight_scale=1.0,
     measured=100,
