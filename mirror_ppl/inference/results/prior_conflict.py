@@ -1,8 +1,7 @@
 """Priors that are at odds with what people's posteriors say.
 
-A prior that makes people improbable costs little after many rounds and much after few: what they do
-is then first taken for lapses, or for things not seen (Evans and Moshonov, *Checking for prior-data
-conflict*, 2006).
+Such a prior pulls posteriors towards it, little after many rounds and much after few (Evans and
+Moshonov, *Checking for prior-data conflict*, 2006).
 """
 
 from __future__ import annotations
@@ -53,9 +52,9 @@ def prior_conflicts(
         return {}
     prior, found = draw_prior(human, 1, DRAWS, seed), {}
     for site in scalar_sites(human):
-        own = draws[site].cpu().numpy().reshape(len(draws[site]), -1)
-        if own.shape[1] != len(acted):
+        if site not in draws or draws[site].shape[1] != len(acted):
             continue  # of the world, not of people
+        own = draws[site].cpu().numpy().reshape(-1, len(acted))
         medians = np.median(own, 0)[acted]
         values = prior[site].cpu().numpy().ravel()
         low, high = az.hdi(values, hdi_prob=PROBABILITY)
