@@ -201,10 +201,8 @@ def test_priors_are_as_on_the_page(self_model):
         for row in table_of(page("docs/human_model.md"), "Site")
     }
     assert rows["sight_*"] == f"uniform over {len(human.domain.reach_bins)} bins"
-    assert (
-        rows["consistency"]
-        == f"LogNormal(log {spread.loc.exp().item():.0f}, {spread.scale.item():g})"
-    )
+    assert rows["consistency"] == f"LogNormal(log *m*, {spread.scale.item():g})"
+    assert spread.loc.exp().item() == pytest.approx(human.domain.record.consistency)
     lapse = sites["lapse"]["fn"]
     assert (
         rows["lapse"] == f"Beta({lapse.concentration1.item():g}, {lapse.concentration0.item():g})"

@@ -23,12 +23,14 @@ DRAWS = 4000
 """Prior draws from which the interval is estimated: 40 of them are outside."""
 SHARE = 0.5
 """If more than this share of the people are on one side of the interval, a prior is at odds."""
+LEAST = 2
+"""Least number of them: a single person may be unusual."""
 
 
 def prior_conflicts(
     human: HumanModel, draws: Mapping[str, Tensor], rounds: Tensor, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """Return the priors beyond whose shortest 99% interval more than half of the people lie.
+    """Return priors beyond whose shortest 99% interval more than half of the people lie (two or more).
 
     A person lies beyond an end if the posterior median does. Of a person from the prior that has a
     probability of at most 2%, as half of the posterior is then in 1% of the prior; of six of ten
@@ -61,7 +63,7 @@ def prior_conflicts(
         below = medians[medians < low] if low > values.min() else medians[:0]
         above = medians[medians > high] if high < values.max() else medians[:0]
         beyond = max(below, above, key=len)
-        if len(beyond) > SHARE * len(medians):
+        if len(beyond) >= LEAST and len(beyond) > SHARE * len(medians):
             found[site] = {
                 "people": len(beyond),
                 "of": len(medians),
