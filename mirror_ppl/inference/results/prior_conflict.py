@@ -30,7 +30,7 @@ LEAST = 2
 def prior_conflicts(
     human: HumanModel, draws: Mapping[str, Tensor], rounds: Tensor, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """Return priors beyond whose shortest 99% interval more than half of the people lie (two or more).
+    """Return priors beyond whose shortest 99% interval most people lie, and at least two.
 
     A person lies beyond an end if the posterior median does. Of a person from the prior that has a
     probability of at most 2%, as half of the posterior is then in 1% of the prior; of six of ten
