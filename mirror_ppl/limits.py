@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping
+from contextlib import suppress
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -108,6 +110,15 @@ def require_memory(needed: int, what: str) -> None:
             f"{what} would need about {needed / 2**30:,.1f} GB of memory, {free / 2**30:.1f} GB "
             "are free"
         )
+
+
+def return_memory() -> None:
+    """Return memory that was freed to the system, which the C library may keep for later.
+
+    After many small arrays it keeps hundreds of megabytes. Nothing happens if it is not glibc.
+    """
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def free_memory() -> int | None:

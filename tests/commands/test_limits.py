@@ -1,12 +1,14 @@
 """Numbers without an end, and memory that there is not, are refused before any work."""
 
+from types import SimpleNamespace
+
 import pytest
 from running import command
 
 from mirror_ppl import limits
 from mirror_ppl.commands import assist, calibrate, compare, evaluate, fit, simulate, train
 from mirror_ppl.errors import OptionError
-from mirror_ppl.limits import LIMITS, free_memory, require_memory, share
+from mirror_ppl.limits import LIMITS, free_memory, require_memory, return_memory, share
 
 HUGE = [
     (fit, "--draws", 99999999999, "at most 100000"),
@@ -117,3 +119,20 @@ def test_argument_errors_are_one_line(tmp_path, capsys, module, args, line):
     assert "│" not in said.err
     if module is not compare:
         assert said.err.endswith(f"; see {module.PROGRAM} --help\n")
+
+
+def test_freed_memory_is_returned_where_the_system_can(monkeypatch):
+    called = []
+    library = SimpleNamespace(malloc_trim=called.append)
+    for found in (library, SimpleNamespace()):
+        monkeypatch.setattr("ctypes.CDLL", lambda name, found=found: found)
+        return_memory()
+    assert called == [0]
+
+    def missing(name):
+        raise OSError(f"no library {name}")
+
+    monkeypatch.setattr("ctypes.CDLL", missing)
+    return_memory()
+    monkeypatch.undo()
+    return_memory()

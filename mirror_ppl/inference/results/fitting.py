@@ -22,6 +22,7 @@ from mirror_ppl.inference.results.prior_conflict import prior_conflicts
 from mirror_ppl.inference.results.summary import summarize, summarize_newcomer
 from mirror_ppl.inference.workers import Workers, parts_of
 from mirror_ppl.likelihood.contract import check_contract
+from mirror_ppl.limits import return_memory
 from mirror_ppl.models.family import KIND, OneOfKinds
 from mirror_ppl.models.human import HumanModel
 from mirror_ppl.models.implants import in_units
@@ -154,6 +155,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     # All rounds were checked together.
     anyway = replace(options, allow_contradictions=1.0)
     posterior = infer(human, train, anyway, seed, network, report, run, population, workers, True)
+    return_memory()
     how = Description(human, seed, explore, posterior.population, every_draw)
     if checkpoint is not None and test is not None:
         identity += f"{_recorded(test)} {explore} {every_draw}"
@@ -216,6 +218,7 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
         counts = learned.round_counts
         summary["prior_conflicts"] = prior_conflicts(human, posterior.draws, counts, seed)
     summary |= newcomer
+    return_memory()
     return Fit(human, learned, posterior, data, summary, seconds)
 
 
