@@ -10,9 +10,10 @@ import torch
 import mirror_ppl
 from mirror_ppl.errors import PriorConflict
 from mirror_ppl.inference.engines import run_identity
-from mirror_ppl.inference.results.prior_conflict import conflict_line, prior_conflicts
+from mirror_ppl.inference.results.prior_conflict import DRAWS, conflict_line, prior_conflicts
 from mirror_ppl.models import HumanModel
 from mirror_ppl.models.loading import load_human_model
+from mirror_ppl.models.prior import draw_prior
 from mirror_ppl.models.weights import load_self_model, shipped_weights
 
 
@@ -42,7 +43,7 @@ def self_model():
 
 
 def conflicts(human, medians, rounds=None, site="strength"):
-    """Of three draws for each person, ``[3, P, 1]``."""
+    """Conflicts with three draws for each person, ``[3, P, 1]``, around their medians."""
     middle = torch.tensor(medians)[None, :, None]
     draws = {name: torch.full_like(middle, 0.01) for name in ("strength", "careless")}
     draws["strength"] += 50
@@ -69,11 +70,15 @@ def test_most_of_the_people_on_one_side_are_a_conflict(self_model, medians, peop
 
 
 def test_a_conflict_has_people_their_median_and_the_interval(self_model):
-    (conflict,) = conflicts(Uniform(self_model), (120.0, 130.0, 140.0, 50.0)).values()
+    human = Uniform(self_model)
+    (conflict,) = conflicts(human, (120.0, 130.0, 140.0, 50.0)).values()
     low, high = conflict.pop("prior")
     assert conflict == {"people": 3, "of": 4, "median": 130.0}
-    assert 0 <= low < high <= 100
-    assert high - low == pytest.approx(99, abs=0.5)  # three standard errors: 3 * .16
+    values = draw_prior(human, 1, DRAWS, 0)["strength"].flatten().sort().values
+    inside = (values >= low) & (values <= high)
+    assert int(inside.sum()) - 1 == 0.99 * DRAWS  # between its ends, which are draws themselves
+    width = int(inside.sum()) - 1
+    assert high - low == pytest.approx(float((values[width:] - values[:-width]).min()))
     conflict["prior"] = [0.5, 99.5]
     assert conflict_line("strength", conflict) == (
         "The prior of strength is at odds with 3 of 4 people: 99% of it is from 0.5 to 99.5, and "

@@ -211,12 +211,12 @@ def fit_people(  # noqa: PLR0913 - everything a fit can depend on
     summary = attributes | {
         "options": asdict(options),
         "contradictions": contradictions.as_data(),
-        "prior_conflicts": None,
+        # Of pooled people a population is the prior of most sites.
+        "prior_conflicts": None
+        if pooling != "none"
+        else prior_conflicts(human, posterior.draws, learned.round_counts, seed),
         "people": found,
     }
-    if pooling == "none":  # otherwise a population is the prior of most sites
-        counts = learned.round_counts
-        summary["prior_conflicts"] = prior_conflicts(human, posterior.draws, counts, seed)
     summary |= newcomer
     return_memory()
     return Fit(human, learned, posterior, data, summary, seconds)
